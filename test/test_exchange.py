@@ -157,7 +157,7 @@ def test_the_angular_rate_goes_both_ways(cubic):
     assert import_calibration(zeros, serial='7').gyroscope is None
     off = px4.text.replace('TC_G_ENABLE\t1', 'TC_G_ENABLE\t0')
     assert import_calibration(off, serial='7').gyroscope is None
-    assert 'angular rate: is lost' in export_calibration(unit, 'kalibr').notes
+    assert 'the bias of the angular rate is lost' in export_calibration(unit, 'kalibr').notes
     with pytest.raises(CalibrationError, match='TC_G0_X3_1: is missing'):
         import_calibration(px4.text.replace('TC_G0_X3_1', 'TC_G0_Y3_1'), serial='7')
 

@@ -287,7 +287,7 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(client, tmp_path, capsy
     assert command(*arguments) == 1
     text = capsys.readouterr()
     assert '- u: the board temperature leads the case' in text.out
-    assert '0 of 1 test calibrated; 0 tests done in this run, 1 in an earlier one' in text.out
+    assert '0 of 1 test calibrated; 0 tests done in this run, 1 in an earlier run' in text.out
     assert text.err == ''
     assert command(*arguments, '--with-prior') == 1
     text = '- fitted without a prior: 0 units with complete data, 3 are needed'

@@ -93,8 +93,8 @@ IMU_OUT = NodeTopic('imu/data_raw', IMU, 'specific force in m/s^2', 2000)
 REGIME = NodeTopic(
     'regime/dynamic',
     BOOL,
-    'S = 1; on every change and with every reading that decides: of the case, or of the board '
-    'while there is no case; nothing while unknown',
+    'whether S = 1; on every change and every reading that decides: of the case, or of the board '
+    'while there is no case; not published while S is unknown',
     1,
     is_latched=True,
 )

@@ -29,7 +29,7 @@ def fleet_fit(
         'Write no certificates, which halves the work.', False, '--no-certificates'
     ),
     with_prior: bool = option(
-        'Fit units with incomplete data again, with the prior of the others.',
+        'Fit units with incomplete data again, with the prior of the other units.',
         False,
         '--with-prior',
     ),
@@ -133,7 +133,7 @@ def _tell_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     out.line(
         f'{result.page}: {result.n_fitted} of {counted(len(result.rows), "test")} calibrated; '
         f'{counted(result.n_done, "test")} done in this run, '
-        f'{len(result.rows) - result.n_done} in an earlier one'
+        f'{len(result.rows) - result.n_done} in an earlier run'
     )
 
 

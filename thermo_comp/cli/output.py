@@ -4,7 +4,7 @@
 Owns the output of the command line: tables, JSON, progress, and one line per error.
 
 Results go to stdout, everything about the run (progress, notes, errors) to stderr, so that a pipe
-carries results only. Everything goes through `_print`: text from outside (serials, topics,
+carries results only. All output goes through `_print`: text from outside (serials, topics,
 metadata, file names) can neither forge a line nor move the cursor, and any terminal can show it.
 """
 

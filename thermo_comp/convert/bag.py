@@ -91,7 +91,7 @@ def _of_type(present: Present, kind: str) -> list[str]:
 
 
 def _shared(name: str, others: list[str]) -> int:
-    """Largest number of leading namespaces that a topic shares with any of the others."""
+    """Largest number of leading namespaces that a topic shares with any of the other topics."""
     namespaces, *theirs = (
         {*PurePosixPath('/', topic.strip('/')).parents} for topic in (name, *others)
     )

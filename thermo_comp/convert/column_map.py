@@ -43,7 +43,7 @@ _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Range of temperatures per length of a log [K/s] that no log reaches: a hair dryer warms a board
 #: by some 0.1 K/s.
 _FASTEST_K_S = 0.5
-_RISING = 0.7  # smallest part of the rows with a later time than the row before; some are repeated
+_RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
 #: Last and first part of a counter's range; a step from the last to the first is a new start.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
@@ -227,7 +227,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
-        # Any time axis will do: finding rests depends on the order of the samples.
+        # Any rising times will do: finding rests depends only on the order of the samples.
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = believed_unit(still.magnitude)
         if unit == 'unknown':
@@ -309,7 +309,7 @@ def _stamp(
     steps = np.diff(times)
     if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
         step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # In a slow log of a unit that never turns, the temperature shows that the log took longer.
+        # In a slow log of a unit that never turns, large temperature changes prove a long log.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
         # Take the largest unit with a plausible interval of samples: 5 ms is plausible, 5 s is

@@ -166,7 +166,7 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
         )
     reference_c = calibration.reference_temperature_c
     notes = [f'the file holds at {reference_c:g} degC: {drift}']
-    notes += ['angular rate: is lost'] * (calibration.gyroscope is not None)
+    notes += ['the bias of the angular rate is lost'] * (calibration.gyroscope is not None)
     cubics = np.pad(curves.level[:, None], ((0, 0), (0, 3)))
     matrix = np.array(calibration.misalignment) / curves.K
     range_c = calibration.static.temperature_range_c

@@ -31,8 +31,8 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| of a still sensor in each unit. Cheap sensors are off by a few per cent (bias and scale), a
-# thermal chamber adds some; 20 % exceeds the sum and is far below the ratios between the units.
+# |a| of a still sensor in each unit. The tolerance of 20 % exceeds the errors of bias and scale of
+# cheap sensors, even in a thermal chamber, and is far below the ratios between the units.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
@@ -299,8 +299,8 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
-    # The quiet level is the lower quartile: a log may be handled for most of its time. The level
-    # is at least a quantum: a sensor with less noise shows none.
+    # The quiet level is the lower quartile, since a unit may be handled for most of a log, and at
+    # least a quantum, since a sensor with noise below its quantum shows no noise.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []

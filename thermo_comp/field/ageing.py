@@ -273,15 +273,15 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
         half = np.add.reduceat(inverse * by_level[:, j], first, axis=1)
         for i in range(6):
             precision[:, :, i, j] = np.add.reduceat(by_level[:, [i]] * half, first, axis=0)
-    pull = np.add.reduceat(by_level * alpha[:, np.newaxis], first, axis=0)
+    gradient = np.add.reduceat(by_level * alpha[:, np.newaxis], first, axis=0)
     # A jump before a start also shifts all later starts.
     after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
-    pull = np.cumsum(pull[::-1], axis=0)[::-1]
+    gradient = np.cumsum(gradient[::-1], axis=0)[::-1]
     known = {change.time for change in model.changes}
     for k in range(n):
         time = float(rows.time[first[k]])
         for sd in _JUMPS if time not in known else ():
-            gain = _log_bayes_factor(after[k, k], pull[k], sd) - np.log(n * len(_JUMPS))
+            gain = _log_bayes_factor(after[k, k], gradient[k], sd) - np.log(n * len(_JUMPS))
             yield Change(time, sd, gain)
     if None in known:
         return
@@ -291,12 +291,12 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
         yield Change(None, sd, gain - float(np.log(len(_BENDS))))
 
 
-def _log_bayes_factor(precision: Floats, pull: Floats, sd: float) -> float:
+def _log_bayes_factor(precision: Floats, gradient: Floats, sd: float) -> float:
     """
     Return the gain in log evidence by a change of prior sd `sd`, marginal over all other unknowns.
     """
-    inner = np.eye(len(pull)) + sd**2 * precision
-    gain = 0.5 * sd**2 * pull @ np.linalg.solve(inner, pull)
+    inner = np.eye(len(gradient)) + sd**2 * precision
+    gain = 0.5 * sd**2 * gradient @ np.linalg.solve(inner, gradient)
     return float(gain - 0.5 * np.linalg.slogdet(inner)[1])
 
 

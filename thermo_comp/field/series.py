@@ -162,7 +162,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     Return the begin of a calibration's validity [days since 1970], the time up to which its
     covariance is aged, and whether it is an update.
 
-    The begin is the last rest of an update, else the date of the file, or -inf without a date.
+    Validity begins at the last rest of an update, else at the file's date, or -inf without a date.
     """
     names = [
         source.name for source in calibration.provenance.sources if source.name.startswith(_UNTIL)

@@ -4,8 +4,8 @@
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
 A rest determines the error along gravity alone, so the attitudes decide which axes are determined.
-An axis is updated only if the rests reduce the sd of some reading of it to 0.6 of its prior sd;
-the other axes keep their values, with an increased covariance.
+An axis is updated only if the rests reduce the sd of some reading of the axis to 0.6 of that
+reading's prior sd; the other axes keep their values, with an increased covariance.
 """
 
 from collections.abc import Sequence
@@ -300,5 +300,5 @@ def what_moved(result: Update) -> list[str]:
             'with an aged uncertainty; rests in other attitudes would determine them'
         )
     if result.n_outliers:
-        lines.append(f'{result.n_outliers} rests contradict all others and are left out')
+        lines.append(f'{result.n_outliers} rests contradict all other rests and are left out')
     return lines

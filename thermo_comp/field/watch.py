@@ -50,7 +50,7 @@ class Watch:
     """
     Comparison of the rests of a log with the claimed sd.
 
-    days, periods, temperatures: by day, by period (at most 30), by class of temperature
+    days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
     left: first day of the last period outside the claim; None for a unit within its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years

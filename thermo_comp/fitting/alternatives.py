@@ -73,8 +73,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program are not compared: they limit the number of columns, which is
-    # equal in both models.
+    # Left-out halves of the program are not compared: they limit the number of columns, and the
+    # models of the two detectors have the same columns.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 

@@ -306,7 +306,7 @@ def file_parameters(
             (of_scale, 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
         ):
             each = unknown[places] * (unit / regression.rms)[:, None]
-            # Curves over the temperatures of parts are sums of the other columns.
+            # Curves over the temperatures of parts are sums of columns of the sets and response.
             each, of_parts = np.split(each, [sums.shape[1]])
             each = each + sums.T @ of_parts
             static, (delta,), dynamic, response = np.split(each, [n, n + 1, n + 1 + m])

@@ -58,9 +58,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
     if options.model == 'golovach' or n_directions < POSITIONS_NEEDED:
-        # P attitudes give 3 P drifts. The unit has 6 unknown drifts (bias and scale of each axis),
-        # the supports have 2 P. Below 6 attitudes a tilt cannot be distinguished from a drift of
-        # the unit. In the paper's model tilts would absorb the errors of its two sets.
+        # P attitudes give 3 P drifts for 6 unknown drifts of the unit (bias and scale of each
+        # axis) and 2 P unknown tilts of supports: below 6 attitudes a tilt cannot be distinguished
+        # from a drift of the unit. In the paper's model tilts would absorb errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     if known is None and _has_soaks_only(windows):
         data = _at_rest(data)
@@ -93,7 +93,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _has_soaks_only(windows: ThermalWindows) -> bool:
-    """Whether no position has more than 1 % of the change of the temperature (RMS)."""
+    """Whether the RMS change of the temperature in a position is below 1 % of that in the test."""
     t, position = windows.temperature, windows.data.position
     within = within_positions(t[:, None], position)[:, 0]
     square = np.bincount(position, within**2) / np.bincount(position)
@@ -104,8 +104,8 @@ def _at_rest(data: Windows) -> Windows:
     """
     Return the windows with columns that are constant in each position.
 
-    A lag of unknown size changes the readings of a soak by as much as the rest of the temperature
-    does. Their drift does not determine the curve, but the norms of the positions do.
+    A lag of unknown size changes the readings of a soak by as much as the remaining drift of the
+    temperature does: the norms of the positions determine the curve, drifts within soaks do not.
     """
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
     return replace(data, columns=means[data.position], start=np.zeros_like(data.start))
@@ -258,8 +258,8 @@ def _steepness(windows: ThermalWindows, start: ConstantCalibration, options: Fit
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if _has_soaks_only(windows):
-        # The constants explain a part of the differences: take the RMS change of the norms, per
-        # unit of all slopes, that the constants do not explain.
+        # The constants explain a part of the differences between norms: take the RMS change of the
+        # norms, per unit of all slopes, that the constants do not explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants
@@ -283,7 +283,7 @@ def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibra
     gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
-        raise FitError('an axis is exactly zero at rest: is it dead, is it the right topic?')
+        raise FitError('an axis is exactly zero at rest: is the axis dead, or the topic wrong?')
     if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
         known = options.gravity if windows.data.forces is None else gravity
         return constant_calibration(means, known, with_misalignment=False)

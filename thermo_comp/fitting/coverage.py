@@ -114,7 +114,7 @@ def rough_centre(means: Floats) -> Floats:
     Return the reading at zero force: 0 if the norms of readings agree, else a sphere's centre.
 
     With offset binary codes the angles between raw vectors are meaningless. `means`: mean
-    readings, shape (n, 3); with fewer than four, or all in a plane, the result is 0.
+    readings, shape (n, 3); with fewer than four readings, or all in a plane, the result is 0.
     """
     zero = np.zeros(3)
     if len(means) < 4:
@@ -155,8 +155,8 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the best of several sets of rests, each given as mean readings of shape (n, 3).
 
     The best set has the smallest sd of the constants, from the residuals of |f| and the directions
-    of its rests. The first set, which has the strictest thresholds, is taken if no other set is
-    better by 2 %, or if no set has six attitudes.
+    of its rests. The first set within 2 % of this sd is taken, since earlier sets have stricter
+    thresholds; if no set has six attitudes, the first set of all is taken.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
     enough = [len(distinct_directions(up)) for up in ups]

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of positions: that determine bias and scale factor (six constants), the
-#: misalignment (three more), and by their norms the sd of mounting offsets.
+#: Smallest numbers of positions that determine bias and scale factor (six constants), the
+#: misalignment (three more constants), and by their norms the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
 
 
@@ -183,14 +183,14 @@ def _judge_positions(up: Floats) -> Finding:
             f'{n} positions determine bias and scale; the misalignment keeps its prior: it needs '
             f'{POSITIONS_FOR_MISALIGNMENT} well spread positions',
         )
-    advised = 18  # two per constant
+    advised = 18  # two positions per constant of the triad
     if n < advised:
         return advice('positions', f'{n} positions; {advised} would reduce the uncertainty')
     return Finding('positions', 'good', f'{n} positions')
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a further position if the sd of |f| in some attitude is 3 times that in positions."""
+    """Advise a further position if the largest sd of |f| is 3 times the positions' median sd."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',
@@ -276,7 +276,7 @@ def judge_result(
         why = ': no temperature drift above the noise; already compensated?'
         yield advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and has_temperature:
-        why = 'each position is predicted badly by the others; record more positions'
+        why = 'each position is predicted badly by the other positions; record more positions'
         yield advice('left out', f'{text}: left-out positions exceed the raw error: {why}')
     else:
         yield Finding('residual', 'good', text)

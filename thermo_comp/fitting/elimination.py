@@ -112,8 +112,8 @@ class Reduced:
     layout: places of the unknowns
     starts_prior: precision of the initial lag states, and precision times state, (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
-    positions: the blocks of the positions; the initial lag states of the bag, then the unknowns of
-        the unit remain
+    positions: the blocks of the positions, with their cross blocks for the initial lag states of
+        the bag, then for the unknowns of the unit
     shares: contributions of the positions to the blocks of the bags with their cross blocks and
         gradients, shape (n_positions, r, r + n + 1); and to the diagonals before the elimination
         of the positions, shape (n_positions, r)

@@ -5,9 +5,9 @@ Owns the exclusion of bags of another environment, and the error that is publish
 
 In a chamber with a fan the board temperature follows the case temperature by one law, in still air
 by another. The bias of a part without a thermometer depends on the environment, and no set of
-coefficients describes two environments. A bag of still air would increase the error in the
-chamber. The fit excludes a bag of another environment and publishes the error of its correction as
-a lack of fit.
+coefficients describes two environments: a bag of still air would increase the error in a chamber
+with a fan. The fit excludes a bag of another environment and publishes the error of its correction
+as a lack of fit.
 """
 
 from __future__ import annotations

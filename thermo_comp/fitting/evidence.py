@@ -95,7 +95,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats]:
 def tables_of(
     residuals: Iterable[Floats], is_dynamic: Bools
 ) -> list[dict[str, ResidualStatistics]]:
-    """Return the statistics of the known ones of some residuals, shape (n,), by regime."""
+    """Return statistics by regime of the finite values of residuals, each of shape (n,)."""
     return [
         statistics_by_regime(values[np.isfinite(values)], is_dynamic[np.isfinite(values)])
         for values in residuals

@@ -47,9 +47,9 @@ class Inactive:
     """
     Sparsity and quality factors of inactive columns, given the active ones [2]_.
 
-    part, column: part (0: bias, 1: scale) and column of each of k inactive columns, shape (k,) S:
-    sparsity factor, the information about the weights, shape (3 k, 3 k), by column, then axis Q:
-    quality factor, the gradient by the weights, shape (3 k,)
+    part, column: part (0: bias, 1: scale) and column of each of k inactive columns, shape (k,)
+    S: sparsity factor, the information about the weights, shape (3 k, 3 k), by column, then axis
+    Q: quality factor, the gradient by the weights, shape (3 k,)
     """
 
     part: Ints

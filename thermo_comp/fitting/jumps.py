@@ -66,7 +66,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     directions differ by less than 10 degrees.
     """
     cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
-    # A slow log has long gaps, as the end of a rest is found to some twenty samples.
+    # A slow log has long gaps, because the end of a rest is found only to some twenty samples.
     longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
     means = [
@@ -80,7 +80,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     near = _near(bag, gaps, [margin_s] * len(gaps))
-    # If the noise is correlated, the level beside a gap is a mean over a longer time.
+    # If the noise is correlated, the level beside a gap is the mean over a time above `margin_s`.
     margins = [_margin(part, quiet_sd) for part in near]
     slow = [place for place, margin in enumerate(margins) if margin > margin_s]
     wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
@@ -106,7 +106,7 @@ def _near(
 
 
 def _margin(near: Floats, quiet_sd: Floats) -> float:
-    """Return the duration of the readings beside a gap [s]: 60 time constants of the noise."""
+    """Return the duration of readings beside a gap: 60 time constants of the noise, 10..100 s."""
     time, accel = near[:, 0], near[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -123,15 +123,14 @@ def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
 def _examine(
     near: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
 ) -> Jump | None:
-    """Test the readings beside a gap for a jump; None without one."""
+    """Test the readings beside a gap for a jump; None without a jump."""
     time, accel, gyro = near[:, 0], near[:, 1:4], near[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
         return None
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
-    # A shock decays, but a step is also a difference between the quiet samples before and after
-    # it.
+    # A step, unlike a shock, which decays, also changes the mean level of the quiet samples.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     lasting_sd = quiet_sd * relative_sd * _correlation(residual, quiet_sd)
     step, relative_sd, residual = _step(time, accel, time[at], r)
@@ -139,8 +138,8 @@ def _examine(
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = sd * relative_sd * _correlation(residual, sd)
     if r:
-        # At least half of the step must last, and the lasting part must exceed four standard
-        # deviations.
+        # At least half of the step must last, and the lasting part must exceed four of its own
+        # standard deviations.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -210,8 +209,8 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
     Find the first sample after a step, and the lag-1 correlation of the noise.
 
     The place of the step and the correlation are estimated in turn, three times. Noise with a
-    correlation below 0.4 counts as white. The correlation is at most 0.999; noise of a larger
-    correlation is a random walk.
+    lag-1 correlation below 0.4 counts as white. The correlation is at most 0.999; noise of a
+    larger correlation is a random walk.
     """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
     for _ in range(3):

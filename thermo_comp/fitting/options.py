@@ -60,7 +60,7 @@ class FitOptions:
     gravity: local gravity [m/s^2]; FitError if it does not occur on Earth
     model: 'response' selects from all columns; 'golovach' is the paper's model: a linear static
         and a quadratic dynamic set, no response
-    static_curve, dynamic_curve: a family; None for the model's default
+    static_curve, dynamic_curve: family of each set's curve; None for the model's default
     groups, forced: groups of columns that may take part (None: all), and that are not selected but
         always kept
     prior: calibration of this unit or of its type; its columns are the model
@@ -144,7 +144,7 @@ class FitOptions:
         """
         Return the prior sd of a nonlinear term [g/g^2; for the cube g/g^3].
 
-        The defaults are above the limits of quartz pendulums: some 20 .. 60 ug/g^2, some ug/g^3.
+        Data sheets of quartz pendulums have lower limits: 20 .. 60 ug/g^2, a few ug/g^3.
         """
         if kind == 'cube':
             return 1e-5 if self.k3_sd is None else self.k3_sd

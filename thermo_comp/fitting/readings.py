@@ -51,8 +51,8 @@ def is_spike(value: Floats) -> Bools:
     """
     Return which readings are more than 10 K from the median of five readings, shape (n,).
 
-    A thermometer without contact reads -127 or 85 degC for a moment. The tracker rejects such
-    readings, unless they have increased the noise that a fit expects of the thermometer.
+    A thermometer without contact reads -127 or 85 degC for a moment. The tracker rejects spikes,
+    unless spikes have increased the noise that a fit expects of the thermometer.
     """
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:

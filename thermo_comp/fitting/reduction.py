@@ -171,8 +171,8 @@ def reduce_source(
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
-    is chosen in the same way. A cell has `least` samples, or 5 if the samples are slow and most
-    rests are shorter than a cell.
+    is chosen in the same way. A cell has `least` samples; slow samples get shorter cells, of 10 or
+    5 samples, if longer cells interrupt or lose rests.
     """
     reading = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
     # The norms at rest are used to choose the thresholds only if |f| at rest is gravity.
@@ -345,8 +345,7 @@ def _windows(
     offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
-    # The last window is not of full length if the bag ends within it: it has less than 90 % of the
-    # samples.
+    # A last window with less than 90 % of the usual samples is not of full length: the bag ended.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
 

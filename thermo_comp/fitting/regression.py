@@ -279,7 +279,7 @@ class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Return the equations at a state without inactive weights; `grams`: None for all."""
+        """Return the equations at a state, inactive weights 0; `grams`: None for all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).whole if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)

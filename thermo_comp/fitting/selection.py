@@ -123,7 +123,7 @@ class Growth:
     def extended(
         self, before: Trial, groups: tuple[str, ...] = (), typical: Floats | None = None
     ) -> Trial:
-        """Fit a model with further groups, from the fit of the model before."""
+        """Fit a model with further groups, from the fit of the model without them."""
         typical = before.typical if typical is None else typical
         posterior = before.posterior
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
@@ -153,8 +153,8 @@ class Growth:
 
     def lowest_degree(self, constants: Trial) -> Trial:
         """
-        Fit the curve with its first column, then with more of them as long as each is likelier by
-        `TRIAL_GAIN`: norms alone are explained by many curves.
+        Fit the curve with its first column, and add columns whose gain in log density exceeds
+        `TRIAL_GAIN`: many curves explain norms alone.
         """
         prior = constants.posterior.prior
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
@@ -220,9 +220,9 @@ class Growth:
 def better_beginning(fits: Sequence[Trial]) -> Trial:
     """
     Choose the fit that is better on left-out data: begun with a small or with a large prior sd of
-    mounting offsets. If neither is better, the large sd must be likelier by `TRIAL_GAIN`. Both
-    fits explain the norms of few positions, one by mounting offsets, the other by misalignments;
-    only misalignments predict the norm of another position.
+    mounting offsets. If neither is better, the large sd must be likelier by `TRIAL_GAIN`. Mounting
+    offsets and misalignments explain the norms of few positions equally well, but only
+    misalignments predict the norm of another position.
     """
     small, *others = fits
     for large in others:
@@ -315,7 +315,7 @@ def _grown(
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, with its final score, and those within one standard error of it."""
+    """Mark the chosen model, with its final score, and models within one standard error of it."""
     marked = []
     for trial in trials:
         is_chosen = trial.groups == chosen.groups

@@ -53,7 +53,7 @@ def fit_sources(
     paths: Sequence[str | Path], topics: Topics | None = None, force: AskedForce = USUAL_FORCE
 ) -> tuple[list[FitSource], Input]:
     """
-    Make sources of recordings; each recording is opened now, and again by the fit.
+    Make sources of recordings; each recording is opened by this function and again by the fit.
 
     Raises RecordingError if a recording cannot be read or lacks a topic; FitError if a recording
     is given twice, or if some have counts and some Imu messages.
@@ -85,7 +85,7 @@ def recording_source(
     force: AskedForce = USUAL_FORCE,
 ) -> tuple[FitSource, RecordingInfo]:
     """
-    Make a source of a recording, which is opened now and again for each pass.
+    Make a source of a recording, which is opened by this function and again for each pass.
 
     `require`: topics that the recording must have; `force`: the user's options about |f|, which
     replace the bag's metadata

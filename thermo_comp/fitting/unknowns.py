@@ -189,7 +189,7 @@ class Prior:
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
     start_share: variance of the initial lag states over that of the run-time prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
-        inactive one, shape (2 k,)
+        inactive coefficient, shape (2 k,)
     informative: replaces all other sd of the unit's parameters; column_sd then only gives the
         active columns
     """
@@ -289,7 +289,7 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Places of radius and misalignment, which the axes share; the last of the unit."""
+        """Places of radius and misalignment, which the axes share; the unit's last places."""
         return np.concatenate((self.radius, self.misalignment))
 
     @cached_property
@@ -373,7 +373,7 @@ def lay_out(
 
 
 def tangent_basis(up: Floats) -> Floats:
-    """Return two unit vectors perpendicular to each given one, shape (n, 3, 2)."""
+    """Return two unit vectors perpendicular to each vector of `up`, shape (n, 3, 2)."""
     helper = np.zeros_like(up)
     helper[np.arange(len(up)), np.argmin(np.abs(up), axis=1)] = 1.0
     first = _cross(up, helper)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a run over a fleet: fits what is missing; a test is done when its result.json exists."""
+"""Owns a run over a fleet: fits the tests without a result.json, which a finished fit writes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .work import FleetOptions, UnitOutcome, connected, run, sha256
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
 _FORMAT = 2
 _LONGEST_NAME = 100
-# Largest number of rows listed on the page; the table has all.
+# Largest number of rows listed on the page; the table has all rows.
 _MOST_ROWS = 60
 CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'result.json'
 
@@ -73,7 +73,7 @@ def fit_fleet(
     tell: Callable[[int, int, Row | None], None] = lambda *_: None,
 ) -> FleetResult:
     """
-    Fit all units without results; raises ThermoCompError or OutputError if impossible.
+    Fit all units without results; ThermoCompError or OutputError if no unit can be fitted.
 
     `tell` is called with the numbers of finished and of all tests, and None before the first fit,
     or the row of the last fit.
@@ -249,8 +249,8 @@ class Results:
             texts = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
             return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, texts)))})
         if outcome.calibration:
-            # Write the record last: before, its hash differs from the calibration's, and the unit
-            # counts as missing.
+            # Write the record last: while its hash differs from the calibration's, the unit counts
+            # as missing.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             (folder / CERTIFICATE).unlink(missing_ok=True)

@@ -44,7 +44,7 @@ class Column(NamedTuple):
     label: str = ''  # text for a compared quantity, see `_COMPARED`
     unit: str = ''
     by: str = 'value'
-    sd: str = ''  # the column with its standard deviation
+    sd: str = ''  # name of the column with the standard deviation of a compared quantity
 
 
 _BELOW = ((1, 0), (2, 0), (2, 1))
@@ -91,7 +91,7 @@ _TABLE = (
     ('dynamic_ug', 'number', '|f| - g at rest, RMS, dynamic regime'),
     ('all_ug', 'number', '|f| - g at rest, RMS'),
     ('peak_ug', 'number', 'largest |f| - g of a window at rest'),
-    ('unseen_ug', 'number', '|f| - g of each position by a fit to the others, RMS'),
+    ('unseen_ug', 'number', '|f| - g of each position by a fit to all other positions, RMS'),
     ('claimed_ug', 'number', 'RMS of the claimed standard deviation of the windows'),
     ('cpu_s', 'number', 'processor time of reading and fit'),
     ('tool_version', 'text', 'version of thermo_comp that fitted the unit'),

@@ -54,10 +54,10 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class UnitOutcome:
-    """The result of a unit, small enough to send."""
+    """The result of a unit, small enough to send between processes."""
 
     row: dict[str, Cell]
-    hashes: dict[str, str]  # of the bags
+    hashes: dict[str, str]  # SHA-256 of each bag
     is_final: bool  # False if the file system failed, so that a repetition may succeed
     calibration: str = ''
     certificate: str = ''
@@ -77,7 +77,7 @@ def _started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
 
 
 def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcome:
-    """Read and fit a unit; a bad bag does not stop the unit, a bad unit not the fleet."""
+    """Read and fit a unit; a bad bag does not stop the unit's fit, nor a bad unit the fleet's."""
     began = time.process_time()
     storage = Storage(url)
     hashes = dict.fromkeys(unit.bags, '')
@@ -205,7 +205,7 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
             return
         versions = {}
         try:
-            problem = 'no Dask scheduler answers there'
+            problem = 'no Dask scheduler answers at this address'
             client = stack.enter_context(Client(scheduler, timeout=_WAIT_S))
             problem = 'the cluster has no worker'
             client.wait_for_workers(1, timeout=_WAIT_S)

@@ -110,7 +110,7 @@ class RateCheck:
     @property
     def noise_excess(self) -> float:
         """
-        Relative excess of a sample's noise variance over the calibrated one at the measured rate.
+        Relative excess of the noise variance of a sample over its calibrated value, from the rate.
         """
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0

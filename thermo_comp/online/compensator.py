@@ -277,8 +277,8 @@ class Compensator:
         Build a compensator that continues from the last sample with another model or settings.
 
         The states of thermometers, regime and memory that the new model also has are kept. The
-        original does not change, so a failure has no effect; only one of the two compensators may
-        continue.
+        present compensator does not change, so a failure has no effect; afterwards only the
+        present or the new compensator may continue.
         """
         new = copy(self)
         new.take_over(model, config)

@@ -204,7 +204,7 @@ class ThermalSide:
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[float]:
-        """Return the slow part of a segment's variance, evaluated at the segment's end or held."""
+        """Return the slow part of a segment's variance, held for `SLOW_NS` once evaluated."""
         key = start_ns // SLOW_NS
         if key != self._slow_key:
             self._slow_key = key

@@ -14,7 +14,7 @@ class CompensatorConfig(ThermalConfig):
     """Settings of the user; ValueError if a value is out of its range."""
 
     #: Time after which repeated equal samples are dropped [s]; samples of three exact zeros are
-    #: always dropped; 0 switches both checks off.
+    #: dropped at once; 0: repeated samples and zeros are not dropped.
     stuck_timeout_s: NotNegative = 2.0
     #: Gravity at the place of use [m/s^2]; 0 = the gravity of the calibration.
     local_gravity_m_s2: NotNegative = 0.0
@@ -60,7 +60,7 @@ class Counters(Dropped):
 
 
 class GravityResidual(NamedTuple):
-    """|f| - g over still windows [m/s^2], its sd, their number, if the last window was still."""
+    """Mean |f| - g of still windows [m/s^2], its sd, their number; was the last window still?"""
 
     residual: float
     residual_sd: float

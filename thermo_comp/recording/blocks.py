@@ -126,7 +126,7 @@ class ImuColumns(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Readings of a thermometer, shape (m,); `after`: number of samples before each."""
+    """Readings of a thermometer, shape (m,); `after`: number of samples before each reading."""
 
     stamp_ns: Ints
     celsius: Floats
@@ -228,7 +228,7 @@ def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
 
 
 def joined(blocks: Sequence[Block]) -> Block:
-    """Join blocks, at least one, into one with the first sample's `frame_id`."""
+    """Join blocks, at least one, into a block with the first sample's `frame_id`."""
     if len(blocks) == 1:
         return blocks[0]
     begins = np.cumsum([0, *map(len, blocks)])

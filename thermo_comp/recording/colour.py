@@ -22,7 +22,7 @@ _TENTH, _NEVER = -1.2816, 6.7
 _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 
 
-def spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Floats:
+def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats:
     """
     Return the spread of the variances of cells at rest relative to white noise, per axis.
 
@@ -30,8 +30,8 @@ def spread_of_variances(cells: Cells, believable: Bools, level: Floats) -> Float
     their effective number is smaller by the factor (1 - r) / (1 + r), and the roughness is 1 - r
     times the variance, which follows from its tenth percentile `level` and this number.
     """
-    n_free = float(np.median(cells.count[believable])) - 1.0
-    quiet = believable & (cells.variance <= level).any(axis=1)
+    n_free = float(np.median(cells.count[plausible])) - 1.0
+    quiet = plausible & (cells.variance <= level).any(axis=1)
     rough = np.median(cells.roughness[quiet], axis=0)
     result = np.ones(3)
     for axis in range(3):

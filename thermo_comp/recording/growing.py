@@ -24,7 +24,7 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # a killed process loses a chunk: half a minute at 100 Hz
+_CHUNK_BYTES = 1 << 17  # a killed process loses a chunk: some 17 s of counts at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of a bag that is being written: its number and the process number.
@@ -96,8 +96,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Turn an unfinished bag into a bag with this number, or the next free one, and delete it; None
-    if it has no message. RecordingError if nothing can be read.
+    Turn an unfinished bag into a bag with this number, or the next free number, and delete the
+    unfinished bag; None if it has no message. RecordingError if nothing can be read.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

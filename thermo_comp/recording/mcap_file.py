@@ -223,7 +223,7 @@ class McapFile(BagFile):
             elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
                 raise DamagedError(f'the record at byte {at} has {length} bytes')
             elif opcode in {Opcode.DATA_END, Opcode.FOOTER}:
-                words = 'its summary is missing, but no message is'
+                words = 'its summary is missing, but all messages are there'
                 break
             at += step
         words = self._count(spans[1:], words, end is not None)

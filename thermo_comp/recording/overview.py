@@ -48,8 +48,8 @@ class ThermometerSurvey:
 @dataclass(frozen=True)
 class Survey:
     """
-    Summary of a recording for a fit. The rate follows from the median interval; still intervals
-    last at least 3 s; findings are obstacles to a fit, with the next step.
+    Summary of a recording for a fit. The rate of samples follows from their median interval; still
+    intervals last at least 3 s; findings are obstacles to a fit, with the user's next step.
     """
 
     info: RecordingInfo
@@ -187,7 +187,7 @@ class _Clock:
     last_ns: int = 0
     newest_ns: int = 0  # newest stamp since the last restart of the clock
     step_ns: float = 0.0
-    n_backwards: int = 0  # number of stamps that do not rise above all before
+    n_backwards: int = 0  # number of stamps that do not rise above all earlier stamps
     n_restarts: int = 0  # number of steps back by more than `LONGEST_PAUSE_NS`
     n_gaps: int = 0
     longest_gap_s: float = 0.0
@@ -199,7 +199,7 @@ class _Clock:
         later = stamp_ns[not self.n :]
         steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
-        # After a step back by an hour or less samples are left out until the time has caught up.
+        # After a step back by an hour or less, samples are left out up to the newest stamp so far.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):

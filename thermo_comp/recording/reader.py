@@ -85,8 +85,8 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the begin of the part [s]; set when that sample is
-        #: read.
+        #: Time from the bag's first sample to the begin of the part that is read [s]; set when
+        #: the first sample is read.
         self.since_s = 0.0
         self.apart = ''  # warning, if any so far, about a thermometer on another clock
 
@@ -209,7 +209,7 @@ class RecordingReader(ExitStack):
         return self._cut(without_jumps(self._blocks(), self.info.path))
 
     def _cut(self, blocks: Iterator[Block]) -> Iterator[Block]:
-        """Drop messages outside the part; RecordingError if no sample is left."""
+        """Drop messages outside the part to be read; RecordingError if no sample is left."""
         if self._part == WHOLE:
             yield from blocks
             return

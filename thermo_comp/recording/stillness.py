@@ -6,7 +6,7 @@ Owns still intervals: raw samples -> short cells (count, mean, variance) -> wher
 Two tests are relative to the quiet level of the bag: the variance inside a cell (vibration,
 handling) and the step between adjacent cells (a turn, a knock). A step starts a new interval,
 because a tilt of one microradian is already one micro-g. Temperature tilts a unit at rest, too: a
-steady change over the cells around, slower than the Earth rotates, is a drift and not a step. Two
+steady change over several cells, slower than the Earth rotates, is a drift and not a step. Two
 tests have absolute limits, because the quietest tenth of a flight is no rest: a sensor at rest
 scatters by no more than its noise, and does not rotate.
 """
@@ -54,7 +54,7 @@ class Cells:
     """
     Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
-    Dropped are samples that are not finite or whose stamp does not rise. `quantum` is the samples'
+    Samples that are not finite or whose stamp does not rise are dropped. `quantum` is the samples'
     step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in rad/s.
     `roughness` is half the mean square change from sample to sample: the variance of white noise;
     `seam` the change to a cell's first sample from the last sample of the cell right before it.
@@ -238,7 +238,7 @@ def _quantum_of(samples: Floats) -> Floats:
             continue
         # Equal multiples of a step differ by rounding only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
-        # All changes must be whole multiples of the smallest.
+        # All changes must be whole multiples of the smallest change.
         steps = changes / changes[0]
         is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()
         if n_levels < 0.2 * len(changes) or n_levels == 1 or is_whole:
@@ -269,22 +269,22 @@ def still_runs(
     cell to the quiet level; `still_sd` is the largest scatter at rest [g].
     """
     full = _is_full(cells)
-    believable = full & is_under(cells, still_sd) & ~_is_turning(cells)
-    if not believable.any():
+    plausible = full & is_under(cells, still_sd) & ~_is_turning(cells)
+    if not plausible.any():
         return [[] for _ in ratios]
-    drift = _drift(cells, believable)
-    level = np.quantile(cells.variance[believable], 0.1, axis=0)
-    wider = spread_of_variances(cells, believable, level)
+    drift = _drift(cells, plausible)
+    level = np.quantile(cells.variance[plausible], 0.1, axis=0)
+    wider = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise: toggling between two adjacent
     # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
-    # variance is a little below its mean; 1.3 covers it for cells of 32 samples.
+    # variance is below its mean; for cells of 32 samples a factor of 1.3 covers the difference.
     noise = np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
-    # A drift of d within a cell has a variance of d^2 / 12; twice that allows for noise.
+    # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     by_drift = within**2 / 6.0 if len(within) else 0.0
     result = []
     for ratio in ratios:
-        quiet = believable & (cells.variance <= ratio * noise + by_drift).all(axis=1)
+        quiet = plausible & (cells.variance <= ratio * noise + by_drift).all(axis=1)
         roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
         # Noise of the roughness `roughest` changes between cells by at most `_STEP_SDS` sd.
@@ -365,9 +365,9 @@ def _is_turning(cells: Cells) -> Bools:
     return np.asarray(shakes | (np.abs(cells.rate - level) > _STILL_RATE).any(axis=1))
 
 
-def _drift(cells: Cells, believable: Bools) -> Floats:
+def _drift(cells: Cells, plausible: Bools) -> Floats:
     """Return the drift between successive cells, a median over neighbours, shape (n - 1, 3)."""
-    both = believable[1:] & believable[:-1] & (np.diff(cells.index) == 1)
+    both = plausible[1:] & plausible[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2
     if len(step) <= half:
@@ -384,7 +384,7 @@ def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
         return np.zeros(len(step), dtype=bool)
-    # With many short rests most steps are turns: limit the spread.
+    # With many short rests most steps are turns: limit the spread of the steps.
     spread = np.minimum(
         1.4826 * np.median(np.abs(step[both]), axis=0), STILL_SD / _STEP_SDS * _one_g(cells)
     )

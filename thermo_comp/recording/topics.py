@@ -215,10 +215,10 @@ def select_topics(
         for role, key in keys.items()
     ]
     if corrected and 'accel' not in name_of:
-        chosen.append(_said_corrected(corrected))
+        chosen.append(_text_of_corrected(corrected))
     name_of |= _further(present, topics, name_of, is_read=bool(require))
     if 'accel' in name_of and 'board' not in name_of:
-        chosen.append(_said_unnamed(present, topics.board, set(name_of.values())))
+        chosen.append(_text_of_unnamed(present, topics.board, set(name_of.values())))
     named = {**topics.further, 'board': topics.board, 'case': topics.case}
     fields = {role: split_field(named.get(role, ''))[1] for role in name_of if role != 'accel'}
     fields = {
@@ -280,12 +280,12 @@ def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
     return ''
 
 
-def _said_corrected(name: str) -> str:
+def _text_of_corrected(name: str) -> str:
     return f'{shown(name)} is corrected already: thermo_comp wrote it, it is not an input'
 
 
-def _said_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
-    """Say which topics may be the board's thermometer, none of which is read; '' without any."""
+def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
+    """Name unread topics that may be the board's thermometer; '' without such topics."""
     names = [
         shown(name)
         for name, (kind, count) in present.items()
@@ -356,7 +356,7 @@ def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -
     if len(present) > len(names):
         listed += f' and {len(present) - len(names)} more'
     if corrected and not {'counts', 'imu'}.isdisjoint(wanted):
-        listed += f'; {_said_corrected(corrected)}'
+        listed += f'; {_text_of_corrected(corrected)}'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',

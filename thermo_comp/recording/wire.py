@@ -53,8 +53,8 @@ def decode_blocks(
 ) -> list[Block]:
     """
     Decode messages in their order; a block ends where the frame changes. `roles` lists the inputs
-    found in the whole bag. The reading of a field is kept as a Temperature. Raises RecordingError,
-    without a path, if the bytes of a message do not fit its type.
+    found in the whole bag. The reading of a field is kept as a Temperature message. Raises
+    RecordingError, without a path, if the bytes of a message do not fit its type.
     """
     roles = tuple(dict.fromkeys((*ROLES, *roles)))
     topics = {feed.role: feed.topic for feed in feeds}

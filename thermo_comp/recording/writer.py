@@ -52,7 +52,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         path: str | Path,
         *,
         compression: Compression = 'zstd',
-        # zstd's level -1 writes Imu messages a sixth faster than 1, at most a few percent larger.
+        # zstd's level -1 is a sixth faster than level 1, and a bag at most a few percent larger.
         level: int = -1,
         metadata: Mapping[str, str] | None = None,
         overwrite: bool = False,

@@ -42,7 +42,7 @@ _SIMULATED = 'truth'
 
 @dataclass(frozen=True)
 class Position:
-    """A still position: direction of the force in the output frame, RMS of |f| - g by `rung`."""
+    """A still position: direction of the force in the output frame, RMS |f| - g by correction."""
 
     number: int
     bag: int
@@ -128,7 +128,7 @@ class Evidence:
 
     @property
     def forces(self) -> dict[str, Floats]:
-        """Specific force of the windows by rung; empty without windows."""
+        """Specific force of the windows by correction; empty without windows."""
         windows = self.windows
         if windows is None or not len(windows):
             return {}
@@ -161,7 +161,7 @@ class Evidence:
         places, first, n = np.unique(label, return_index=True, return_counts=True)
         up = means_by(label, next(reversed(self.forces.values())))
         up /= np.linalg.norm(up, axis=1, keepdims=True)
-        rms = {rung: np.sqrt(means_by(label, one**2)) for rung, one in self.residuals.items()}
+        rms = {name: np.sqrt(means_by(label, one**2)) for name, one in self.residuals.items()}
         rms[LEFT_OUT] = np.array([self.left_out.get(place, np.nan) for place in places.tolist()])
         return tuple(
             Position(
@@ -183,7 +183,7 @@ class Evidence:
         return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return by rung the residual of each axis about its position's mean, (n, 3) [m/s^2]."""
+        """Return each axis' residual about its position's mean by correction, (n, 3) [m/s^2]."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -267,7 +267,7 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
     """List the reservations about a calibration, except the advice to record more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     notes = [
-        f'the bags hold no {name}: the dynamic set is extrapolated there'
+        f'the bags hold no {name}: the dynamic set is extrapolated to {name}'
         for name, rate in (('heating', upper), ('cooling', -lower))
         if rate < _SLOWEST_RAMP_K_MIN
     ]

@@ -78,18 +78,18 @@ def draw_residuals(evidence: Evidence) -> Figure:
     rows = _rows(evidence)
     dynamic = given(evidence.windows).is_dynamic[rows]
     figure, panels, _, unit = _panels(evidence, [1.05] * len(residuals), more=0.5)
-    for axes, (rung, residual) in zip(panels, residuals.items(), strict=True):
+    for axes, (name, residual) in zip(panels, residuals.items(), strict=True):
         axes.set_prop_cycle(style.AXIS_CYCLE)
         _plot(axes, evidence, residual / MICRO_G, unit, label=AXES)
         axes.set_ylabel('µg')
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.locator_params(axis='y', nbins=5)
-        if rung != RAW:
+        if name != RAW:
             _symmetric(axes, residual[rows])
         stats = statistics_by_regime(residual[rows], dynamic)
         del stats['all']
         parts = [f'{name} {number(stat.rms / MICRO_G)}' for name, stat in stats.items() if stat.n]
-        title = f'{rung}: RMS {", ".join(parts)} µg'
+        title = f'{name}: RMS {", ".join(parts)} µg'
         if axes is panels[0]:
             style.legend_above(axes, title)
         else:
@@ -99,20 +99,20 @@ def draw_residuals(evidence: Evidence) -> Figure:
 
 
 def draw_gravity(evidence: Evidence) -> Figure:
-    """Draw |f| over time, before and after, and after in detail (the paper's Fig. 7)."""
+    """Draw |f| over time, raw and corrected, and corrected in detail (the paper's Fig. 7)."""
     residuals = evidence.residuals
-    corrected = [rung for rung in residuals if rung != RAW]
+    corrected = [name for name in residuals if name != RAW]
     sets = [forces for forces in (list(residuals), corrected) if forces]
     figure, panels, _, unit = _panels(evidence, [1.6] * len(sets), more=0.4)
     for axes, drawn in zip(panels, sets, strict=True):
-        for rung in drawn:
-            value = residuals[rung] / MICRO_G
-            _plot(axes, evidence, value, unit, label=rung, **style.RUNG_LINES[rung])
+        for name in drawn:
+            value = residuals[name] / MICRO_G
+            _plot(axes, evidence, value, unit, label=name, **style.CORRECTION_LINES[name])
         axes.axhline(0.0, color='black', linewidth=0.5)
         axes.set_ylabel('|f| − g, µg')
         style.legend_above(axes)
-    for rung in corrected:
-        _symmetric(panels[-1], residuals[rung][_rows(evidence)])
+    for name in corrected:
+        _symmetric(panels[-1], residuals[name][_rows(evidence)])
     return figure
 
 
@@ -235,9 +235,9 @@ def draw_positions(evidence: Evidence) -> Figure:
     figure = style.new_figure(3.0)
     up, down = figure.subplots(1, 2)
     least = evidence.least_known
-    rung = LEFT_OUT if evidence.left_out else next(reversed(evidence.residuals), RAW)
+    judged = LEFT_OUT if evidence.left_out else next(reversed(evidence.residuals), RAW)
     for side, axes, name in ((1, up, 'z up'), (-1, down, 'z down')):
-        _draw_hemisphere(axes, evidence.positions, side, rung)
+        _draw_hemisphere(axes, evidence.positions, side, judged)
         if least is not None and (least.up[2] >= 0.0) == (side > 0):
             place = equal_area(least.up, side)
             axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
@@ -262,7 +262,7 @@ def _note(
     axes.annotate(text, place, by, textcoords='offset points', fontsize=7.5, **look)
 
 
-def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, rung: str) -> None:
+def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, judged: str) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     axes.plot(np.cos(angle), np.sin(angle), color='black', linewidth=0.8)
     # Radius of the circle at an elevation of 45 degrees, in the projection of `equal_area`.
@@ -275,13 +275,13 @@ def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, run
         axes.plot(*line, color='#BBBBBB', linewidth=0.6)
     for label, x, y in (('+x', 1.2, 0), ('−x', -1.2, 0), ('+y', 0, 1.2), ('−y', 0, -1.2)):
         axes.text(x, y, label, ha='center', va='center', color='#555555', fontsize=7.5)
-    largest = max((p.residual_rms.get(rung, 0.0) for p in positions), default=0.0)
+    largest = max((p.residual_rms.get(judged, 0.0) for p in positions), default=0.0)
     for position in positions:
         if (position.up[2] >= 0.0) == (side > 0):
             place = equal_area(position.up, side)
             axes.plot(*place, 'o', markersize=4.5, color='black')
             if largest > 0.0:
-                size = _RING * np.sqrt(position.residual_rms.get(rung, 0.0) / largest)
+                size = _RING * np.sqrt(position.residual_rms.get(judged, 0.0) / largest)
                 axes.plot(*place, 'o', markersize=size, mfc='none', mec=style.RED, mew=1.1)
             _note(axes, str(position.number), place, (3.5, 2.5))
     axes.set_xlim(-1.32, 1.32)

@@ -115,7 +115,7 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
     axes = figure.subplots()
     drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}
     drawn = {name: values for name, values in drawn.items() if len(values)}
-    lines = {'raw': style.RUNG_LINES['raw'], 'static': style.STATIC_LINE}
+    lines = {'raw': style.CORRECTION_LINES['raw'], 'static': style.STATIC_LINE}
     for name, values in drawn.items():
         share = np.arange(1, len(values) + 1) / len(values) * 100.0
         line = lines.get(name, style.DYNAMIC_LINE)

@@ -84,7 +84,7 @@ def render_report(
     is_certificate = evidence.calibration is not None
     title = 'Thermal calibration certificate' if is_certificate else 'Thermal test record'
     contributions = budget(evidence, info)
-    rungs = [*evidence.residuals, *([LEFT_OUT] if evidence.left_out else [])]
+    corrections = [*evidence.residuals, *([LEFT_OUT] if evidence.left_out else [])]
     return render(
         'certificate.html',
         title=f'{evidence.serial}: {title}',
@@ -109,8 +109,8 @@ def render_report(
         schuler=schuler_peak,
         figures=figures,
         drifts=drifts_of(evidence.history),
-        rungs=rungs,
-        rung_headings=[f'{rung}, µg RMS' for rung in rungs],
+        corrections=corrections,
+        correction_headings=[f'{name}, µg RMS' for name in corrections],
     )
 
 
@@ -288,7 +288,7 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             else 'The area of a red ring is proportional to the residual of this position.'
             if evidence.residuals
             else '',
-            'Red cross: the direction with the largest standard deviation of |f|, which is given; '
+            'Red cross: the direction with the largest standard deviation of |f|, with its value; '
             'a position in this direction would improve the calibration most.'
             if evidence.least_known
             else '',

@@ -28,7 +28,7 @@ AXIS_CYCLE = cycler(
     color=(BLUE, RED, GREEN), linestyle=('-', _DASHED, _DOTTED), linewidth=(1.1, 1.1, 1.5)
 )
 AXIS_LINES: tuple[Line, ...] = tuple(AXIS_CYCLE)
-RUNG_LINES: dict[str, Line] = {
+CORRECTION_LINES: dict[str, Line] = {
     RAW: {'color': GREY, 'linestyle': '-', 'linewidth': 0.9},
     CHOSEN: {'color': BLACK, 'linestyle': '-', 'linewidth': 1.3},
 }

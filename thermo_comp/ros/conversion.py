@@ -110,7 +110,7 @@ class SampleConverter:
         self.traffic.n_fallback += data is not given
         self._passed = start if is_imu else 0
         end = 16 + int.from_bytes(data[12:16], 'little')
-        # The padding after the name may hold any bytes.
+        # The padding after the frame name may hold any bytes.
         self._name, gap = data[12:end], start - end + skip
         self._unpack = struct.Struct(f'<4siI{len(self._name)}s{gap}x3d{n_after}x').unpack
         frame = self._frame_id.encode() + b'\0' if self._frame_id else self._name[4:]

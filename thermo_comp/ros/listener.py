@@ -79,7 +79,7 @@ class LiveTopics:
             if is_over:
                 self._stack.close()
             waiting = self._came[:]
-            # The thread may have appended more messages meanwhile.
+            # The receiving thread may have appended more messages meanwhile.
             del self._came[: len(waiting)]
             if waiting:
                 feeds = [Feed(k, *one) for k, one in enumerate(self._feeds.items())]

@@ -108,8 +108,8 @@ class NodeConfig:
     )
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
-        'Time after which repeated equal samples are not published [s]; three exact zeros never '
-        'are; 0 publishes any sample.',
+        'Time after which repeated equal samples are not published [s]; samples of three zeros '
+        'are never published; 0 publishes both.',
         (0.0, 3600.0),
     )
     local_gravity: float = _parameter(
@@ -274,7 +274,7 @@ class ParameterRequests:
                 future = (self._slow if waits else self._quick).submit(self._read, group)
                 future.add_done_callback(lambda done: self._loop.call_soon(partial(end, done)))
             return
-        # The number of results is limited: to write one per parameter takes as long as to read it.
+        # The number of results is limited: to write a result takes as long as to read a parameter.
         results += [_refusal(reason)] * min(len(groups), PARAMETERS_LIMIT)
         respond()
 
@@ -283,7 +283,7 @@ class ParameterRequests:
         return changes, self._prepare(changes)
 
     def _set(self, prepared: Future[Any], results: list[SetParametersResult]) -> None:
-        """Apply one group; an unexpected error refuses it and is logged by the loop."""
+        """Apply one group; an unexpected error refuses the group and is logged by the loop."""
         try:
             changes, preparation = prepared.result()
             news = [change for change in changes if not self._is_in_force(change)]

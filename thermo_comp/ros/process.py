@@ -39,8 +39,8 @@ class SignalWatch:
     If the process has not ended `ending_s` [s] after the call, it is ended.
     """
 
-    # Another thread makes the call: while the main thread waits in the middleware, the interpreter
-    # runs no signal handlers.
+    # Another thread calls the stop function: while the main thread waits in the middleware, the
+    # interpreter runs no signal handlers.
 
     def __init__(self, ending_s: float | None = None) -> None:
         self._ending_s = ending_s

@@ -55,7 +55,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
         path = Path(name).expanduser()
         root = Path(directory).expanduser().resolve() if directory else None
         try:
-            # Links are resolved first; an unreadable folder gives the error of a file outside.
+            # Links are resolved first; a file in an unreadable folder counts as outside `root`.
             if root is not None and not path.resolve().is_relative_to(root):
                 raise PermissionError
             content = read_bounded(path, SIZE_LIMIT, root)

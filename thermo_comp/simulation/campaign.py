@@ -23,8 +23,8 @@ _PROGRAMS = {
     # The temperature range and the style of the paper's Fig. 3: up, down and back, with long
     # soaks.
     'paper': '20 60min, 35@0.5 90min, 20 60min, 5 90min, 20 60min, 35 60min',
-    # Four hours, for one bag of a thermal test: the whole temperature range, ramps in both
-    # directions, two rates.
+    # 4 h 20 min, for one bag of a thermal test: the whole temperature range, ramps in both
+    # directions.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
     # The shortest program with the whole temperature range, ramps in both directions and short
     # soaks.

@@ -38,7 +38,7 @@ class Link:
 @dataclass(frozen=True)
 class Thermostat:
     """
-    Heater of a part, 0 to `max_power` W, with PI control to `set_point` [degC]; W/K, W/(K s).
+    Heater of a part: up to `max_power` W, PI control to `set_point` [degC], gains W/K, W/(K s).
     """
 
     node: str

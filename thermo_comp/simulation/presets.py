@@ -228,7 +228,7 @@ _KINDS = {
     'thermostatted': (0, _thermostatted),
     'bare-quartz': (1, _bare_quartz),
     'mems': (2, _mems),
-    # The numbers missing between these belong to the triads of benchmarks/triads.py.
+    # The numbers 3 to 12 belong to the triads of benchmarks/triads.py.
     'demo': (13, _demo),
 }
 UNIT_NAMES = tuple(_KINDS)

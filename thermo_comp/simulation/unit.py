@@ -32,8 +32,8 @@ _ROWS = 1 << 20
 class Stream(IntEnum):
     """
     Sources of random numbers, each with a separate stream: switching a source on or off, or
-    another block size, does not change the others. The numbers of the sources must never change or
-    be reused, because they determine the random numbers of a seed.
+    another block size, does not change the other streams. The numbers of the sources must never
+    change or be reused, because they determine the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0

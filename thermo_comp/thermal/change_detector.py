@@ -84,7 +84,7 @@ class ChangeDetector:
         self.swing = self._ripple_rate
         self._baseline = 0.0
         # Largest error of the baseline [K/s]; the baseline may begin at a crest of the ripple.
-        self._doubt = self.swing
+        self._baseline_error = self.swing
         self._trend = 0.0
         self._is_above = False
         self._turned_s = 0.0
@@ -94,10 +94,10 @@ class ChangeDetector:
         self._edge_ns = 0
         self._reading = nan
 
-    def settle(self, sensor: Thermometer, least_doubt: float = 0.0) -> None:
-        """Begin a soak with the rate as its baseline, with an error of at least `least_doubt`."""
+    def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
+        """Begin a soak with the rate as its baseline, with an error of at least `least_error`."""
         self._baseline = self.rate
-        self._doubt = max(self.swing, least_doubt, 2.0 * sqrt(sensor.var_rate))
+        self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # cell edges crossed before the soak measure the ramp
 
     def is_following(self, stamp_ns: int) -> bool:
@@ -106,7 +106,7 @@ class ChangeDetector:
 
     def is_back(self) -> bool:
         """Whether the rate is within the swing and the error of the baseline."""
-        return abs(self.rate - self._baseline) < self.swing + self._doubt
+        return abs(self.rate - self._baseline) < self.swing + self._baseline_error
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
@@ -131,7 +131,7 @@ class ChangeDetector:
         if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
         # A rate between the baseline and 0 does not count as a departure from the baseline.
-        baseline, swing = self._baseline, self.swing + self._doubt
+        baseline, swing = self._baseline, self.swing + self._baseline_error
         high = baseline + swing if baseline > 0.0 else swing
         low = baseline - swing if baseline < 0.0 else -swing
         if self._by_edges:
@@ -212,8 +212,8 @@ class ChangeDetector:
             # Since no edge of a cell has been crossed, the rate is at most one quantum per time
             # since the last edge.
             bound = self._quantum / apart
-            if bound < self._doubt + abs(self._baseline):
-                self._doubt = max(min(self._doubt, bound), self.swing)
+            if bound < self._baseline_error + abs(self._baseline):
+                self._baseline_error = max(min(self._baseline_error, bound), self.swing)
                 self._baseline = min(max(self._baseline, -bound), bound)
             return 0
         edge = 0.5 * (reading + before)
@@ -232,8 +232,8 @@ class ChangeDetector:
         """
         Let the baseline follow a rate that lasts for `dt` [s], by one swing per memory at most.
         """
-        baseline, doubt = self._baseline, self._doubt
-        limit = self.swing + doubt
+        baseline, error = self._baseline, self._baseline_error
+        limit = self.swing + error
         share = dt / (dt + self._baseline_s)
         step = rate - baseline
         if not -limit <= step <= limit:
@@ -245,7 +245,7 @@ class ChangeDetector:
             farthest = max(farthest, abs(baseline))
             moved = min(max(moved, -farthest), farthest)
         self._baseline = moved
-        self._doubt = doubt - share * doubt
+        self._baseline_error = error - share * error
 
     def _learn_swing(self, dt: float) -> None:
         """Update the swing, the largest distance of the rate from its trend in half periods."""

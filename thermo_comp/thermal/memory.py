@@ -202,7 +202,7 @@ class LagBank:
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
         """
-        Take the input's next value [K], with an error `sd` [K]; the input was linear in between.
+        Take the input's next value [K], with an error `sd` [K]; between values it is linear.
         """
         seen_ns = self.stamp_ns
         if seen_ns is None:
@@ -219,10 +219,10 @@ class LagBank:
             self.lagging, self.extra = self.at(stamp_ns, value)
             self.stamp_ns = stamp_ns
             if sd or dt_ns * 1e-9 > self._sparse_s:
-                self._doubt(_coefficients(self.taus, dt_ns)[0], dt_ns * 1e-9, change, sd)
+                self._add_variances(_coefficients(self.taus, dt_ns)[0], dt_ns * 1e-9, change, sd)
         self.input = value
 
-    def _doubt(self, decays: list[float], dt: float, change: float, sd: float) -> None:
+    def _add_variances(self, decays: list[float], dt: float, change: float, sd: float) -> None:
         self.has_extra = True
         result = []
         for variance, e, tau in zip(self.extra, decays, self.taus, strict=True):
@@ -231,8 +231,8 @@ class LagBank:
                 # Between readings far apart, the time at which the input changed is unknown.
                 grown += (change * (1.0 - e)) ** 2
             if sd:
-                # The error is the same from step to step, so the standard deviations add, not the
-                # variances.
+                # The input's error is the same from step to step, so the standard deviations add,
+                # not the variances.
                 grown = (math.sqrt(grown) + sd * (1.0 - e)) ** 2
             result.append(grown)
         self.extra = result

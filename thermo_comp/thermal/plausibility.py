@@ -37,7 +37,7 @@ DOUBTFUL_READINGS: Final = 4
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with frozen readings [K].
-LARGEST_DOUBT: Final = 60.0
+LARGEST_ERROR: Final = 60.0
 
 #: Smallest temperature difference at which a sensor leads the other in a ramp: in K, and as a
 #: share of the temperature change.
@@ -88,7 +88,7 @@ class SensorCheck:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Forget the sensor's past readings."""
         self.fault = Fault.NONE
         self.step = 0.0
         self.is_revived = False
@@ -139,8 +139,8 @@ class SensorCheck:
                 self.step = step
                 return False
             if fault is Fault.STEP:
-                # Enough time has passed for the change, but the reading differs from the expected
-                # temperature.
+                # After a rejected step the estimate starts again if an admitted reading differs
+                # from the expected temperature by more than noise.
                 self.is_revived = abs(step) > self._largest_noise + _SIGMAS * sqrt(variance)
         self.fault = Fault.NONE
         self._n_used += 1
@@ -195,16 +195,16 @@ class SensorCheck:
             return 0.0
         return self._jumped * exp(-max(stamp_ns - self._jumped_ns, 0) * self._decay)
 
-    def doubt(self, stamp_ns: int) -> float:
-        """Return the variance to add to the temperature's for standstills and jumps [K^2]."""
-        doubt = self._jump_at(stamp_ns)
+    def extra_variance(self, stamp_ns: int) -> float:
+        """Return the variance that standstills and jumps add to the temperature's [K^2]."""
+        variance = self._jump_at(stamp_ns)
         changed_ns = self.sensor.changed_ns
         if changed_ns is None or self._n_same < self._n_doubtful:
-            return doubt
+            return variance
         if self._has_cells and self.fault != Fault.FROZEN:
-            return doubt
-        moved: float = min(self._rate * max(stamp_ns - changed_ns, 0) * 1e-9, LARGEST_DOUBT)
-        return doubt + moved * moved
+            return variance
+        moved: float = min(self._rate * max(stamp_ns - changed_ns, 0) * 1e-9, LARGEST_ERROR)
+        return variance + moved * moved
 
 
 def still_readings(settings: ThermometerSettings) -> int:
@@ -222,8 +222,8 @@ class LeadCheck:
     The temperature changes since the last constant temperature are compared while both sensors
     change in the same direction. Heat from outside changes the case temperature first. If the
     board leads, the two topics are swapped or the heat comes from inside; in both cases the
-    gradient terms are wrong. `doubt` is the square of the board's possible lead in this ramp
-    [K^2].
+    gradient terms are wrong. `extra_variance` is the square of the board's possible lead in the
+    present ramp [K^2].
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:
@@ -233,7 +233,7 @@ class LeadCheck:
         self._quanta = case.settings.quantum_c + board.settings.quantum_c
         self._margin = LEAD_K + 2.0 * self._quanta
         self.is_reversed = False
-        self.doubt = 0.0
+        self.extra_variance = 0.0
         self._calm: tuple[float, float] | None = None
         self._calm_ns: int | None = None
         self._n_alike = 0
@@ -245,7 +245,7 @@ class LeadCheck:
         calm = self._calm_rate
         if is_static or (-calm < case.rate < calm and -calm < board.rate < calm):
             self._n_alike = 0
-            self.doubt = 0.0
+            self.extra_variance = 0.0
             stamp_ns = case.stamp_ns or 0
             self._calm_ns = stamp_ns if self._calm_ns is None else self._calm_ns
             if is_static or stamp_ns - self._calm_ns >= _CALM_NS:
@@ -262,9 +262,9 @@ class LeadCheck:
         noise = _SIGMAS * sqrt(case.var_temperature + board.var_temperature)
         lead = direction * (by_case - by_board)
         if lead > -noise - self._quanta:
-            self.doubt = 0.0
+            self.extra_variance = 0.0
         elif slow > DOUBTFUL_RATE_SHARE * fast:
-            self.doubt = lead * lead
+            self.extra_variance = lead * lead
         is_telling = (
             slow > LEAD_RATE_SHARE * fast
             and abs(lead) > self._margin + noise

@@ -12,7 +12,7 @@ from .memory import BOARD_INPUT
 #: thermometer, order of arrival, temperature [degC].
 Entry = tuple[int, bool, str, int, float]
 
-#: Largest number of waiting readings; more mean that readings and samples use different clocks.
+#: Largest number of waiting readings; if more wait, readings and samples use different clocks.
 PENDING_LIMIT: Final = 4096
 #: Largest backward step between consecutive stamps of one sensor [ns]; after a larger step the
 #: earlier readings are taken to be from another clock.
@@ -22,7 +22,7 @@ NEVER_NS: Final = 1 << 62
 
 
 class ReadingQueue:
-    """Readings by stamp; at equal stamps the board's first, so that both decide the regime."""
+    """Readings by stamp; at equal stamps the board's first: the case's decides the regime."""
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
@@ -36,9 +36,7 @@ class ReadingQueue:
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> int:
-        """
-        Add a reading; return the number refused: the reading, or earlier ones of another clock.
-        """
+        """Add a reading; return how many are refused: it, or earlier readings of another clock."""
         n_before = len(self._entries)
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:

@@ -189,11 +189,11 @@ class _Watch:
         # When the temperature ripples, the rate of the detector's filters does not overshoot, but
         # that of the third-order thermometer does.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
-        doubt = sqrt(sensor.var_rate)
+        sd = sqrt(sensor.var_rate)
         relaxed = self._relaxed
         stamp = self._stamp_ns
         self._stamp_ns = stamp_ns
-        if stamp is None or doubt > relaxed:
+        if stamp is None or sd > relaxed:
             self._mean = rate  # the rate is too uncertain to enter the mean
         else:
             dt = (stamp_ns - stamp) * 1e-9
@@ -202,9 +202,9 @@ class _Watch:
         if self._still_ns and changed is not None and stamp_ns - changed > self._still_ns:
             return True
         swing = change.swing
-        room = relaxed + (swing if swing < 0.25 * relaxed else 0.25 * relaxed)
-        room -= SURE_SIGMAS * doubt
-        if not -room < rate < room:
+        bound = relaxed + (swing if swing < 0.25 * relaxed else 0.25 * relaxed)
+        bound -= SURE_SIGMAS * sd
+        if not -bound < rate < bound:
             return False
         # Extrapolate the rate half a lag ahead, from its mean over the last quarter lag.
         ahead = 3.0 * rate - 2.0 * self._mean
@@ -213,7 +213,7 @@ class _Watch:
 
 
 def _obvious(sensor: Thermometer, rate: float) -> int:
-    """Sign of the rate if it exceeds a limit beyond doubt, otherwise 0."""
+    """Sign of the sensor's rate if it exceeds `rate` by `OBVIOUS_SIGMAS` sd, otherwise 0."""
     margin = abs(sensor.rate) - rate
     if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
         return 1 if sensor.rate > 0.0 else -1

@@ -56,9 +56,9 @@ class Thermometer:
     they are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
     `interval_s`: typical interval between readings; `n_in_row`: number of readings since the last
     start; `n_restarts`: number of starts after a gap or a step; `is_ready`: two readings exist, so
-    that a rate is known. `measured` and its
-    variance: the last reading, or for a sensor with cells the equivalent Gaussian measurement
-    (infinite variance: no information). `bending`: probability of the bending mode.
+    that a rate is known. `measured` and its variance: the last reading, or for a sensor with cells
+    the equivalent Gaussian measurement (infinite variance: no information). `bending`: probability
+    of the bending mode.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:
@@ -285,9 +285,9 @@ class Thermometer:
         if jump > half:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
-        # A repeated reading has no new information: its cell only bounds the variance. An estimate
-        # outside the cell is measured to be at the edge, once per time in which the temperature
-        # changes by one sd.
+        # A repeated reading has no new information: its cell only bounds the variance. If the
+        # estimate is outside the cell, the edge counts as measured, once per time in which the
+        # predicted temperature changes by one sd of the estimate.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))

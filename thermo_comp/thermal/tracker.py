@@ -205,16 +205,16 @@ class ThermalTracker:
             else:
                 gradient, variance = self._lost_gradient(stamp_ns, rate)
             gradients.append(gradient)
-            pairs += [gradient, variance + self.checks[name].doubt(stamp_ns)]
+            pairs += [gradient, variance + self.checks[name].extra_variance(stamp_ns)]
         for name in self.spec.rates:
             sensor = self.thermometers[name]
             is_live = self.is_live(stamp_ns, sensor)
             # The rate of a lost sensor is taken to be the board's rate, with an sd of 100 %.
             pairs += [sensor.rate, sensor.var_rate] if is_live else [rate, rate * rate]
-        var_board += self.checks[BOARD_INPUT].doubt(stamp_ns)
+        var_board += self.checks[BOARD_INPUT].extra_variance(stamp_ns)
         # If the board leads the case in a ramp, the topics of case and board may be swapped.
         is_reversed = self.lead.is_reversed
-        var_board += gradients[0] * gradients[0] if is_reversed else self.lead.doubt
+        var_board += gradients[0] * gradients[0] if is_reversed else self.lead.extra_variance
         if not self.memory.is_empty:
             pairs += self.memory.at(stamp_ns, board, gradients)
         return board, var_board, rate, self.weight_at(stamp_ns), float(not is_known), *pairs

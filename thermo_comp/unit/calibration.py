@@ -3,7 +3,7 @@
 """
 Owns the Calibration value of one unit, validated as a whole.
 
-The dataclasses mirror the file key by key. They are immutable: a node replaces one by assignment.
+The immutable dataclasses mirror the file key by key; a node replaces a calibration by assignment.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
 (0..1), and phi_j the columns of the thermal response (`columns`), common to both sets (Eq. (6) to

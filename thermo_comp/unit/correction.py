@@ -26,8 +26,8 @@ from .functions import hold
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection
 
-#: Largest rate of change of the output while the two sets are blended [m/s^3]: 1 ug per second;
-#: the blending is lengthened for this, up to a number of transition times.
+#: Largest rate of change of the output while the two sets are blended [m/s^3], 1 ug per second,
+#: and the number of transition times up to which the blending is lengthened to keep this rate.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
 #: Number of board temperatures at which curves and differences of the two sets are evaluated.
@@ -53,7 +53,7 @@ class Excess(NamedTuple):
     temperature: float  # board temperature beyond the range of the regime's set, signed [K]
     rate: float  # rate of the board beyond the range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
-    relative: float  # sum of all distances outside, each in half ranges
+    relative: float  # sum of all distances outside the ranges, each in half ranges
 
 
 class Correction:
@@ -83,7 +83,7 @@ class Correction:
         weights = np.array([(*term.bias, *term.scale) for term in response])
         self._W = weights.reshape(-1, 6).T[:, :, np.newaxis]
         self._is_present = (self._W[:3] != 0.0) | (self._W[3:] != 0.0)
-        self._find_felt()
+        self._find_columns_of_pairs()
         slopes = self.curves.slopes(np.linspace(*self._span, _GAP_TEMPERATURES))
         of_bias = np.arange(6)[:, np.newaxis] < 3
         bends = slopes.std(axis=2, keepdims=True)
@@ -109,15 +109,15 @@ class Correction:
         #: Number of rows of the slow part of the error variance.
         self.n_slow = 9 if self.of_force is None else 24
 
-    def _find_felt(self) -> None:
+    def _find_columns_of_pairs(self) -> None:
         """
         Find the columns that depend on each quantity of the state whose variance is propagated.
         """
         self.layout = layout = Layout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
-        self._felt_columns = columns[pair[columns] >= 0]
-        self._felt, self._felt_starts = np.unique(pair[self._felt_columns], return_index=True)
+        self._pair_columns = columns[pair[columns] >= 0]
+        self._pairs, self._pair_starts = np.unique(pair[self._pair_columns], return_index=True)
         by_board = np.array([quantity.by_board for quantity in layout.pairs])
         self._signs = by_board[:, np.newaxis, np.newaxis]
         self._lagged = [layout.places[lag] for lag in layout.lags if lag.input == BOARD_INPUT]
@@ -169,16 +169,16 @@ class Correction:
             over[is_dynamic], too_fast[is_dynamic], max(gradients, key=abs), curves + of_columns
         )
 
-    def felt(self, slopes: Floats) -> Floats:
+    def by_pairs(self, slopes: Floats) -> Floats:
         """
         Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), given derivatives of
         phi.
         """
-        columns = self._felt_columns
+        columns = self._pair_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
         if len(columns):
             each = self._W[:, columns] * slopes[columns]
-            result[self._felt] = np.add.reduceat(each, self._felt_starts, axis=1).swapaxes(0, 1)
+            result[self._pairs] = np.add.reduceat(each, self._pair_starts, axis=1).swapaxes(0, 1)
         return result
 
     def line(
@@ -258,14 +258,14 @@ class Correction:
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
-        felt = self.felt(by_source * factors[0])
+        by_pair = self.by_pairs(by_source * factors[0])
         # The response depends on the board temperature by t^power and by gradients and lags.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]
-        on_board = self._weigh(on_board, in_order(self._signs * felt, 0))
+        on_board = self._weigh(on_board, in_order(self._signs * by_pair, 0))
         slopes = self.curves.slopes(board)
-        v = self._spread(np.concatenate(variances), np.concatenate((slopes + on_board, felt)))
+        v = self._spread(np.concatenate(variances), np.concatenate((slopes + on_board, by_pair)))
         v[:, 0] += (shares[:, np.newaxis] * self.curves.unexplained(board)).sum(axis=0)
         v += slow
         is_beyond = bool(beyond_range.any())
@@ -286,8 +286,8 @@ class Correction:
             # The posterior holds within the calibrated ranges, so the variance grows with the
             # distance outside.
             v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
-        doubt = unknown + weight * static_weight + outside * outside
-        if not (is_beyond or doubt.any()):
+        of_gap = unknown + weight * static_weight + outside * outside
+        if not (is_beyond or of_gap.any()):
             return v
         if self.table.differs:
             of_static, of_dynamic = (
@@ -295,8 +295,8 @@ class Correction:
             )
             gap = self._weigh(held * (of_dynamic - of_static), gap)
         held_back = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
-        of_gaps = self._spread(np.array([doubt, np.ones_like(doubt)]), np.array([gap, held_back]))
-        return np.asarray(v + of_gaps)
+        of_gaps = np.array([of_gap, np.ones_like(of_gap)])
+        return np.asarray(v + self._spread(of_gaps, np.array([gap, held_back])))
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """

@@ -57,9 +57,9 @@ class SlowUncertainty:
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         phi = table.held(table.raw(states)) * factors
-        felt = self._correction.felt(table.slopes(states)[0] * factors)
-        felt = felt[self._correction.layout.lag_pairs, :, 0]
-        moved = felt * np.array(start_shares)[:, np.newaxis]
+        by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
+        by_pair = by_pair[self._correction.layout.lag_pairs, :, 0]
+        moved = by_pair * np.array(start_shares)[:, np.newaxis]
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
         result: list[float] = []
         beyond: list[float] = []
@@ -94,8 +94,8 @@ class SlowUncertainty:
         regressors = self._correction.curves.regressors(columns, phi)
         of_state, of_difference = np.zeros((2, len(states), 3))
         for axis, ((rows, variances), _, _) in enumerate(self._blocks):
-            felt = regressors[axis].T / self._K[axis]
-            for result, design in ((of_state, felt), (of_difference, felt - mean_of(felt))):
+            terms = regressors[axis].T / self._K[axis]
+            for result, design in ((of_state, terms), (of_difference, terms - mean_of(terms))):
                 result[:, axis] = ((design @ rows) ** 2).sum(axis=1) + design**2 @ variances
         return of_state, of_difference
 

@@ -99,7 +99,7 @@ def _lag_of_part(column: Column) -> memory.Lag:
 
 
 class Gradient(Term):
-    """Heat flow."""
+    """Effect of a heat flow."""
 
     kind, formula = 'gradient', 'g_s'
     groups: ClassVar[_Pairs] = (('gradient', 'heat flow (case − board)'),)
