@@ -17,6 +17,7 @@ from report_helpers import certificate, evidence, fitted
 
 from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
+from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.html import number
 from thermo_comp.report.page import figures_of, position_error, schuler_peak
 from thermo_comp.report.states import curves
@@ -129,6 +130,17 @@ def test_figures_are_legible_in_black_and_white(draw):
                     unit in axes.get_ylabel()
                     for unit in ('°C', 'K/min', 'µg', 'ppm', 'counts', '%', 'm/s²', 'position')
                 )
+
+
+def test_the_area_of_a_ring_is_proportional_to_the_residual_of_its_position():
+    shown = evidence()
+    with drawing():
+        lines = [line for axes in of_bags.draw_positions(shown).axes for line in axes.lines]
+    rings = [line for line in lines if line.get_marker() == 'o' and line.get_mfc() == 'none']
+    areas = np.sort([ring.get_markersize() ** 2 for ring in rings])
+    # A position without a left-out residual has a ring without area.
+    rms = np.sort([position.residual_rms.get(LEFT_OUT, 0.0) for position in shown.positions])
+    assert areas / areas[-1] == pytest.approx(rms / rms[-1])
 
 
 @pytest.mark.parametrize(
