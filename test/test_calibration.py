@@ -82,7 +82,7 @@ def test_round_trip_is_exact(value):
 
 
 @pytest.mark.parametrize('closes', ['board', 'case'])
-def test_when_the_dynamic_state_closes_is_in_the_file(closes):
+def test_the_end_condition_of_the_dynamic_regime_is_in_the_file(closes):
     value = calibration(detector=DetectorSettings(closes=closes))
     text = dump_calibration(value)
     assert parse_calibration(text.encode()) == value
@@ -92,7 +92,7 @@ def test_when_the_dynamic_state_closes_is_in_the_file(closes):
 
 
 @pytest.mark.parametrize('serial', ['no', '1e5', '0x1F', '12', 'null', '~', 'a: b', '- x', '1:30'])
-def test_serials_that_look_like_something_else_stay_texts(serial):
+def test_serials_that_look_like_numbers_or_dates_stay_texts(serial):
     value = calibration(unit=replace(calibration().unit, serial=serial))
     assert parse_calibration(dump_calibration(value).encode()).unit.serial == serial
 
@@ -202,7 +202,7 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
         (b'"\\ud800": 1', 'not valid YAML|invalid'),
     ],
 )
-def test_bytes_that_are_no_calibration(content, message):
+def test_bytes_that_are_no_calibration_are_refused(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
     # `rule` is the message for peers without access to the file: it quotes nothing of the file.
@@ -223,7 +223,7 @@ def test_any_damage_gives_a_calibration_or_a_calibration_error(data):
         assert parse_calibration(dump_calibration(value).encode()) == value
 
 
-def test_files_that_are_no_files(tmp_path):
+def test_paths_that_are_no_regular_file_are_refused(tmp_path):
     fifo = tmp_path / 'fifo'
     os.mkfifo(fifo)
     large = tmp_path / 'large'

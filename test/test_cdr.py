@@ -115,7 +115,7 @@ def test_frames_of_other_lengths_in_one_stream():
 
 @pytest.mark.parametrize('kind', [Vector3Stamped, Imu])
 @pytest.mark.parametrize('override', ['', 'other_link'])
-def test_what_has_another_form_goes_through_rclpy(kind, override):
+def test_messages_of_another_form_go_through_rclpy(kind, override):
     values = [float(k) for k in range(37 if kind is Imu else 3)]
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
@@ -154,7 +154,7 @@ def test_the_first_message_may_be_any_bytes():
         assert converter.traffic.n_malformed == 1
 
 
-def test_dropped_samples_give_nothing():
+def test_dropped_samples_give_no_message():
     converter = SampleConverter(Vector3Stamped)
     good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
     for message in (good, good + bytes(8)):

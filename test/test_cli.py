@@ -57,7 +57,7 @@ class TestOutput:
         row = next(line for line in printed.splitlines() if line.startswith('/accel/counts'))
         assert row.split() == ['/accel/counts', 'geometry_msgs/msg/Vector3Stamped', '8996']
 
-    def test_a_reader_that_has_seen_enough_is_no_error(self, bag):
+    def test_a_closed_pipe_is_no_error(self, bag):
         command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
         finished = ran('bash', '-c', f'set -o pipefail; {command}')
         assert finished.stderr == ''
@@ -117,7 +117,7 @@ class TestPlay:
     def needs_ros(self):
         pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-    def test_sends_everything_under_the_names_asked_for(self, bag, cli):
+    def test_sends_every_message_under_the_requested_names(self, bag, cli):
         arguments = ('play', bag, '--rate', '0', '--wait', '0', '--json')
         finished = cli(*arguments, '--ros-args', '-r', '__ns:=/here')
         data = parsed(finished.stdout)
@@ -197,7 +197,7 @@ class TestTopics:
         assert degrees == {'board': 20.0, 'case': 21.0, 'magnet': 22.0}
         assert seen['chosen'] is None
 
-    def test_the_only_one_of_its_type_is_said(self, named, unit, cli):
+    def test_the_only_topic_of_its_type_is_taken_and_named(self, named, unit, cli):
         text = '/imu/raw, its only Vector3Stamped, is taken for counts'
         assert text in cli('info', named).stdout
         topics = ('--topic', 'board=/t1', '--topic', 'case=/t2')
@@ -234,7 +234,7 @@ class TestCells:
         assert list(output.aligned(('n',), [], 'title')) == ['title', 'n']
 
 
-def test_what_sets_the_exit_code_is_said_to_the_quiet(capsys):
+def test_findings_that_set_the_exit_code_are_printed_despite_quiet(capsys):
     out = output.Output(quiet=True)
     out.sources([('01.mcap', 'the only topic', 'cut off after 3 s')])
     with pytest.raises(typer.Exit):

@@ -124,7 +124,7 @@ class TestBags:
     def test_missing(self, cli, unit, tmp_path):
         self.replayed(cli, unit, tmp_path / 'absent', r'absent: no such file or directory')
 
-    def test_garbage_in_a_bag_s_clothes(self, cli, unit, tmp_path):
+    def test_garbage_with_the_suffix_of_a_bag(self, cli, unit, tmp_path):
         for name in ('noise.mcap', 'noise.db3', 'noise.bag'):
             (tmp_path / name).write_bytes(b'\x89MCAP0\r\n' + bytes(range(256)) * 8)
             self.replayed(cli, unit, tmp_path / name, name)
@@ -189,7 +189,7 @@ class TestEvaluations:
 
 
 @pytest.mark.usefixtures('no_figures')
-def test_a_torn_bag_is_worked_through_and_the_exit_code_tells(cli, unit, tmp_path):
+def test_a_torn_bag_is_processed_and_sets_the_exit_code(cli, unit, tmp_path):
     whole = bag(tmp_path / 'whole.mcap').read_bytes()
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(whole[:-100])

@@ -73,7 +73,7 @@ def test_change_is_even_about_rest():
     np.testing.assert_allclose(slopes[:, 1], -slopes[:, 2])
 
 
-def test_what_the_bank_needs_remembered():
+def test_memory_that_the_bank_of_columns_needs():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
     taus = {

@@ -205,7 +205,7 @@ def test_a_fixed_rate_gathers_no_rounding(tmp_path):
     assert stamps[-1] == 10**9 + round(299 * 1e9 / 3.0)
 
 
-def test_runs_of_rows_make_no_difference(tmp_path, monkeypatch):
+def test_the_number_of_rows_in_a_block_makes_no_difference(tmp_path, monkeypatch):
     path, _ = table(tmp_path / 'log.csv')
     write_log(table_log(path, column_map()), tmp_path / 'whole')
     monkeypatch.setattr('thermo_comp.convert.log._RUN_ROWS', 64)
@@ -259,7 +259,7 @@ class TestThinning:
         assert self.kept([float('nan'), 1, float('nan'), 1, 2]) == [1, 4]
         assert self.kept([float('nan')] * 3) == []
 
-    def test_a_clock_that_starts_anew_is_worth_a_message(self):
+    def test_a_clock_that_starts_anew_gives_a_message(self):
         readings = Readings(np.array([5, 6, 1, 2]) * 10**9, np.full(4, 20.0))
         assert (readings.thinned().stamp_ns // 10**9).tolist() == [5, 1]
 
@@ -330,7 +330,7 @@ class TestColumnMap:
 
 
 class TestCommand:
-    def test_says_what_it_did(self, tmp_path, cli):
+    def test_convert_reports_rows_rate_and_topics(self, tmp_path, cli):
         path, _ = table(tmp_path / 'log.csv')
         map_path = tmp_path / 'map.yaml'
         map_path.write_text(
@@ -361,7 +361,7 @@ class TestFreezer:
             pytest.skip(f'no {path}')
         return path
 
-    def test_every_row_is_there_and_the_faults_are_seen(self, path, tmp_path):
+    def test_every_row_is_in_the_bag_and_the_faults_are_reported(self, path, tmp_path):
         columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
         report = write_log(table_log(path, columns), tmp_path / 'bag')
         assert report.rows == report.messages['accel'] == 24514

@@ -66,7 +66,7 @@ def write_ros1(path, rng):
 
 
 @pytest.mark.parametrize('ros', [1, 2])
-def test_topics_of_any_name_become_ours(tmp_path, rng, ros):
+def test_topics_of_any_name_become_the_usual_topics(tmp_path, rng, ros):
     path = write_ros1(tmp_path / 'old.bag', rng) if ros == 1 else write_ros2(tmp_path / 'new', rng)
     report = write_log(bag_log(path), tmp_path / 'bag.mcap')
     recording = read_recording(tmp_path / 'bag.mcap')
@@ -116,13 +116,13 @@ def present(imu, temperature=(), pressure=()):
         (('/robot/baro/t',), ('/robot/baro/p',), None, '/robot/baro/t'),
     ],
 )  # fmt: skip
-def test_neighbours_tell_the_thermometers(temperature, pressure, board, case):
+def test_thermometers_are_identified_by_topics_beside_them(temperature, pressure, board, case):
     imu = '/robot/imu/data' if temperature and temperature[0].startswith('/robot') else '/imu/data'
     topics = find_topics(present([imu], temperature, pressure), None, None, None)
     assert topics == {'imu': imu, 'board': board, 'case': case}
 
 
-def test_what_neighbours_cannot_tell_is_asked():
+def test_ambiguous_topics_must_be_named():
     with pytest.raises(RecordingError, match=r'several topics may be the Imu.*--topic imu='):
         find_topics(present(['/a/data', '/b/data']), None, None, None)
     with pytest.raises(RecordingError, match=r'several topics may be the board.*--topic board='):
@@ -171,13 +171,13 @@ def test_command(tmp_path, rng, cli):
         (32.2, 'unknown'),  # gravity in ft/s^2
     ],
 )
-def test_what_a_still_sensor_reads_says_its_unit(magnitude, unit):
+def test_the_magnitude_at_rest_tells_the_unit(magnitude, unit):
     believed, reason = believed_unit(magnitude)
     assert believed == unit
     assert f'{magnitude:.4g}' in reason
 
 
-def test_nothing_is_said_against_what_may_be_true():
+def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
     # Any magnitude at rest above that of mg may be counts of a precise converter.

@@ -149,7 +149,7 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
-def test_what_was_corrected_is_left_out(tmp_path, rng, course, kept, share):
+def test_samples_corrected_by_ardupilot_are_left_out(tmp_path, rng, course, kept, share):
     path = tmp_path / 'log.BIN'
     force = write_new(path, rng, [('INS_TCAL1_ENABLE', *step) for step in course])
     read = read_autopilot(path)
@@ -160,7 +160,7 @@ def test_what_was_corrected_is_left_out(tmp_path, rng, course, kept, share):
     assert len(read.temperatures['board'].celsius) > 1
 
 
-def test_a_simulator_that_makes_noise_is_said(tmp_path, rng):
+def test_a_log_of_a_simulator_with_noise_is_reported(tmp_path, rng):
     path = tmp_path / 'noisy.BIN'
     write_new(path, rng, parameters=(('SIM_ACC1_RND', 0.1),))
     assert 'SIM_' in read_autopilot(path).metadata['ardupilot_simulated']

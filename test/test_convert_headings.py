@@ -195,7 +195,7 @@ def test_a_slow_log_of_one_attitude_is_in_seconds(tmp_path, step, since):
     assert columns.stamp.unit == 's'
 
 
-def test_some_repeated_rows_leave_a_time_a_time(tmp_path):
+def test_a_time_column_may_have_some_repeated_rows(tmp_path):
     # WHY: a table in which one row in seven was written twice was refused as `not a rising time`.
     times = [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)]
     assert guess_columns(slow_table(tmp_path / 'log.csv', 'time', times)).stamp.unit == 's'
@@ -390,7 +390,7 @@ def test_the_unit_of_times_is_that_of_a_sample_rate(tmp_path, rng, step, unit, r
     np.testing.assert_array_equal(np.diff(table_log(path, columns).stamp_ns), 10**9 // rate_hz)
 
 
-def test_a_second_is_told_from_a_millisecond_by_how_fast_a_hand_turns(tmp_path, rng):
+def test_seconds_and_milliseconds_differ_in_how_fast_a_hand_turns(tmp_path, rng):
     # WHY: samples at 1 Hz were taken for 1 kHz. The tables turn half a turn in 1 s and in 0.8 s.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
@@ -427,7 +427,7 @@ def test_a_hand_s_turns_tell_the_unit_of_the_rate(tmp_path, rng, fastest, unit):
     np.testing.assert_allclose(gyro, expected, atol=1e-6)
 
 
-def test_what_does_not_tell_itself_is_asked_for(tmp_path, rng):
+def test_unidentified_columns_must_be_stated(tmp_path, rng):
     path = tmp_path / 'log.txt'
     time = 0.01 * np.arange(len(UP))
     for size, columns, rate_hz, reason in (

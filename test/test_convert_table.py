@@ -53,7 +53,7 @@ def test_headings_are_optional(tmp_path):
 
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
-def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path, separator):
+def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
     # A row of units counts as a row without numbers; the last row is incomplete.
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
@@ -150,7 +150,7 @@ class TestParquet:
         assert table.values['a'].tolist() == [row[1] for row in ROWS]
         np.testing.assert_array_equal(table.values['b'], [1.0, np.nan, 3.0])
 
-    def test_its_own_timestamps_state_their_unit(self, tmp_path):
+    def test_timestamps_of_parquet_state_their_unit(self, tmp_path):
         path = self.table(
             tmp_path, t=np.array([1767225600123, 0], dtype='datetime64[ms]'), a=[1.0, 2.0]
         )

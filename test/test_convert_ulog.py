@@ -126,7 +126,7 @@ def test_old_layout_without_sample_time(tmp_path, rng):
     np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
 
 
-def test_thermometer_that_is_not_there(tmp_path, rng):
+def test_a_chip_without_a_thermometer_is_recognised(tmp_path, rng):
     log = UlogWriter(ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, (x, y, z) in enumerate(still(rng)):
@@ -226,7 +226,7 @@ def test_a_combined_sensor_that_px4_compensated_is_refused(tmp_path, rng):
 
 
 @pytest.mark.parametrize('begin', [0, 1])
-def test_what_px4_compensated_is_left_out(tmp_path, rng, begin):
+def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     path = tmp_path / 'half.ulg'
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
@@ -237,7 +237,7 @@ def test_what_px4_compensated_is_left_out(tmp_path, rng, begin):
     np.testing.assert_array_equal(read.accel[part], force[part])
 
 
-def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):
+def test_the_use_of_a_log_of_1_hz_is_reported(tmp_path, rng, cli):
     log = UlogWriter(OLD_ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, force in enumerate(still(rng)):

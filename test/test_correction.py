@@ -233,7 +233,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
             assert a + b * x + c * x * x == pytest.approx(expected, rel=0.09)
 
 
-def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
+def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
     # Only the start of a lag of 60 s is uncertain: the sd falls as exp(-t/60).
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     compensator = Compensator(unit, UNCHECKED)
@@ -262,7 +262,7 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
         assert [v for _, v in span] == pytest.approx([variance] * len(span), abs=part)
 
 
-def test_a_further_sensor_that_is_lost_is_paid_for():
+def test_a_lost_further_sensor_widens_the_claimed_sd():
     unit = calibration(
         sensors=SENSORS, response=(term('gradient', (30.0, 0.0, 0.0), sensor='tip'),)
     )
@@ -286,7 +286,7 @@ def test_a_thermometer_that_the_calibration_does_not_know_changes_nothing(rng):
     )
 
 
-def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
+def test_a_swap_of_calibrations_keeps_the_lags_that_the_two_share(rng):
     unit = full_bank(rng)
     events = run_of(rng, seconds=60)
     compensator = Compensator(unit, UNCHECKED)
@@ -300,7 +300,7 @@ def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
     assert compensator.process(61 * SECOND_NS, 0.0, 0.0, 2900.0) is not None
 
 
-def test_the_state_at_the_edge_of_a_column_is_held_and_what_is_cut_off_is_paid_for():
+def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
         response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
@@ -329,7 +329,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
     return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
 
 
-def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
+def test_beyond_the_range_lagging_parts_do_not_lower_the_claimed_sd():
     # Slopes of curve and lag cancel for an error of the thermometer, but not outside the range.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
@@ -342,7 +342,7 @@ def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
 
 
-def test_beyond_the_range_slopes_that_cancel_are_no_knowledge():
+def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
     # The slope of the bias is 0.8 counts/K at the upper edge; a force of 10 m/s^2 cancels it.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
@@ -446,7 +446,7 @@ def test_the_claim_grows_all_the_way_out_of_the_range():
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 
 
-def test_a_part_that_is_still_outside_is_paid_for():
+def test_a_part_that_is_still_outside_the_range_widens_the_claimed_sd():
     bent = axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bent), dynamic=regime_set(bent),

@@ -51,7 +51,7 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng):
         )
 
 
-def test_without_positions_the_prior_is_left():
+def test_without_positions_the_covariance_is_that_of_the_prior():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
     # If an axis is vertical, the variance of |f| is the sum of those of its bias and its scale.
@@ -93,7 +93,7 @@ def test_the_next_direction_lowers_the_mean_variance(n, rng):
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
 
-def test_who_follows_the_proposals_gets_a_good_test():
+def test_the_proposed_directions_make_a_good_test():
     up = NOTHING
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
@@ -107,7 +107,7 @@ def test_who_follows_the_proposals_gets_a_good_test():
     assert farthest(up)[1] < 36.0
 
 
-def test_the_hole_in_the_sphere():
+def test_the_largest_angle_to_the_nearest_direction():
     # The corners of a cube are equally far from its faces.
     up, angle = farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))

@@ -114,7 +114,7 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch):
     assert n_figures == 2
 
 
-def test_refusals_are_quoted_as_they_are_said():
+def test_refusals_on_the_page_are_those_of_the_source():
     text = (ROOT / 'docs' / 'recording.md').read_text()
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10

@@ -142,7 +142,7 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page():
 @pytest.mark.parametrize(
     ('path', 'bag'), [(path, path.stem) for path in FILES], indirect=['bag'], ids=str
 )
-def test_every_command_works_on_the_drivers_bag(path, bag, tmp_path, cli):
+def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
     names, topics = read_names(path), ('--topics', path)
     has_board = path.stem not in LACKS
     printed = cli('info', bag, *topics).stdout
@@ -192,7 +192,7 @@ def warming_unit():
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
-def test_the_node_works_as_the_file_says(path, tmp_path):
+def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from ros_helpers import Peer, node_in_thread, stamped
     from sensor_msgs.msg import Imu, Temperature

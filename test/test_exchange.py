@@ -51,7 +51,7 @@ def cubic():
 
 
 @pytest.mark.parametrize('to', TOOLS)
-def test_foreign_text_makes_no_live_line(cubic, to):
+def test_foreign_text_adds_no_line_to_an_export(cubic, to):
     # WHY: a serial with a line break set a parameter of the vehicle.
     clean = export_calibration(cubic, to).text
     unit = replace(cubic.unit)
@@ -213,7 +213,7 @@ def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic):
         assert reading - offset == pytest.approx(9.81 * up[axis], abs=1e-7)
 
 
-def test_what_is_lost_is_said(cubic):
+def test_losses_of_an_export_are_noted(cubic):
     spline = CubicSpline((-15.0, 0.0, 10.0, 25.0), (0.01, 0.0, 0.02, -0.01))
     static = replace(cubic.static, x=AxisSet(spline, ONE))
     dynamic = replace(static, y=replace(static.y, delta=0.1))
@@ -364,7 +364,7 @@ def test_a_file_that_imu_tk_saved_is_read():
     np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
 
 
-def test_a_full_matrix_is_taken_apart_into_ours_and_a_turn():
+def test_a_full_matrix_becomes_a_triangular_matrix_and_a_rotation():
     SM = np.array([[1.02, 0.03, -0.01], [-0.02, 0.99, 0.02], [0.01, -0.03, 1.01]])
     text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
     back = import_calibration(text, serial='7')

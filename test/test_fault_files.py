@@ -40,7 +40,7 @@ def folder(tmp_path):
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_full_disk(small_disk, folder, cli, name):
+def test_a_command_on_a_full_disk_fails_in_one_line(small_disk, folder, cli, name):
     before, _ = COMMANDS[name]
     output = small_disk / name
     finished = cli(*before, output, code=1, cwd=folder)
@@ -167,7 +167,7 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
-def test_a_command_that_is_asked_to_end_leaves_nothing(folder, name):
+def test_a_terminated_command_leaves_no_file(folder, name):
     # WHY: a hidden file as large as the bag remained after each time-out and each shutdown.
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]

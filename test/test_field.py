@@ -157,7 +157,7 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
 
 
-def test_axes_that_no_rest_shows_keep_their_bits():
+def test_axes_that_no_rest_observes_keep_their_bits():
     unit = known()
     updated = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     new = updated.calibration
@@ -289,7 +289,7 @@ def test_update_by_the_command_line(tmp_path, unit_file, cli):
     assert 'has been updated with all of these rests' in again.stderr
 
 
-def test_nothing_gained_writes_nothing(tmp_path, unit_file, cli):
+def test_an_update_without_gain_writes_no_file(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     log = write_log(tmp_path / 'rests', rests(unit, upright, no_error))
     finished = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', '--json', code=3)

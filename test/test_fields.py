@@ -106,7 +106,7 @@ def test_any_field_of_any_layout(store, rows, cells, is_little):
         ('raw[', 'no `raw\\['),
     ],
 )
-def test_a_path_that_leads_nowhere_is_said(store, path, text):
+def test_a_path_to_no_number_is_refused(store, path, text):
     with pytest.raises(RecordingError, match=text):
         Field('lab_msgs/msg/Deep', path, store.fielddefs)
 
@@ -123,7 +123,7 @@ def test_a_torn_message_is_damaged(store):
         field.read(torn)
 
 
-def test_definitions_are_the_bags_own_or_known_or_said():
+def test_definitions_come_from_the_bag_or_are_known_or_refused():
     known = {'a/msg/B': ('ros2msg', 'float32 t\n'), 'a/msg/C': ('ros2msg', '?')}
     assert Field('a/msg/B', 't', definitions_of('a/msg/B', known)).has_stamp is False
     jazzy = definitions_of('sensor_msgs/msg/BatteryState', {})
@@ -186,7 +186,7 @@ def test_a_bag_with_a_drivers_own_type(tmp_path, store, storage):
     assert case.stamp_ns.tolist() == [START_NS + row * 10**7 for row in range(0, 50, 5)]
 
 
-def test_two_fields_of_one_message_are_no_twins(tmp_path, store):
+def test_two_fields_of_one_message_are_two_inputs(tmp_path, store):
     driver_bag(tmp_path / 'bag', store)
     topic = '/fmu/out/sensor_accel'
     names = {'board': f'{topic}:temperature', 'case': f'{topic}:z'}

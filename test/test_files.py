@@ -127,7 +127,7 @@ def test_only_the_same_kind_is_replaced(tmp_path, kind, there):
         write_atomically(path, b'new', kind, overwrite=False)
 
 
-def test_what_a_command_wrote_is_of_its_kind(folder, cli):
+def test_an_output_of_a_command_is_recognised_as_its_kind(folder, cli):
     for command in (
         ('export', 'unit.yaml', '--to', 'px4', '-o', 'a.params'),
         ('export', 'unit.yaml', '--to', 'ardupilot', '-o', 'a.parm'),

@@ -118,7 +118,7 @@ def test_square_and_cube_are_found_within_their_claims(rng):
     assert all(term.left_out_gain > 1.0 and term.log_evidence_change > 100.0 for term in terms)
 
 
-def test_terms_that_are_not_there_leave_and_nothing_else_moves(rng):
+def test_absent_terms_are_pruned_without_effect_on_the_other_parameters(rng):
     truth, posterior, terms = chosen(rng)
     assert not terms
     assert not posterior.state.nonlinear.any()
@@ -129,7 +129,7 @@ def test_terms_that_are_not_there_leave_and_nothing_else_moves(rng):
         )
 
 
-def test_an_odd_square_joins_only_where_it_is(rng):
+def test_an_odd_square_is_chosen_only_where_it_is_present(rng):
     _, posterior, terms = chosen(rng, kq=1e-5, share=0.0)
     assert [term.kind for term in terms] == ['odd_square']
     assert posterior.state.nonlinear[:, 1] == pytest.approx(1e-5, rel=0.02)
@@ -162,7 +162,7 @@ def test_a_table_of_sections_states_the_force_of_each_rest():
             parse_sections(wrong)
 
 
-def test_a_bag_states_its_force_and_the_user_has_the_last_word(tmp_path):
+def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
     stamps = 10**18 + np.arange(0, 20 * 10**9, 10**8)
     rate = np.zeros((200, 3))
     rate[:, 2] = np.where(np.arange(200) < 100, 0.0, 5.0)

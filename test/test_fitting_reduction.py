@@ -203,7 +203,7 @@ def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):
 
 
 @pytest.mark.parametrize(('seconds', 'left'), [(24.0, 0), (26.0, 600)])
-def test_what_is_left_over_is_kept_from_half_a_window_on(seconds, left, rng):
+def test_a_last_window_is_kept_if_it_is_at_least_half_full(seconds, left, rng):
     (interval,) = reduced([block(still(rng, seconds, (0.0, 0.0, 3000.0)))]).intervals
     assert interval.n_whole == 2
     assert interval.count.tolist() == [1000.0, 1000.0, *([float(left)] if left else [])]
@@ -264,7 +264,7 @@ def course(quantum, noise, rng):
 
 
 @pytest.mark.parametrize(('quantum', 'noise'), [(0.0, 0.005), (0.0, 0.05), (0.0625, 0.005)])
-def test_a_thermometer_is_known_from_its_readings(quantum, noise, rng):
+def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([course(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
     # Noise below a tenth of the quantum is invisible; a tenth is assumed.
@@ -274,7 +274,7 @@ def test_a_thermometer_is_known_from_its_readings(quantum, noise, rng):
     assert learned.fastest_ramp_k_min >= 1.0
 
 
-def test_whole_degrees_are_seen():
+def test_a_quantum_of_a_degree_is_estimated():
     assert quantum_of(np.repeat([20.0, 21.0, 22.0, 24.0], 100)) == 1.0
     assert quantum_of(np.full(100, 20.0)) == 0.0
 

@@ -265,7 +265,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
     assert alone_score.rms == alone_score.sections.rms
 
 
-def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
+def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     # Five of the six faces do not separate bias and scale of the axis whose face is left out.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
@@ -283,7 +283,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
 
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
-def test_no_step_goes_uphill(seed):
+def test_no_step_of_the_solver_increases_the_objective(seed):
     # Bags with few data start far from rest, so the product of initial state and weight matters.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
@@ -298,7 +298,7 @@ def test_no_step_goes_uphill(seed):
     assert np.diff(sizes).max() < 1e-9 * sizes[0]
 
 
-def test_what_takes_no_part_any_more_is_gone(solved):
+def test_excluded_columns_get_zero_weight(solved):
     regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
     # Excluded columns get zero weight even without a step of the solver.

@@ -74,7 +74,7 @@ def calm():
     return *selected_of(truth, windows, up), truth
 
 
-def test_what_explains_nothing_is_not_chosen(calm):
+def test_columns_that_explain_nothing_are_not_chosen(calm):
     regression, chosen, _ = calm
     np.testing.assert_array_equal(chosen.posterior.prior.column_sd > 0.0, [~IDLE, ~IDLE])
     assert chosen_groups(chosen) == {'curve', 'board'}
@@ -85,7 +85,7 @@ def test_what_explains_nothing_is_not_chosen(calm):
     assert not chosen.posterior.state.weights[..., IDLE].any()
 
 
-def test_models_that_were_looked_at_show_their_left_out_errors(calm):
+def test_tried_models_show_their_left_out_errors(calm):
     _, selected, truth = calm
     rms = {trial.groups: trial.score.rms for trial in selected.trials}
     # Constants are tried before the curve; their error is the size of the missing effect.
@@ -98,7 +98,7 @@ def test_models_that_were_looked_at_show_their_left_out_errors(calm):
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
 
-def test_what_is_forced_stays(calm):
+def test_a_forced_group_stays_in_the_model(calm):
     regression, _, truth = calm
     _, chosen = selected_of(truth, regression.windows, calm[1].posterior.state.up, ('idle',))
     assert chosen_groups(chosen) == set(ALL)
@@ -137,7 +137,7 @@ def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, st
     assert chosen.score.rms < 1.2 * truth.sigma[0]
 
 
-def test_noises_come_out(noisy):
+def test_noise_parameters_are_estimated(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
@@ -214,7 +214,7 @@ def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
     assert falls['bias', 'idle'] < 0.5
 
 
-def test_what_a_group_explains_is_what_it_adds(calm):
+def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
     regression, chosen, truth = calm
     columns = regression.windows.columns[:, 2:4]
     evidence = group_evidence(regression, chosen.posterior)
@@ -242,7 +242,7 @@ def test_outliers_do_not_pull(calm):
     np.testing.assert_array_equal(used_with_outliers, used)
 
 
-def test_means_of_few_values_are_no_knocks():
+def test_means_that_take_few_values_are_no_outliers():
     # With a converter that carries its remainder most means are equal, some differ by a count.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
@@ -262,7 +262,7 @@ def test_means_of_few_values_are_no_knocks():
     np.testing.assert_array_equal(np.delete(changed, 100), 1.0)
 
 
-def test_of_two_columns_that_are_almost_one_the_better_stays():
+def test_of_two_almost_equal_columns_the_better_stays():
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(6), n_windows=50)
     columns = windows.columns.copy()
@@ -276,7 +276,7 @@ def test_of_two_columns_that_are_almost_one_the_better_stays():
 
 
 @pytest.mark.parametrize(('start_sd', 'lower', 'upper'), [(0.0, 0.0, 0.15), (1.0, 0.8, 1.0)])
-def test_how_bags_begin_is_learnt(start_sd, lower, upper):
+def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, upper):
     truth = Truth(start_sd=start_sd)
     windows, up = table_of(truth, 18, np.random.default_rng(9), n_windows=60)
     _, chosen = selected_of(truth, windows, up)
@@ -309,7 +309,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 
-def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
+def test_tilts_of_supports_are_estimated_apart_from_the_unit():
     truth = Truth(tilt_sd=5e-6)
     windows, up = table_of(truth, 12, np.random.default_rng(0), n_windows=60)
     stiff = replace(windows, tilt=windows.tilt[:, :0])
@@ -327,7 +327,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
 
-def test_a_stiff_support_is_not_seen_tilting(calm):
+def test_a_stiff_support_gets_no_tilt(calm):
     # The estimated tilt is below the noise of the mean of 60 windows of 2 ug.
     _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)

@@ -136,7 +136,7 @@ def test_sets_and_start_states_by_hand(bags):
 
 @pytest.mark.parametrize('name', ['board', 'case'])
 @pytest.mark.parametrize('is_stuck', [False, True])
-def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
+def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
     # The thermometer is silent or repeats a value from the first ramp until late in the second.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]

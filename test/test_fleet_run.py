@@ -57,7 +57,7 @@ def fleet(tmp_path_factory):
     return folder
 
 
-def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fleet, tmp_path):
+def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client, fleet, tmp_path):
     out = tmp_path / 'out'
     collected = []
 
@@ -107,7 +107,7 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fl
     assert {name for name, known in seen.items() if known} == {'A/good'}
 
 
-def test_paths_that_climb_are_no_door(client, tmp_path):
+def test_paths_with_dots_never_lead_out_of_the_folder(client, tmp_path):
     fleet = tmp_path / 'fleet'
     for seed, name in enumerate(('one', '..two', 'three..')):
         write_unit(fleet / name, seed, 2)
@@ -118,7 +118,7 @@ def test_paths_that_climb_are_no_door(client, tmp_path):
     assert made == {('out', 'units')}
 
 
-def test_bags_that_cannot_be_read_any_more_take_no_result_away(client, tmp_path):
+def test_unreadable_bags_leave_earlier_results_in_place(client, tmp_path):
     # WHY: after a bad mount a second run deleted calibrations and certificates that were good.
     bags = write_unit(tmp_path / 'bags' / 'unit', 1)
     options = replace(OPTIONS, certificates=True)
@@ -197,14 +197,14 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
 
 
 class TestScheduler:
-    def test_nobody_answers(self, fleet, tmp_path, monkeypatch):
+    def test_a_scheduler_that_does_not_answer_is_named(self, fleet, tmp_path, monkeypatch):
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
         with pytest.raises(
             ThermoCompError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers'
         ):
             fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
 
-    def test_it_has_no_worker(self, monkeypatch):
+    def test_a_scheduler_without_workers_is_refused(self, monkeypatch):
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
         with (
             distributed.LocalCluster(
@@ -215,7 +215,7 @@ class TestScheduler:
         ):
             pass
 
-    def test_it_is_used_as_it_is(self, client, fleet, tmp_path, monkeypatch):
+    def test_a_running_scheduler_is_used_if_versions_agree(self, client, fleet, tmp_path, monkeypatch):
         address = client.cluster.scheduler_address
         refused = str(fleet / 'B')
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)

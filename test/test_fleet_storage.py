@@ -102,7 +102,7 @@ class TestElsewhere:
         assert outcome.row['verdict'] == 'failed'
         assert str(outcome.row['left_out']).startswith('unit/a.mcap: ')
 
-    def test_a_protocol_that_nobody_knows(self):
+    def test_an_unknown_protocol_is_refused(self):
         with pytest.raises(ThermoCompError, match='nowhere://x: Protocol not known'):
             Storage('nowhere://x')
 
@@ -157,7 +157,7 @@ class TestDiscovery:
             'f.mcap': ['f.mcap'],
         }
 
-    def test_names_that_somebody_chose_stand_on_one_line(self, tmp_path):
+    def test_names_from_files_are_printed_on_one_line(self, tmp_path):
         write_unit(tmp_path / 'lot\x1b[31m' / 'a\nb', 1, 1)
         write_unit(tmp_path, 1, 1, serial='S1\nCAL_ACC0_ID 7', names=['loose.mcap'])
         units = find_units(Storage(str(tmp_path)))
@@ -184,7 +184,7 @@ class TestDiscovery:
         assert Storage('bags').address == str(tmp_path / 'bags')
         assert Storage('memory://bags').address == 'memory://bags'
 
-    def test_nothing_there(self, tmp_path):
+    def test_a_folder_without_bags_is_refused(self, tmp_path):
         with pytest.raises(ThermoCompError, match='no bag in it; expected DIR/UNIT/BAG'):
             find_units(Storage(str(tmp_path)))
         with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):

@@ -52,7 +52,7 @@ def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
 
 
 class TestOutliers:
-    def test_one_unit_stands_out_in_one_thing(self, rng):
+    def test_one_outlier_in_one_quantity_is_reported(self, rng):
         rows = fleet_of(100, rng)
         rows[17] = {**rows[17], 'bias_y_ug': 50.0 * 12.0}
         (outliers,) = summarise(rows).outliers
@@ -85,7 +85,7 @@ class TestOutliers:
 
 
 class TestDrift:
-    def test_what_changed_between_two_tests(self, rng):
+    def test_a_change_between_two_tests_is_reported(self, rng):
         first = fleet_of(10, rng)
         second = fleet_of(10, rng, day=30.0, like=first)
         second[3] = {**second[3], 'bias_x_ug': float(first[3]['bias_x_ug']) + 40.0}
@@ -131,7 +131,7 @@ def hostile(rng):
 
 
 class TestPage:
-    def test_nothing_of_the_bags_is_markup_and_nothing_needs_a_network(self, rng):
+    def test_text_from_bags_is_no_markup_and_the_page_needs_no_network(self, rng):
         rows = hostile(rng)
         page = render_fleet(rows, summarise(rows), lambda row: f'units/{row["name"]}/c.html')
         assert '<script' not in page
@@ -153,7 +153,7 @@ class TestPage:
 
 
 class TestTable:
-    def test_a_spreadsheet_runs_nothing(self, tmp_path):
+    def test_cells_of_the_table_are_no_formulas(self, tmp_path):
         row = row_of(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)
         _, path = write_tables([row], tmp_path)
         heading, line = path.read_text().splitlines()

@@ -149,7 +149,7 @@ def test_sd_by_hand():
     assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
 
 
-def test_what_is_known_has_no_sd():
+def test_parameters_without_variance_give_no_sd():
     unit = replace(rich_calibration(), posterior=None)
     bias, scale = sd_of_states(unit, ramp_states(unit, np.array([20.0]), 0.0, np.inf))
     assert bias == pytest.approx(np.full((1, 3), 1e-5))
@@ -192,7 +192,7 @@ def test_values_that_are_not_finite_are_left_out(bad):
     assert residual_statistics(np.array([1.0, bad, 1.0])) == residual_statistics(np.ones(2))
 
 
-def test_nothing_to_count_gives_nan():
+def test_statistics_of_no_values_are_nan():
     statistics = residual_statistics(np.zeros(0))
     assert statistics.n == 0
     assert np.isnan([statistics.mean, statistics.rms, statistics.peak]).all()

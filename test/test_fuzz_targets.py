@@ -16,7 +16,7 @@ TARGETS = targets.targets()
 
 
 @pytest.mark.parametrize('name', TARGETS)
-def test_seeds_and_what_is_near_them(name, rng):
+def test_seeds_cut_off_or_changed_do_not_crash_the_targets(name, rng):
     target = TARGETS[name]
     for seed in target.seeds:
         assert len(seed) <= target.max_length

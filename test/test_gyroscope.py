@@ -84,7 +84,7 @@ def held_out(unit):
     return arrays(unit, stations, 99, rate_hz=RATE_HZ)
 
 
-def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
+def test_the_residual_of_a_mems_gyroscope_is_its_noise(unit, fitted, held_out):
     calibration = fitted.calibration
     gyroscope = calibration.gyroscope
     for record in held_out:
@@ -108,7 +108,7 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
-def test_the_fit_tells_what_other_positions_see(fitted):
+def test_left_out_residuals_of_the_fit_hold_for_new_positions(fitted):
     row = fitted.rates[-1]
     assert row.section == 'all'
     assert row.raw.rms > 100.0 * FLOOR
@@ -148,7 +148,7 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
 
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
-def test_within_positions_is_blind_to_levels(places, seed):
+def test_residuals_within_positions_do_not_depend_on_levels(places, seed):
     position = np.sort(np.array(places))
     rng = np.random.default_rng(seed)
     rate, level = rng.standard_normal((len(places), 3)), rng.standard_normal((5, 3))
@@ -277,7 +277,7 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert unknown.exit_code == 0
 
 
-def test_where_no_temperature_changes_nothing_is_wrong(unit, fitted):
+def test_a_bag_without_temperature_change_gives_no_alarm(unit, fitted):
     bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3, rate_hz=RATE_HZ))
     rate = judge_bags(bags, fitted.calibration).rate
     section = rate.sections['all']

@@ -107,7 +107,7 @@ class TestWindows:
         assert len(windows) >= 28
         np.testing.assert_allclose(windows.residual, 0.0, atol=1e-9)
 
-    def test_residuals_are_those_of_the_hand(self, tmp_path):
+    def test_residuals_equal_those_computed_by_hand(self, tmp_path):
         # 10 K above the reference the z axis reads 20 counts more: 20 / 300 m/s^2.
         bag = resting(tmp_path / 'bag', 30.0)
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
@@ -230,7 +230,7 @@ class TestVerdict:
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
     )
-    def test_by_its_own_claim(self, residual, raw, claimed, verdict):
+    def test_the_verdict_compares_residual_and_claimed_sd(self, residual, raw, claimed, verdict):
         judgement = judge(made(residual, raw, claimed), CLAIMING)
         assert judgement.verdict == verdict
         assert judgement.is_valid == verdict.startswith('valid')
@@ -350,7 +350,7 @@ def around(n, bias, scale, noise=0.0):
 
 class TestShifts:
     @pytest.mark.parametrize('n', [6, 18])
-    def test_what_moved_is_named(self, n):
+    def test_changed_parameters_are_named(self, n):
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
         # 12 windows per position with 0.5 ug of noise determine shifts far below 20 ug and 30 ppm.
         judgement = judge(moved, corrected_by(SLOPE, 1e-5), None)

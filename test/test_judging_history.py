@@ -53,7 +53,7 @@ def test_changes_and_their_sd_by_hand():
         assert not change.is_sure
 
 
-def test_what_is_no_history():
+def test_calibrations_that_are_no_history_give_no_drift():
     unit = dated('2026-01-01')
     # A single calibration, models of the same bags, and another unit are no history.
     other = dataclasses.replace(unit, unit=dataclasses.replace(unit.unit, serial='other'))
@@ -65,7 +65,7 @@ def test_what_is_no_history():
     assert not any(drift.is_sure for drift in silent)
 
 
-def test_commands_tell_the_history(cli, tmp_path, monkeypatch):
+def test_commands_print_the_history(cli, tmp_path, monkeypatch):
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(figure, '') for figure in figures])
     now = fitted().calibration

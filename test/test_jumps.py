@@ -87,7 +87,7 @@ def test_bump_that_passes_is_no_jump(rng):
     assert look(rest) == ()
 
 
-def test_what_a_long_absence_leaves_is_no_jump(rng):
+def test_a_change_after_a_long_motion_is_no_jump(rng):
     rest = Rest(rng)
     rows = (rest.time > 300.0) & (rest.time < 360.0)
     rest.accel[rows] += GRAVITY * rng.standard_normal((rows.sum(), 3))

@@ -144,7 +144,7 @@ def circle(uses):
 
 
 @pytest.mark.parametrize('by', ['room', 'file'])
-def test_no_circle(by):
+def test_no_packages_or_files_import_each_other(by):
     # Neither two packages nor two files may import each other, except for type annotations.
     uses = {}
     for path in SOURCES:
@@ -176,7 +176,7 @@ def test_help_starts_without_the_heavy_libraries():
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
 
 
-def test_a_look_at_a_bag_starts_without_the_fit():
+def test_inspecting_a_bag_loads_no_fit():
     heavy = ('scipy', 'matplotlib', 'pydantic', 'rosbags', 'rclpy', 'thermo_comp.fitting')
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 

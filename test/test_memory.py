@@ -55,7 +55,7 @@ def test_a_value_at_the_same_stamp_replaces_the_last_one():
     assert bank.at(0, 3.0)[0] == [2.0]
 
 
-def test_what_is_not_known_of_a_lag():
+def test_the_variance_of_a_lag_by_hand():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
     # A gap of 50 s is more than a tenth of the time constant 100 s, but not of 1000 s.

@@ -107,7 +107,7 @@ def test_imu_input_with_frame_and_switch_of_the_input(peer, saved):
         assert heard[1].linear_acceleration.x == pytest.approx(0.5, rel=1e-12)
 
 
-def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
+def test_the_regime_flag_is_latched_and_absent_while_unknown(peer, saved):
     with node_in_thread(*saved(calibration()), *lossless()) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         flags = peer.listen(Bool, 'regime/dynamic')
@@ -152,7 +152,7 @@ def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
         assert stamps[-1] <= START_NS + n * SECOND_NS
 
 
-def test_diagnostics_name_what_is_wrong(peer, saved):
+def test_diagnostics_name_faults_of_samples(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(thermal_calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')

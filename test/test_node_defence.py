@@ -107,7 +107,7 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
         (ListParameters, 'prefixes'),
     ],
 )
-def test_questions_of_any_length_are_answered(peer, unit, kind, field):
+def test_parameter_requests_of_any_length_are_answered(peer, unit, kind, field):
     # WHY: a request with 100 000 names delayed the samples by more than a second.
     name = 'thermo_comp/' + re.sub('(?<!^)(?=[A-Z])', '_', kind.__name__).lower()
     with node_in_thread(*node_arguments(unit)) as node:
@@ -166,7 +166,7 @@ NOT_CALIBRATIONS = {
 }
 
 
-def test_nothing_of_a_file_that_is_no_calibration_is_told(peer, unit, tmp_path):
+def test_no_content_of_a_file_that_is_no_calibration_is_quoted(peer, unit, tmp_path):
     other = tmp_path / 'other'
     with node_in_thread(*node_arguments(unit)):
         for content, rule in NOT_CALIBRATIONS.items():

@@ -122,7 +122,7 @@ def test_counts(tmp_path):
     assert run(unit, tmp_path / 'bag', tmp_path) == n
 
 
-def test_the_board_says_the_regime_where_there_is_no_case(tmp_path):
+def test_the_board_decides_the_regime_of_a_unit_without_a_case_sensor(tmp_path):
     # WHY: nobody published `regime/dynamic`, and the table of a replay always said `unknown`.
     n = thermal_test(tmp_path / 'bag', has_case=False)
     unit = replace(rich_calibration(), unit=UNIT)

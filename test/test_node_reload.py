@@ -175,7 +175,7 @@ def raising_at(number, call):
     return False
 
 
-def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
+def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
     # WHY: a calibration was refused, and its bias was applied all the same.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)

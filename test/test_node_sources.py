@@ -159,7 +159,7 @@ def numbered(begin, period_s, until_s, start_s=0.0):
 
 @pytest.mark.parametrize('offset', [-7, -1, 0, 1, 2, 1000])
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
-def test_two_that_send_are_never_mixed(offset, period_s):
+def test_two_publishers_that_send_are_never_mixed(offset, period_s):
     first = [(*message, 'own') for message in numbered(500, 0.01, 12.0)]
     begins = 500 + 200 + offset  # numbers near those of the first driver
     other = [(*message, 'other') for message in numbered(begins, period_s, 8.0, start_s=2.003)]
@@ -174,7 +174,7 @@ def test_two_that_send_are_never_mixed(offset, period_s):
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 
 
-def test_without_numbers_two_publishers_are_two():
+def test_without_sequence_numbers_no_publisher_is_taken_as_ended():
     sources = Sources()
     assert sources.of_one(1, [None] * 3, [0, 1, 2]) == 0
     for k in range(5):
@@ -202,7 +202,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer, unit):
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
 
 
-def test_a_driver_that_cannot_be_heard_is_named(peer, unit):
+def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
     reliable = 'qos_overrides./accel/counts.subscription.reliability:=reliable'
     with node_in_thread(*node_arguments(unit, reliable)):
         heard = peer.listen(DiagnosticArray, '/diagnostics')

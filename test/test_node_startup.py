@@ -52,7 +52,7 @@ def arguments(*overrides):
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
     ],
 )  # fmt: skip
-def test_bad_start(overrides, text, unit, tmp_path, capfd):
+def test_a_bad_start_ends_with_one_line(overrides, text, unit, tmp_path, capfd):
     (tmp_path / 'text.yaml').write_text('just words')
     nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)
     (tmp_path / 'nan.yaml').write_text(nan)
@@ -115,7 +115,7 @@ def test_help_that_cannot_be_written(sink, code):
 ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
-def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path, monkeypatch):
+def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
     # Python imports sitecustomize first, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
@@ -171,7 +171,7 @@ def test_unreadable_ros_arguments(capfd):
     assert 'Traceback' not in printed
 
 
-def test_misspelt_parameters_are_said(unit, capfd):
+def test_misspelt_parameters_are_named(unit, capfd):
     overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):

@@ -104,7 +104,7 @@ def test_a_prior_knows_the_offset(rng, plain):
     np.testing.assert_allclose(constants(result)[0], 32768.0 + BIAS, atol=2.0)
 
 
-def test_a_centre_is_found_only_where_there_is_one(rng):
+def test_an_offset_is_found_only_if_positions_determine_it(rng):
     ups = positions(12, 5)
     assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()
     np.testing.assert_allclose(rough_centre(100.0 * ups + 338.0), 338.0, atol=1e-6)

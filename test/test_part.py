@@ -41,7 +41,7 @@ def part_of(path, begin=None, end=None, **options):
 
 @pytest.mark.parametrize('n_messages', [8192, 100])
 @pytest.mark.parametrize(('begin', 'end'), [(20.0, 50.0), (20.0, None), (None, 50.0)])
-def test_what_is_inside_is_there_and_nothing_else(bag, begin, end, n_messages, monkeypatch):
+def test_a_part_contains_exactly_the_messages_inside(bag, begin, end, n_messages, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', n_messages)
     blocks, since = part_of(bag, begin, end, raw=True)
     whole = read_recording(bag, require=()).columns
@@ -75,7 +75,7 @@ def test_stamps_say_the_same_as_seconds(bag):
         np.testing.assert_array_equal(stamped.accel, other.accel)
 
 
-def test_nothing_inside_is_said(bag):
+def test_a_part_without_samples_is_refused(bag):
     with pytest.raises(RecordingError, match=re.escape('no sample is in [500:]')) as refused:
         part_of(bag, 500.0)
     assert str(bag) in str(refused.value)

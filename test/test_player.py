@@ -126,7 +126,7 @@ def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng
     assert printed.strip() == expected
 
 
-def test_says_who_does_not_listen_and_who_may_lose(peer, tmp_path, rng):
+def test_play_names_topics_without_subscriber_and_best_effort_subscribers(peer, tmp_path, rng):
     bag = bag_of(tmp_path / 'bag', 20, rng)
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     peer.listen(Temperature, 'temperature/case', best_effort)

@@ -51,7 +51,7 @@ def test_a_tolerance_makes_it_smaller():
     assert ranks[0] < ranks[-1] <= 30
 
 
-def test_what_is_exactly_known_has_no_variance():
+def test_exactly_known_parameters_have_no_variance():
     covariance = np.zeros((4, 4))
     assert posterior_of(covariance) == Posterior.of(np.empty((4, 0)), np.zeros(4))
     covariance[2, 2] = 9.0
@@ -130,7 +130,7 @@ def test_the_whole_bank_of_two_thermometers_fits_into_a_file():
     assert parse_calibration(content) == value
 
 
-def test_what_no_reader_would_read_is_not_written():
+def test_a_file_above_the_size_limit_is_not_written():
     with pytest.raises(CalibrationError, match=rf'takes \d+ bytes, at most {SIZE_LIMIT} are'):
         dump_calibration(whole_bank(('case', 'frame', 'window')))
 

@@ -62,7 +62,7 @@ def test_the_calibration_s_keys_are_those_of_the_example():
     assert holds(excerpt, example)
 
 
-def test_it_fits_the_page():
+def test_the_readme_is_short_enough():
     lines = README.splitlines()
     assert len(lines) <= 150
     assert [line for line in lines if len(line) > 100 and '|' not in line] == []

@@ -143,7 +143,7 @@ class TestGrowing:
         assert collected.pop('accel') == sent.pop('/accel/counts')
         assert {f'/temperature/{name}': own for name, own in collected.items()} == sent
 
-    def test_what_is_no_bag_is_said(self, tmp_path):
+    def test_a_file_that_is_no_bag_is_refused(self, tmp_path):
         with pytest.raises(RecordingError, match='no such file'):
             next(growing_blocks(tmp_path / 'no.mcap', Topics(), lambda _: True))
         (tmp_path / 'text.mcap').write_text('hello, this is no bag')
@@ -161,7 +161,7 @@ class TestGrowing:
         assert contents(bags) == contents([session])
         assert f'position {N_POSITIONS}: good' in finished.stderr
 
-    def test_a_folder_is_gone_on_with(self, cli, tmp_path):
+    def test_a_second_run_continues_the_folder(self, cli, tmp_path):
         bags = tmp_path / 'bags'
         for number, part in enumerate((UPS[:2], UPS[2:3]), 1):
             bag = write_session(tmp_path / f'part{number}.mcap', part)
@@ -185,7 +185,7 @@ class TestGrowing:
         )
 
 
-def test_what_a_crash_has_left_is_told_and_finished(session, cli, tmp_path):
+def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path):
     # WHY: the hours that a killed run had recorded were left in a hidden file without any message.
     bags = tmp_path / 'bags'
     killed = subprocess.run(

@@ -237,7 +237,7 @@ HUGE = 1 << 60
         (struct.pack('<BQ', 0, 3) + bytes(3), 'not whole'),
     ],
 )  # fmt: skip
-def test_claims_are_not_believed(tmp_path, record, reason):
+def test_false_lengths_in_a_file_need_little_memory(tmp_path, record, reason):
     path = tmp_path / 'bag.mcap'
     path.write_bytes(whole_file(record))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

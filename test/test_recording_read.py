@@ -377,7 +377,7 @@ def test_blocks_have_about_one_size(tmp_path, monkeypatch, n_messages):
     assert np.concatenate([block.accel for block in blocks]).tobytes() == whole.tobytes()
 
 
-def test_a_closed_recording_gives_nothing(tmp_path):
+def test_a_closed_recording_refuses_to_read(tmp_path):
     write_mcap(tmp_path / 'bag.mcap', regular_messages())
     write_rosbag1(tmp_path / 'bag.bag', regular_messages())
     for name in ('bag.mcap', 'bag.bag'):

@@ -262,7 +262,7 @@ def test_the_relaxed_rate_moves_the_end():
 
 
 @pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
-def test_it_closes_with_the_case_or_the_board(sensor):
+def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     # The case lags by 3 min, the board by another 15 min. After the ramp the case's rate falls as
     # exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): they reach the relaxed rate, a
     # tenth of the ramp's, after 7 and 38 min. Steps of 62.5 mK hide the last 5 min of the case.

@@ -167,7 +167,7 @@ def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
     assert all(figure.question in page.text for figure in figures_of(seen))
 
 
-def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
+def test_no_text_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
     # A browser shows names, serials, notes and hashes of a certificate as text, not as HTML.
     evil = '<script>alert("x")</script>'
     bag = write_bag(

@@ -100,7 +100,7 @@ def test_windows_are_means_of_ten_seconds_at_rest():
 
 
 @pytest.mark.parametrize('fault', ['moves', 'shakes', 'stuck', 'tilts', 'saturated', 'gap'])
-def test_what_is_no_rest_is_not_kept(fault):
+def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
     samples = standing(12 * RATE_HZ)
     stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
     if fault == 'moves':

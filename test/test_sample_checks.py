@@ -99,7 +99,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
     np.testing.assert_array_equal(many.run, one.run)  # NaN, before the first sample, equals NaN
 
 
-def test_a_user_may_believe_any_sample():
+def test_a_user_may_switch_checks_of_samples_off():
     compensator = Compensator(
         calibration(), CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     )

@@ -67,7 +67,7 @@ def test_a_good_recording(tmp_path):
          ['1 gaps, the longest 30.2 s', '1 stamps do not rise: those samples are left out']),
     ],
 )  # fmt: skip
-def test_what_a_fit_would_miss_is_named(tmp_path, temperature, options, text):
+def test_faults_of_a_recording_are_named(tmp_path, temperature, options, text):
     findings = survey(tmp_path / 'bag', temperature, **options).findings
     assert [one for one in text if not any(one in found for found in findings)] == []
 

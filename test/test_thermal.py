@@ -107,7 +107,7 @@ def test_no_transition_time_is_the_hard_switch_of_the_paper():
     assert set(ramp(tracker).tolist()) == {0.0, 1.0}
 
 
-def test_lost_case_is_replaced_by_the_boards_rate():
+def test_the_rate_of_a_lost_case_is_replaced_by_the_board_s():
     tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(case_timeout_s=10.0), 600.0)
     t = np.arange(0, 1000)
     board = 20.0 + 0.01 * t

@@ -77,7 +77,7 @@ PARTS = {
 
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
-def test_variances_are_honest(errors, sensor, part):
+def test_claimed_variances_match_squared_errors(errors, sensor, part):
     # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claim
     # includes changes that might have begun, and is up to a few times too large; at the onset and
     # the end the change is real and not yet detected. The mean of the few independent errors of a
@@ -202,7 +202,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
     ('stamp_s', 'reading'),
     [(700, math.nan), (700, math.inf), (700, -math.inf), (599, 20.0), (300, 20.0), (-5, 20.0)],
 )
-def test_what_is_no_number_or_not_newer_changes_nothing(stamp_s, reading):
+def test_readings_not_finite_or_not_newer_change_nothing(stamp_s, reading):
     thermometer = settled()
     before = state(thermometer)
     assert not thermometer.update(stamp_s * SECOND_NS, reading)
@@ -217,7 +217,7 @@ def test_a_small_jump_counts_less_than_a_reading():
     assert abs(thermometer.temperature - 20.0) < 0.004
 
 
-def test_a_step_that_stays_is_believed_after_four_readings():
+def test_a_lasting_step_is_accepted_after_four_readings():
     thermometer = settled()
     used = [thermometer.update((600 + k) * SECOND_NS, 60.0) for k in range(6)]
     assert used == [False, False, False, True, True, True]

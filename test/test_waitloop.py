@@ -65,7 +65,7 @@ class Running:
         assert not self.thread.is_alive()
 
 
-def test_rclpy_still_has_what_is_used_beyond_its_documented_api():
+def test_rclpy_still_has_its_undocumented_attributes_in_use():
     methods = {
         'WaitSet': (
             *('clear_entities', 'add_subscription', 'add_guard_condition', 'add_service'),
@@ -82,7 +82,7 @@ def test_rclpy_still_has_what_is_used_beyond_its_documented_api():
     assert issubclass(RCLError, Exception)
 
 
-def test_what_the_user_set_is_known_by_name(node):
+def test_parameters_set_by_the_user_are_known_by_name(node):
     node.declare_parameter('known', 1)
     assert overrides(node) == {'mispelt': 1, 'known': 2}
 
@@ -102,7 +102,7 @@ def test_messages_come_serialized_in_order_with_their_time(node, peer):
     assert running.received_ns[0] > 0
 
 
-def test_what_a_full_queue_loses_is_counted(node, peer):
+def test_messages_lost_by_a_full_queue_are_counted(node, peer):
     loop = WaitLoop(node)
     raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=10))
     publisher = peer.publisher(Vector3Stamped, 'samples')
@@ -122,7 +122,7 @@ def test_what_a_full_queue_loses_is_counted(node, peer):
     assert raw.n_lost == 51 - len(taken)
 
 
-def test_the_rest_of_the_node_is_served_while_samples_flow(node, peer):
+def test_services_and_timers_are_served_while_samples_flow(node, peer):
     ticks = []
     heard = []
     running = Running(node)
