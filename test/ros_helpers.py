@@ -93,7 +93,7 @@ class Peer:
         return publisher
 
     def join(self, node):
-        """Wait until both ends of every topic have discovered each other: then nothing is lost."""
+        """Wait until both ends of every topic have discovered each other."""
         topics = {subscription.topic_name for subscription in self.node.subscriptions}
         outputs = [output for output in node.node.publishers if output.topic_name in topics]
         # Not every test has all thermometers of the unit.

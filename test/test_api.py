@@ -132,7 +132,7 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # Without a case thermometer the board decides the regime, not earlier than a case thermometer.
+    # Without a case thermometer the board decides the regime, not earlier than the case would.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 

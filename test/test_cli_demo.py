@@ -44,8 +44,7 @@ def test_end_to_end(tmp_path):
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # One set leaves the difference of the regimes, two sets the lags; the noise is below 10
-        # ug.
+        # One set leaves the regimes' difference, two sets leave lags; noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

@@ -195,7 +195,7 @@ def test_one_state_has_the_bits_of_many(boards):
         ({'kind': 'play', **WIDE}, '`width_k` must be greater than 0 for play'),
     ],
 )
-def test_refusals(keys, message):
+def test_impossible_columns_are_refused(keys, message):
     with pytest.raises(ValueError, match=message):
         Column(**{'group': 'gradient', 'kind': 'gradient', **keys})
 

@@ -63,7 +63,7 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # Counts of +g, -g: offset = sum / 2, scale = difference / 2; Eq. (3), (4) swap the two.
+    # Counts of +g and -g: offset = sum / 2, scale = difference / 2, which Eq. (3), (4) exchange.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -135,7 +135,7 @@ def at_seconds(*events):
     ]
 
 
-# A reading from tomorrow, or an applied one, tells which waiting readings are of another clock.
+# An applied reading, or a reading a day later, shows that waiting readings are of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)

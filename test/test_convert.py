@@ -67,7 +67,7 @@ def test_round_trip_through_the_bag(tmp_path):
     np.testing.assert_allclose(
         np.degrees(block.imu.angular_velocity),
         np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
-        rtol=1e-14,  # deg/s to rad/s and back round once each
+        rtol=1e-14,  # conversions to rad/s and back to deg/s round once each
     )
     # The Imu marks the missing orientation by -1, and the unknown covariance of the rate by 0.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
@@ -157,7 +157,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
 
 
 def test_readings_that_are_no_temperatures_are_left_out(tmp_path):
-    # WHY: with 46 readings of -127 degC (DS18B20 without contact) a fit left 0.68 mg, not 0.02.
+    # WHY: with 46 readings of -127 degC (DS18B20 without contact) a fit left 0.68, not 0.02 mg.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in (50, 51, 300):

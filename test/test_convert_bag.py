@@ -218,7 +218,7 @@ def test_a_sensor_that_shows_no_noise_is_not_moving(rng):
     assert stillness.magnitude == pytest.approx(1.0, rel=1e-3)
 
 
-def test_too_short_to_tell():
+def test_the_stillness_of_five_samples_is_unknown():
     stillness = find_stillness(np.arange(5), np.ones((5, 3)))
     assert np.isnan(stillness.magnitude)
     assert stillness.moving_ns == ()

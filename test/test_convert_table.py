@@ -162,7 +162,7 @@ class TestParquet:
         table = read_parquet(path, ['a'], Stamp('t', 's'))
         assert table.stamp_ns.tolist() == [500_000_000, NO_STAMP]
 
-    def test_refusals(self, tmp_path):
+    def test_unreadable_parquet_is_refused(self, tmp_path):
         path = self.table(tmp_path, a=['one', 'two'])
         with pytest.raises(RecordingError, match="column 'a' holds string"):
             read_parquet(path, ['a'], ROWS_ALONE)

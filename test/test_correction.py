@@ -452,7 +452,7 @@ def test_a_part_that_is_still_outside_the_range_widens_the_claimed_sd():
         static=regime_set(bent), dynamic=regime_set(bent),
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
-    # The board is back at 33 degC; a part at 34 degC adds nothing, a part still at 41 degC does.
+    # The board is back at 33 degC; a part at 34 degC adds no variance, a part at 41 degC does.
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     bends = 0.6 / math.sqrt(12.0)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)

@@ -54,7 +54,7 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng):
 def test_without_positions_the_covariance_is_that_of_the_prior():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
-    # If an axis is vertical, the variance of |f| is the sum of those of its bias and its scale.
+    # If an axis is vertical, the variance of |f| is that of the bias plus that of the scale.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
@@ -98,7 +98,7 @@ def test_the_proposed_directions_make_a_good_test():
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
         up = np.vstack([up, next_direction(covariance, SD, up)])
-    # Recommended are first the faces, upright before all, then directions for the misalignment.
+    # Faces are proposed first, beginning with upright, then directions for the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))

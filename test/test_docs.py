@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# Tested elsewhere: the session of cli.md, a bag that plays for minutes, a growing bag.
+# Commands that other files test: a bag that plays for minutes, a recording of 18 positions.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',
     'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',

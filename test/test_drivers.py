@@ -33,7 +33,7 @@ OWN = {
     'float32 mean_temp\n',
     'microstrain_inertial_msgs/msg/MipHeader': 'std_msgs/Header header\nuint8 event_source\n',
 }
-#: Topics of each driver as in docs/drivers.md, and further topics of such a bag.
+#: Topics of each driver as in docs/drivers.md, and further topics of a bag of the driver.
 LAYOUTS = {
     'microstrain': {'/imu/data': IMU, '/mip/sensor/temperature_statistics': MIP},
     'xsens': {
@@ -67,14 +67,14 @@ LAYOUTS = {
 }
 #: Drivers without a temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
-#: Drivers whose bags are fitted, in addition to `LACKS`: one with each kind of message.
+#: Drivers whose bags are fitted, in addition to `LACKS`: one driver for each kind of message.
 FITTED = {'xsens', 'mavros', 'px4', 'phidgets'}
-#: Six faces and the first one again, for REST_S each, while the board warms [K/s].
+#: Six faces and the first face again, for REST_S each, while the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
 RATE, REST_S, WARMING = 10, 75, 0.05
 SECONDS = len(UPS) * REST_S
 GRAVITY, MICRO_G = 9.80665, 9.80665e-6
-#: Errors of the unit [m/s^2], constant and per K, and its noise: 4 ug in the mean of a minute.
+#: Biases of the unit [m/s^2], constant and per K, and noise: 4 ug in the mean of a minute.
 BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]), 1e-3
 
 

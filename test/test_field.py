@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders import calibration, rich_calibration
 from conftest import ROOT, parsed
-from field_helpers import any_way, rests, upright, write_log
+from field_helpers import in_any_attitude, rests, upright, write_log
 from scipy.stats import norm
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
@@ -56,7 +56,7 @@ def jump_of(size, day):
 def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     # A ramp excites every column and both sets; the expected derivatives are finite differences.
     unit = rich_calibration()
-    logged = rests(unit, any_way, no_error, days=1, rate=0.5 / 60.0)
+    logged = rests(unit, in_any_attitude, no_error, days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
     values, scale = parameters_of(unit), np.array([axis.scale_factor for axis in unit.axes])
     covariance = unit.posterior.covariance()

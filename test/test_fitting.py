@@ -116,7 +116,7 @@ def test_the_paper_s_model_on_its_own_physics(golovach):
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # The paper's model has a separate curve for each regime, so there is no row of one set.
+        # The paper's model has a separate curve for each regime, so no residual of one set exists.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
     # The paper's model has a linear static set and a quadratic dynamic set.

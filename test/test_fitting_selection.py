@@ -109,7 +109,7 @@ def test_a_forced_group_stays_in_the_model(calm):
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
-    # The evidence favours the group in three cases; left-out data reject it in the last two.
+    # The evidence favours the group in all cases; left-out data reject it in the first two.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {

@@ -103,7 +103,7 @@ def test_value_is_linear_in_the_free_coefficients(function, t, data):
         (lambda: Exponential(0.0, (1.0,), (0.0,)), 'at least 1 K'),
     ],
 )
-def test_refusals(build, message):
+def test_impossible_functions_are_refused(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 

@@ -208,7 +208,7 @@ class TestWindows:
         (note,) = evaluate([good, short], [('it', CLAIMING)]).notes
         assert note.startswith(f'{short}: no window of 60 s at rest')
 
-    def test_refusals(self, tmp_path):
+    def test_another_unit_and_a_bag_shorter_than_a_window_are_refused(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0, minutes=1.0, serial='T-9')
         with pytest.raises(CalibrationError, match='is of unit T-1'):
             judged(bag, calibration())

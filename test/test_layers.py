@@ -143,19 +143,19 @@ def circle(uses):
         uses = {file: targets for file, targets in uses.items() if file not in leaves}
 
 
-@pytest.mark.parametrize('by', ['room', 'file'])
+@pytest.mark.parametrize('by', ['package', 'file'])
 def test_no_packages_or_files_import_each_other(by):
     # Neither two packages nor two files may import each other, except for type annotations.
     uses = {}
     for path in SOURCES:
         text = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
-        here = unit_of(path) if by == 'room' else text
+        here = unit_of(path) if by == 'package' else text
         imported = (name for _, name in imports_of(path, with_types=False))
         names = {name for name in imported if name.split('.')[0] == 'thermo_comp'}
-        targets = {own_unit(name) if by == 'room' else own_file(name) for name in names}
+        targets = {own_unit(name) if by == 'package' else own_file(name) for name in names}
         uses.setdefault(here, set()).update(target for target in targets if target != here)
     left = circle(uses)
-    assert not left, f'these import each other: {left}'
+    assert not left, f'import each other: {left}'
 
 
 def loaded_after(statement, *watched):

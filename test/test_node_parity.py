@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag played over DDS into the node and its offline replay give the same, bit for bit."""
+"""A bag played over DDS into the node and its offline replay give the same bits."""
 
 import csv
 import gc

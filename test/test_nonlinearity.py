@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import calibration, columns_from_events, rich_calibration, stream
-from field_helpers import any_way, rests
+from field_helpers import in_any_attitude, rests
 from test_correction import UNCHECKED, assert_same, run_of
 
 from thermo_comp.errors import CalibrationError
@@ -156,7 +156,7 @@ def test_a_file_keeps_the_terms_and_refuses_those_that_no_axis_has():
 def test_rests_in_the_field_feel_every_coefficient():
     # The expected derivatives are differences of two evaluations.
     unit = with_covariance(calibration(nonlinearity=BENT), np.random.default_rng(1))
-    logged = rests(unit, any_way, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
+    logged = rests(unit, in_any_attitude, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
     values, scale, step = parameters_of(unit), np.full(3, 300.0), 1e-7
     layout, covariance = parameter_layout(unit), unit.posterior.covariance()

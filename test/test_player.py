@@ -167,7 +167,7 @@ def test_ros1_bags_are_played_in_cdr(peer, tmp_path):
     assert [message.temperature for message in board_heard] == [20.0 + k for k in range(20)]
 
 
-def test_refusals(tmp_path, rng):
+def test_play_refuses_a_negative_rate_and_an_absent_bag(tmp_path, rng):
     bag = bag_of(tmp_path / 'bag', 20, rng)
     with pytest.raises(ValueError, match='`rate` must be zero or positive, got -1'):
         play(bag, rate=-1.0)

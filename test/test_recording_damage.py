@@ -65,7 +65,7 @@ def every_cut(content, position, length):
 def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
-    # `last`: the end of each message of the last chunk, by hand from the layout of a chunk.
+    # `last`: the end of each message of the last chunk, from the layout of a chunk.
     at = position + 9 + 40
     last = []
     while at < position + length:

@@ -361,7 +361,7 @@ def test_a_board_that_died_does_not_hold_the_dynamic_state():
 
 
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
-def test_cooling_is_heating_upside_down(quantum):
+def test_cooling_mirrors_heating(quantum):
     rng = np.random.default_rng(8)
     t = np.arange(-1800.0, 7500.0)
     settings = detector_settings(0.001, quantum)

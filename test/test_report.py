@@ -88,7 +88,7 @@ def page():
     return Page(certificate())
 
 
-def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
+def test_certificate_of_a_fit_states_the_expected_facts(page):
     assert not page.open  # the page closes every tag
     for fact in (
         'Unit thermostatted-0001',

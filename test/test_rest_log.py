@@ -105,14 +105,12 @@ def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
     stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
     if fault == 'moves':
         samples[300:] += 30.0  # step of 0.1 m/s^2
-
     elif fault == 'shakes':
         samples += 60.0 * np.sin(np.arange(len(samples)))[:, None]
     elif fault == 'stuck':
         samples[:] = samples[0]
     elif fault == 'tilts':
         samples[:, 0] += np.linspace(0.0, 100.0, len(samples))  # tilt by 3 mrad/s
-
     elif fault == 'saturated':
         samples[:, 0] = 32767.0
     else:
