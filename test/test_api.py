@@ -219,10 +219,9 @@ def test_a_further_thermometer_goes_in_by_its_name(arrays):
 def test_a_bag_that_is_given_twice_is_refused(root, tmp_path):
     bag = root / 'bags' / 'fit' / '01.mcap'
     copy = shutil.copy(bag, tmp_path / 'copy.mcap')
-    with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
-        tc.fit([bag, copy], gravity=9.80665)
-    with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
-        open_bags([bag, copy])
+    for take in (lambda bags: tc.fit(bags, gravity=9.80665), open_bags):
+        with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
+            take([bag, copy])
 
 
 def test_arrays_that_cannot_be_fitted_are_refused():

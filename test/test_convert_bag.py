@@ -46,28 +46,20 @@ def messages(ros, rng, scale, names):
                 yield topic, kind, now, types[kind](header(now), value, 0.0)
 
 
-def write_ros2(path, rng, scale=G, names=None):
-    names = names or NAMES
-    with Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        store = typestore(2)
-        links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in names.items()}
-        for topic, kind, log_ns, message in messages(2, rng, scale, names):
-            writer.write(links[topic], log_ns, store.serialize_cdr(message, kind))
-    return path
-
-
-def write_ros1(path, rng):
-    with Writer1(path) as writer:
-        store = typestore(1)
+def write_bag(path, rng, ros=2, scale=G):
+    store = typestore(ros)
+    new = {'version': 9, 'storage_plugin': StoragePlugin.SQLITE3}
+    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
+    with Writer1(path) if ros == 1 else Writer2(path, **new) as writer:
         links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in NAMES.items()}
-        for topic, kind, log_ns, message in messages(1, rng, G, NAMES):
-            writer.write(links[topic], log_ns, store.serialize_ros1(message, kind))
+        for topic, kind, log_ns, message in messages(ros, rng, scale, NAMES):
+            writer.write(links[topic], log_ns, serialize(message, kind))
     return path
 
 
 @pytest.mark.parametrize('ros', [1, 2])
 def test_topics_of_any_name_become_the_usual_topics(tmp_path, rng, ros):
-    path = write_ros1(tmp_path / 'old.bag', rng) if ros == 1 else write_ros2(tmp_path / 'new', rng)
+    path = write_bag(tmp_path / ('old.bag' if ros == 1 else 'new'), rng, ros)
     report = write_log(bag_log(path), tmp_path / 'bag.mcap')
     recording = read_recording(tmp_path / 'bag.mcap')
     assert report.messages['accel'] == N
@@ -87,7 +79,7 @@ def test_topics_of_any_name_become_the_usual_topics(tmp_path, rng, ros):
 
 
 def test_unit_is_checked_at_rest(tmp_path, rng):
-    path = write_ros2(tmp_path / 'g', rng, scale=1.0)
+    path = write_bag(tmp_path / 'g', rng, scale=1.0)
     with pytest.raises(RecordingError, match=r'stated in m/s\^2, but .* looks like g'):
         write_log(bag_log(path), tmp_path / 'bag.mcap')
     write_log(bag_log(path, unit='g'), tmp_path / 'bag.mcap')
@@ -136,7 +128,7 @@ def test_ambiguous_topics_must_be_named():
 
 
 def test_command(tmp_path, rng, cli):
-    bag = write_ros2(tmp_path / 'bag', rng, scale=1.0)
+    bag = write_bag(tmp_path / 'bag', rng, scale=1.0)
     refused = cli('convert', bag, '-o', tmp_path / 'out.mcap', code=1)
     assert 'looks like g' in refused.stderr
     finished = cli('convert', bag, '--unit', 'g', '-o', tmp_path / 'out.mcap')

@@ -396,9 +396,8 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
 
 
 def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng):
-    # Correction and regressors are linear in the parameters: the correction must change by the
-    # regressors times the change of the parameters. The range of the dynamic set ends first above,
-    # the range of the static set below.
+    # The correction must change by the regressors times the change of the parameters. The range of
+    # the dynamic set is the first to end above, the range of the static set the first below.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))

@@ -194,7 +194,7 @@ def warming_unit():
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
 def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-    from ros_helpers import Peer, node_in_thread, stamped
+    from ros_helpers import Peer, node_arguments, node_in_thread, stamped
     from sensor_msgs.msg import Imu, Temperature
     from std_msgs.msg import Float64
 
@@ -203,8 +203,8 @@ def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
     names = {'imu': '/imu/uncompensated', 'board': '/temperature/board', **read_names(path)}
     layout = LAYOUTS[path.stem]
     save_calibration(warming_unit(), tmp_path / 'unit.yaml')
-    words = [f'calibration_file:={tmp_path / "unit.yaml"}', f'topics:={path}', 'input:=imu']
-    with node_in_thread(*(word for text in words for word in ('-p', text))) as node:
+    words = node_arguments(tmp_path / 'unit.yaml', f'topics:={path}', 'input:=imu')
+    with node_in_thread(*words) as node:
         heard_topics = {subscription.topic_name for subscription in node.node.subscriptions}
         topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
         board, _, field = names['board'].partition(':')

@@ -89,8 +89,7 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
 
 
 def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, rng):
-    # WHY: soaks with interpolated temperatures, whose noise enters rate and gradient, were
-    # refused.
+    # WHY: soaks were refused for interpolated temperatures, whose noise enters rate and gradient.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)

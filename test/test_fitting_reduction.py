@@ -150,8 +150,7 @@ def test_bad_samples_are_counted_and_left_out(rng):
 
 
 def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
-    # WHY: one -127 degC in 60 readings was learnt as a noise of 14 K, and the fit left 25 times
-    # the error.
+    # WHY: one reading of -127 degC in 60 counted as a noise of 14 K, and left 25 times the error.
     whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0

@@ -310,8 +310,7 @@ def test_excluded_columns_get_zero_weight(solved):
 def test_published_huygens_coefficients_come_back(rng):
     # Huygens HASI accelerometer: sf = 1.30675e-3 - 1.35046e-7 T + 4.02821e-10 T^2 [A/g] and
     # offset = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. The test samples the
-    # curves on a chamber's program, fits in our variables (t from 20 degC, counts of 1 pA) and
-    # converts back.
+    # curves on a chamber's program, fits t from 20 degC and counts of 1 pA, and converts back.
     sf, offset = (1.30675e-3, -1.35046e-7, 4.02821e-10), (-8.9642327e-4, 3.83652e-6, -7.61e-9)
     counts_per_ampere = 1e9
     windows, up = table_of(Truth(misalignment=np.zeros(3)), 12, rng)

@@ -215,9 +215,7 @@ class TestScheduler:
         ):
             pass
 
-    def test_a_running_scheduler_is_used_if_versions_agree(
-        self, client, fleet, tmp_path, monkeypatch
-    ):
+    def test_a_scheduler_of_equal_version_is_used(self, client, fleet, tmp_path, monkeypatch):
         address = client.cluster.scheduler_address
         refused = str(fleet / 'B')
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)

@@ -187,10 +187,9 @@ class TestDiscovery:
     def test_a_folder_without_bags_is_refused(self, tmp_path):
         with pytest.raises(ThermoCompError, match='no bag in it; expected DIR/UNIT/BAG'):
             find_units(Storage(str(tmp_path)))
-        with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
-            find_units(Storage(str(tmp_path / 'gone')))
-        with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
-            find_units(Storage('memory://never-made'))
+        for url in (str(tmp_path / 'gone'), 'memory://never-made'):
+            with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
+                find_units(Storage(url))
 
 
 def test_damage_is_the_bag_s_not_the_file_system_s(tmp_path):

@@ -64,8 +64,7 @@ def diagnosis(peer):
                 values = {value.key: value.value for value in array.status[0].values}
                 if condition(array.status[0], values):
                     collected.append((array, array.status[0], values))
-                    return True
-            return False
+            return bool(collected)
 
         peer.wait_for(look, f'the diagnosis among {[a.status[0].message for a in heard][-3:]}')
         heard.clear()

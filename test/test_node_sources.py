@@ -38,24 +38,15 @@ from thermo_comp.unit.calibration_file import save_calibration
 def contested(peer, heard, topic, send):
     """Let both publishers send until the node reports two, however slowly."""
     text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
-    collected = []
-
-    def look():
-        send()
-        collected.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
-        return bool(collected)
-
-    peer.poll(look, text)
-    assert collected[0].level == DiagnosticStatus.ERROR
-    return collected[0]
+    status = status_with(peer, heard, text, send)
+    assert status.level == DiagnosticStatus.ERROR
+    return status
 
 
 def test_samples_of_a_second_publisher_never_go_out(peer, unit):
     # WHY: samples of a second driver in another attitude were published as the unit's.
     with node_in_thread(*node_arguments(unit)) as node:
-        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
-        samples.go_on()
         other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
 
@@ -65,7 +56,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer, unit):
             strange.vector.x, strange.vector.y = 2000.0 + samples.n_sent % 3, -2000.0
             other.publish(strange)
 
-        status = contested(peer, diagnostics, '/accel/counts', both)
+        status = contested(peer, samples.reports, '/accel/counts', both)
         values = {value.key: value.value for value in status.values}
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
@@ -185,9 +176,7 @@ def test_without_sequence_numbers_no_publisher_is_taken_as_ended():
 
 def test_readings_of_a_second_publisher_are_not_used(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
-        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
-        samples.go_on()
         other = peer.node.create_publisher(Temperature, 'temperature/board', DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
 
@@ -196,7 +185,7 @@ def test_readings_of_a_second_publisher_are_not_used(peer, unit):
             other.publish(stamped(reading, START_NS + samples.n_sent * CYCLE_NS))
             samples.send(10)
 
-        contested(peer, diagnostics, '/temperature/board', both)
+        contested(peer, samples.reports, '/temperature/board', both)
         board = node._compensator.thermal.tracker.board
         assert board.temperature == pytest.approx(20.0, abs=1e-6)
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
@@ -244,14 +233,12 @@ def test_reports_more_often_than_samples_are_no_silence(peer, tmp_path):
 def test_a_reading_far_ahead_is_forgotten(peer, unit):
     # WHY: a reading one day ahead kept WARN until a sample of that day came.
     with node_in_thread(*node_arguments(unit)) as node:
-        heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
-        samples.go_on()
         samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)
         samples.n_sent += 1  # samples alone, without temperature readings
         samples.send(5)
-        status_with(peer, heard, 's ahead of the samples')
+        status_with(peer, samples.reports, 's ahead of the samples')
         samples.go_on()
         peer.wait_for(
-            lambda: heard and 'ahead' not in heard[-1].status[0].message, 'the end of the warning'
+            lambda: 'ahead' not in samples.reports[-1].status[0].message, 'the end of the warning'
         )

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One table gives the parameters their types, ranges, checks and documentation."""
 
-from contextlib import contextmanager
 from dataclasses import fields
 
 import pytest
@@ -10,26 +9,13 @@ import yaml
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-import rclpy
 from make_reference import parameters_table
-from rclpy.context import Context
 from rclpy.parameter import Parameter
+from ros_helpers import bare_node, node_in_thread
 
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.ros import parameters
-from thermo_comp.ros.node import CompensationNode
 from thermo_comp.ros.parameters import NodeConfig, ParameterError
-
-
-@contextmanager
-def bare_node(*overrides):
-    args = [word for override in overrides for word in ('-p', override)]
-    context = Context()
-    rclpy.init(args=['--ros-args', *args], context=context)
-    node = rclpy.create_node('thermo_comp', context=context)
-    yield node
-    node.destroy_node()
-    context.try_shutdown()
 
 
 def test_defaults_are_the_compensators():
@@ -147,13 +133,9 @@ def test_the_parameter_file_states_the_defaults(root):
     assert stated == expected
     overrides = yaml.safe_load(overrides_text.replace('    # ', ''))['qos_overrides']
     calibration = root / 'config' / 'calibration.example.yaml'
-    context = Context()
-    rclpy.init(args=['--ros-args', '-p', f'calibration_file:={calibration}'], context=context)
-    node = CompensationNode(context)
-    for topic, sides in overrides.items():
-        for side, policies in sides.items():
-            for policy, value in policies.items():
-                name = f'qos_overrides.{topic}.{side}.{policy}'
-                assert node.node.get_parameter(name).value == value, name
-    node.close()
-    context.try_shutdown()
+    with node_in_thread('-p', f'calibration_file:={calibration}') as node:
+        for topic, sides in overrides.items():
+            for side, policies in sides.items():
+                for policy, value in policies.items():
+                    name = f'qos_overrides.{topic}.{side}.{policy}'
+                    assert node.node.get_parameter(name).value == value, name

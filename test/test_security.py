@@ -58,11 +58,15 @@ BOMB = '\n'.join(
 )
 
 
+def one_reading(path):
+    with BagWriter(path) as writer:
+        writer.write_temperature('temperature/board', [1], [20.0])
+    return path
+
+
 def test_metadata_with_nested_aliases_is_refused(tmp_path):
     # WHY: merge keys with aliases multiply: 30 lines of YAML expand to 10^28 entries.
-    bag = tmp_path / 'bag'
-    with BagWriter(bag) as writer:
-        writer.write_temperature('temperature/board', [1], [20.0])
+    bag = one_reading(tmp_path / 'bag')
     metadata = bag / 'metadata.yaml'
     metadata.write_text(f'{metadata.read_text()}\n{BOMB}\n')
     with pytest.raises(RecordingError, match='not valid YAML'):
@@ -70,12 +74,7 @@ def test_metadata_with_nested_aliases_is_refused(tmp_path):
 
 
 def test_metadata_of_a_bag_opens_no_file_outside(tmp_path):
-    secret = tmp_path / 'secret.mcap'
-    with BagWriter(secret) as writer:
-        writer.write_temperature('temperature/board', [1], [20.0])
-    bag = tmp_path / 'bag'
-    with BagWriter(bag) as writer:
-        writer.write_temperature('temperature/case', [1], [30.0])
+    secret, bag = one_reading(tmp_path / 'secret.mcap'), one_reading(tmp_path / 'bag')
     metadata = bag / 'metadata.yaml'
     (name,) = (file.name for file in bag.glob('*.mcap'))
     for elsewhere in (str(secret), '../secret.mcap'):

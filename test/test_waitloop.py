@@ -9,13 +9,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-import rclpy
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_helpers import DEEP, TIMEOUT
+from ros_helpers import DEEP, TIMEOUT, bare_node
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
@@ -27,12 +25,8 @@ BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 @pytest.fixture
 def node():
-    context = Context()
-    rclpy.init(args=['--ros-args', '-p', 'mispelt:=1', '-p', 'known:=2'], context=context)
-    node = rclpy.create_node('looped', context=context)
-    yield node
-    node.destroy_node()
-    context.try_shutdown()
+    with bare_node('mispelt:=1', 'known:=2') as node:
+        yield node
 
 
 class Running:
