@@ -59,7 +59,7 @@ def reasons(test):
 
 
 @pytest.mark.parametrize('seconds', [0.7, 25.0, 1e4])
-def test_positions_are_found_however_the_blocks_fall(stream, seconds):
+def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
     begins = []
     for up in UPS:
         begins.append(stream.seconds)

@@ -184,7 +184,7 @@ def test_a_fit_of_arrays_is_the_fit_of_their_bags(root, tmp_path, fitted):
     assert tc.load(tmp_path / 'unit.yaml') == again
 
 
-def test_the_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):
+def test_the_python_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):
     (snippet,) = (body for kind, body in FENCE.findall(README) if kind == 'python')
     (tmp_path / 'bags').symlink_to(root / 'bags')
     tc.save(fitted, tmp_path / 'unit.yaml')
@@ -194,7 +194,7 @@ def test_the_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):
     assert names['out'].specific_force.shape == (15407, 3)
 
 
-def test_a_table_is_read_as_the_command_reads_it(tmp_path):
+def test_tc_read_reads_a_table_by_its_headings(tmp_path):
     table = tmp_path / 'log.csv'
     rows = [
         f'{k / 50},{0.01 * (k % 3)},0.02,{9.8 + 0.01 * (k % 2)},{20 + k // 100}'

@@ -48,7 +48,7 @@ def test_the_readme_s_commands_make_the_sample_bags(command, tmp_path, cli):
             np.testing.assert_allclose(readings.celsius, before.celsius, rtol=1e-12)
 
 
-def test_every_sample_can_be_corrected():
+def test_every_sample_of_the_sample_bags_can_be_corrected():
     # Both temperatures come before the first sample, so that every sample is corrected.
     for path in SHIPPED:
         block = read_recording(path).columns

@@ -20,7 +20,7 @@ def needs_ros():
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 
-def test_end_to_end(tmp_path):
+def test_the_demonstration_runs_end_to_end(tmp_path):
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     words = [sys.executable, str(ROOT / 'benchmarks' / 'demo.py')]
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}

@@ -72,7 +72,7 @@ def test_signed_counts_and_the_printed_equations():
     assert corrected == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
 
 
-def test_every_term_by_hand():
+def test_every_term_of_the_correction_by_hand():
     # The expected values are the formula of the static set at t = 10 K without a gradient or rate.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(

@@ -51,7 +51,7 @@ def column_map(**changes):
     return build(ColumnMap, {**data, **changes})
 
 
-def test_round_trip_through_the_bag(tmp_path):
+def test_a_table_is_unchanged_by_a_round_trip_through_a_bag(tmp_path):
     path, columns = table(tmp_path / 'log.csv')
     gyro = {'columns': ['wx', 'wy', 'wz'], 'unit': 'deg/s'}
     report = write_log(table_log(path, column_map(gyro=gyro)), tmp_path / 'bag')
@@ -100,7 +100,7 @@ def test_counts_become_an_imu_with_a_sensitivity(tmp_path):
     assert not (tmp_path / 'other').exists()
 
 
-def test_an_offset_is_taken_away(tmp_path):
+def test_an_offset_of_raw_words_is_subtracted(tmp_path):
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
     rows = path.read_text().splitlines()
     at = [rows[0].split(',').index(name) for name in ('ax', 'ay', 'az')]
@@ -196,7 +196,7 @@ def test_every_odd_row_is_accounted_for(tmp_path):
     assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 
-def test_a_fixed_rate_gathers_no_rounding(tmp_path):
+def test_stamps_of_a_fixed_rate_do_not_accumulate_rounding(tmp_path):
     path, _ = table(tmp_path / 'log.csv', n=300)
     write_log(table_log(path, column_map(stamp={'rate_hz': 3.0})), tmp_path / 'bag')
     stamps = read_recording(tmp_path / 'bag').columns.accel_stamp_ns
@@ -220,7 +220,7 @@ def test_the_number_of_rows_in_a_block_makes_no_difference(tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ('unit', 'celsius'), [('K', 300.0), ('degF', 212.0), ('raw', 160.0), ('degC', 30.0)]
 )
-def test_temperature_units(tmp_path, unit, celsius):
+def test_temperatures_of_any_unit_become_degc(tmp_path, unit, celsius):
     path, _ = table(tmp_path / 'log.csv')
     raw = {'degc_per_count': 0.0625, 'degc_at_zero': 20.0} if unit == 'raw' else {}
     text = path.read_text().replace(',25.', f',{celsius:g}.')
@@ -251,11 +251,11 @@ class TestThinning:
         stamps = np.arange(len(values), dtype=np.int64) * step_s * 10**9
         return (Readings(stamps, np.array(values)).thinned().stamp_ns // 10**9).tolist()
 
-    def test_a_change_or_ten_seconds_without_one(self):
+    def test_a_reading_is_kept_if_it_changes_or_after_ten_seconds(self):
         assert self.kept([1, 1, 2, 2, 2, 1]) == [0, 2, 5]
         assert self.kept([1] * 10, step_s=4) == [0, 12, 24, 36]
 
-    def test_missing_cells_are_no_readings(self):
+    def test_missing_cells_are_not_kept_as_readings(self):
         assert self.kept([float('nan'), 1, float('nan'), 1, 2]) == [1, 4]
         assert self.kept([float('nan')] * 3) == []
 
@@ -274,7 +274,7 @@ class TestColumnMap:
         path.write_text(yaml.safe_dump({**data, **changes}))
         return path
 
-    def test_shipped_examples_are_valid(self):
+    def test_shipped_column_maps_are_valid(self):
         paths = sorted((ROOT / 'config' / 'columns').glob('*.yaml'))
         assert paths
         for path in paths:
@@ -309,14 +309,14 @@ class TestColumnMap:
              "column 'b' is given twice"),
         ],
     )  # fmt: skip
-    def test_mistakes_name_their_key(self, tmp_path, changes, key, message):
+    def test_mistakes_in_a_column_map_name_their_key(self, tmp_path, changes, key, message):
         path = self.write(tmp_path, **changes)
         with pytest.raises(RecordingError, match=message) as caught:
             load_column_map(path)
         assert str(path) in str(caught.value)
         assert key is None or (caught.value.key or '').startswith(key)
 
-    def test_files_that_are_no_maps(self, tmp_path):
+    def test_files_that_are_no_column_maps_are_refused(self, tmp_path):
         path = tmp_path / 'map.yaml'
         with pytest.raises(ThermoCompError, match=r'map\.yaml: .*No such file'):
             load_column_map(path)

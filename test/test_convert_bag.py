@@ -78,7 +78,7 @@ def test_topics_of_any_name_become_the_usual_topics(tmp_path, rng, ros):
     assert recording.info.metadata['topic_board'] == '/mpu/die'
 
 
-def test_unit_is_checked_at_rest(tmp_path, rng):
+def test_the_stated_unit_is_checked_at_rest(tmp_path, rng):
     path = write_bag(tmp_path / 'g', rng, scale=1.0)
     with pytest.raises(RecordingError, match=r'stated in m/s\^2, but .* looks like g'):
         write_log(bag_log(path), tmp_path / 'bag.mcap')
@@ -127,7 +127,7 @@ def test_ambiguous_topics_must_be_named():
     assert chosen['case'] == '/imu/t1'
 
 
-def test_command(tmp_path, rng, cli):
+def test_convert_takes_a_bag(tmp_path, rng, cli):
     bag = write_bag(tmp_path / 'bag', rng, scale=1.0)
     refused = cli('convert', bag, '-o', tmp_path / 'out.mcap', code=1)
     assert 'looks like g' in refused.stderr

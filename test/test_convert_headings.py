@@ -43,12 +43,12 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
         ('2026-03-29 01:30', 0),
     ],
 )
-def test_dates_with_their_zones(text, seconds):
+def test_dates_with_time_zones_are_read(text, seconds):
     assert exact_ns(text, 'iso') == START_NS + round(seconds * 1e9)
 
 
 @pytest.mark.parametrize('text', ['', '01:30', '2026-13-29 01:30:00', '2026-03-29T01:30:00+2'])
-def test_what_is_no_date_is_no_stamp(text):
+def test_cells_that_are_no_dates_give_no_stamp(text):
     assert exact_ns(text, 'iso') == NO_STAMP
 
 
@@ -166,7 +166,7 @@ def test_the_right_triad_and_thermometers_are_taken():
         ),
     ],
 )
-def test_units_at_the_end_of_a_heading_and_names_of_loggers(headings, accel, units):
+def test_units_and_names_in_headings_of_loggers_are_recognised(headings, accel, units):
     # WHY: `temp_f` was read as degC, and common headings were not recognised.
     names = read_headings(headings.split(','))
     assert names.accel[0] == accel
@@ -303,7 +303,7 @@ def test_headings_without_a_time_take_a_rate(tmp_path, rng):
         guess_columns(path, 100.0)
 
 
-def test_the_guessed_map_is_printed(tmp_path, rng, cli):
+def test_the_guessed_column_map_is_printed(tmp_path, rng, cli):
     accel = UP + 0.002 * rng.standard_normal(UP.shape)
     rows = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(accel)]
     (tmp_path / 'log.csv').write_text('\n'.join(['time (s),ax,ay,az', *rows]))
@@ -315,7 +315,7 @@ def test_the_guessed_map_is_printed(tmp_path, rng, cli):
     assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
 
 
-def test_a_guessed_map_is_printed_once(tmp_path, rng, cli):
+def test_equal_guessed_column_maps_are_printed_once(tmp_path, rng, cli):
     tables = [tmp_path / f'{number}.csv' for number in range(3)]
     for heading, level, table in zip(('time (s)', 'time (s)', 'time_s'), np.eye(3), tables,
                                      strict=True):  # fmt: skip
@@ -350,7 +350,7 @@ def write(path, rng, unit, **columns):
 @pytest.mark.parametrize(
     ('unit', 'text'), [(9.80665, 'm/s^2'), (1.0, 'g'), (1000.0, 'mg'), (4096.0, 'counts')]
 )
-def test_the_unit_is_that_of_gravity(tmp_path, rng, unit, text):
+def test_the_unit_follows_from_the_size_of_gravity(tmp_path, rng, unit, text):
     path = write(tmp_path / 'log.txt', rng, unit, time=0.01 * np.arange(len(UP)))
     columns = guess_columns(path)
     assert spoken_columns(columns) == f'time [s], x y z [{text}]'
@@ -366,7 +366,7 @@ def test_the_unit_is_that_of_gravity(tmp_path, rng, unit, text):
     ('step', 'unit', 'rate_hz'),
     [(0.01, 's', 100), (5.0, 'ms', 200), (10000.0, 'us', 100), (5e6, 'ns', 200)],
 )
-def test_the_unit_of_times_is_that_of_a_sample_rate(tmp_path, rng, step, unit, rate_hz):
+def test_the_unit_of_times_gives_a_plausible_sample_rate(tmp_path, rng, step, unit, rate_hz):
     path = write(tmp_path / 'log.txt', rng, 9.8, time=step * np.arange(1, len(UP) + 1))
     columns = guess_columns(path)
     assert columns.stamp.unit == unit
@@ -386,7 +386,7 @@ def test_seconds_and_milliseconds_differ_in_how_fast_a_hand_turns(tmp_path, rng)
 
 
 @pytest.mark.parametrize(('rest_s', 'gap_s'), [(30, 0), (30, 670), (60, 1), (45, 3)])
-def test_short_rests_at_1_hz_tell_their_unit(tmp_path, rng, rest_s, gap_s):
+def test_times_of_short_rests_at_1_hz_are_seconds(tmp_path, rng, rest_s, gap_s):
     # WHY: cells of 30 and more samples contained two rests, whose mean is shorter than gravity.
     ups = positions(18, 1)
     accel = np.repeat(ups, rest_s, axis=0) + 2e-5 * rng.standard_normal((18 * rest_s, 3))
@@ -399,7 +399,7 @@ def test_short_rests_at_1_hz_tell_their_unit(tmp_path, rng, rest_s, gap_s):
 
 
 @pytest.mark.parametrize(('fastest', 'unit'), [(3.0, 'rad/s'), (170.0, 'deg/s')])
-def test_a_hand_s_turns_tell_the_unit_of_the_rate(tmp_path, rng, fastest, unit):
+def test_turns_by_hand_show_the_unit_of_the_angular_rate(tmp_path, rng, fastest, unit):
     rate = np.linspace(-fastest, fastest, 3 * len(UP)).reshape(-1, 3)
     path = write(tmp_path / 'log.txt', rng, 9.8, rate=rate)
     columns = guess_columns(path, 100.0)

@@ -361,7 +361,7 @@ def curves_at(unit, celsius):
 BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
 
 
-def test_beyond_the_range_curves_go_on_along_their_tangent_for_a_quarter_of_the_span():
+def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span():
     one, two = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
     unit = calibration(static=regime_set(one), dynamic=regime_set(two))
     for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
@@ -395,7 +395,7 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
     np.testing.assert_allclose(static[6:] - static[6], upper * np.array([0, 3, 7.5, 7.5]))
 
 
-def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng):
+def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
     # The correction must change by the regressors times the change of the parameters. The range of
     # the dynamic set is the first to end above, the range of the static set the first below.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
@@ -427,7 +427,7 @@ def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng)
             np.testing.assert_allclose(row, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_the_claim_grows_all_the_way_out_of_the_range():
+def test_the_claimed_sd_grows_with_the_distance_from_the_range():
     unit = rich_calibration()
     correction = Correction(unit)
     slow = SlowUncertainty(unit, correction)

@@ -33,7 +33,7 @@ def mean_variance(ups, at):
     return float(np.mean(np.trace(columns @ covariance @ columns.transpose(0, 2, 1), 0, 1, 2)))
 
 
-def test_columns_are_the_derivatives_of_the_measured_force(rng):
+def test_the_columns_are_derivatives_of_the_measured_force(rng):
     up, step = units(rng, 20), 1e-6
 
     def force(constants):
@@ -58,7 +58,7 @@ def test_without_positions_the_covariance_is_that_of_the_prior():
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
-def test_two_opposite_faces_tell_bias_and_scale_of_their_axis():
+def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
     # Bias and scale of x are half the difference and half the sum of two readings.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
@@ -125,5 +125,5 @@ def test_the_largest_angle_to_the_nearest_direction():
         ((3, 1, 0), '+x and +y up in part: x +0.95 g, y +0.32 g, z +0.00 g'),
     ],
 )
-def test_a_direction_in_words(up, words):
+def test_a_direction_is_described_in_words(up, words):
     assert spoken_direction(np.array(up, float) / np.linalg.norm(up)) == words

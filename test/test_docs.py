@@ -49,7 +49,7 @@ COMMANDS = commands()
 
 
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
-def test_the_command_does_what_the_page_says(page, command, output, desk):
+def test_a_command_on_a_page_gives_the_output_shown(page, command, output, desk):
     if '--install-completion' in command:
         pytest.skip('writes into the home folder of the user')
     finished = desk.run(command)
@@ -59,11 +59,11 @@ def test_the_command_does_what_the_page_says(page, command, output, desk):
         assert is_alike(finished.stdout, output), finished.stdout
 
 
-def test_there_are_commands_to_run():
+def test_pages_have_commands_to_test():
     assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
 
 
-def test_completion_is_a_script_that_bash_takes():
+def test_bash_takes_the_completion_script():
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')

@@ -96,7 +96,7 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_folder_that_is_read_only(folder, cli, name):
+def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
     if os.geteuid():
         locked = folder / 'locked'
         locked.mkdir(mode=0o500)
@@ -185,7 +185,7 @@ def rewritten(torn, whole):
         bag.write_counts('accel/counts', columns.accel_stamp_ns, columns.accel, columns.frame_id)
 
 
-def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder, cli):
+def test_a_fit_uses_the_readable_part_of_torn_bags_and_reports_it(folder, cli):
     torn, whole = folder / 'torn.mcap', folder / 'whole.mcap'
     content = (folder / FIT[0]).read_bytes()
     torn.write_bytes(content[: len(content) // 2])

@@ -63,7 +63,7 @@ parts = st.tuples(words, st.integers(0, 255), floats)
     cells=st.lists(floats, min_size=2, max_size=4),
     is_little=st.booleans(),
 )
-def test_any_field_of_any_layout(store, rows, cells, is_little):
+def test_any_number_of_any_message_layout_is_read(store, rows, cells, is_little):
     kind, part = 'lab_msgs/msg/Deep', store.types['lab_msgs/msg/Part']
     messages = [
         store.types[kind](
@@ -111,7 +111,7 @@ def test_a_path_to_no_number_is_refused(store, path, text):
         Field('lab_msgs/msg/Deep', path, store.fielddefs)
 
 
-def test_a_torn_message_is_damaged(store):
+def test_a_message_that_ends_inside_a_field_is_damaged(store):
     kind = 'px4_msgs/msg/SensorAccel'
     field = Field(kind, 'temperature', store.fielddefs)
     whole = serialized(
@@ -173,7 +173,7 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
-def test_a_bag_with_a_drivers_own_type(tmp_path, store, storage):
+def test_a_bag_with_a_message_type_of_the_driver_is_read(tmp_path, store, storage):
     celsius = driver_bag(tmp_path / 'bag', store, storage)
     names = {'board': '/fmu/out/sensor_accel:temperature', 'case': '/case'}
     recording = read_recording(tmp_path / 'bag', Topics.named(names))
@@ -203,7 +203,7 @@ def test_two_fields_of_one_message_are_two_inputs(tmp_path, store):
         Topics.named({'imu': '/imu/data:linear_acceleration'})
 
 
-def test_info_names_what_could_be_a_second_thermometer(tmp_path, store):
+def test_info_names_topics_that_could_be_a_second_thermometer(tmp_path, store):
     driver_bag(tmp_path / 'bag', store)
     topics = Topics.named({'board': '/case'})
     messages = [

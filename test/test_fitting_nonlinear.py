@@ -76,7 +76,7 @@ def chosen(rng, **terms):
     return truth, selected.posterior, found
 
 
-def test_derivatives_are_those_of_differences(rng):
+def test_derivatives_of_nonlinear_terms_equal_differences(rng):
     _, regression, state = table(rng, 1e-5, 1e-5, 1e-6, radius_sd=0.01)
     sd = rng.uniform(1e-4, 1e-3, 24)
     regression.forces = replace(regression.forces, sd=sd)
@@ -136,7 +136,7 @@ def test_an_odd_square_is_chosen_only_where_it_is_present(rng):
     assert not posterior.state.nonlinear[:, 4].any()
 
 
-def test_a_radius_is_estimated(rng):
+def test_the_radius_of_a_rotation_is_estimated(rng):
     truth, regression, state = table(rng, 1e-5, radius_sd=0.01, radius_error=0.004)
     prior = prior_of(truth, (), nonlinear_sd=prior_sd(regression.forces.kinds, OPTIONS))
     solution = regression.solve(state, prior, n_steps=15)
@@ -205,7 +205,7 @@ def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
         read('a', AskedForce(str(tmp_path / 'bad.txt')))
 
 
-def test_a_constant_rotation_is_a_rest_and_its_change_is_none(rng):
+def test_a_constant_rotation_is_a_rest_a_changing_rotation_is_not(rng):
     time = np.arange(0.0, 240.0, 0.02)
     rate = np.interp(time, [0, 80, 100, 180, 190], [0.0, 0.0, 3.0, 3.0, 0.0])
     force = np.column_stack((0.0 * time, rate**2, 9.8 + 0.0 * time))
@@ -287,7 +287,7 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
     assert square.sd == pytest.approx(50.0, rel=0.2)
 
 
-def test_a_claim_has_the_terms_and_the_radius_as_the_posterior_has_them(rng):
+def test_the_claimed_covariance_includes_nonlinear_terms_and_radius(rng):
     truth, regression, state = table(rng, 1e-5, k3=1e-6, radius_sd=0.01)
     prior = prior_of(truth, (), nonlinear_sd=starting_sd(regression.forces, OPTIONS))
     posterior = regression.solve(state, prior, n_steps=12)

@@ -57,7 +57,7 @@ def still(rng, seconds, level):
     return np.array(level) + 0.3 * rng.standard_normal((int(seconds * RATE_HZ), 3))
 
 
-def test_chunks_do_not_matter(rng):
+def test_the_reduction_does_not_depend_on_the_blocks(rng):
     whole = block(np.rint(still(rng, 61.0, (10.0, -3000.0, 50.0))))
     at_once = reduced([whole])
     for n_parts in (2, 7, 50):
@@ -133,7 +133,7 @@ def test_a_knock_starts_a_new_position(rng):
     assert len(reduced([block(accel)]).intervals) == 2
 
 
-def test_a_drift_is_no_motion(rng):
+def test_a_thermal_drift_is_no_motion(rng):
     # A drift of 100 ppm/K at 3 K/min is 0.015 counts/s, or 0.02 sd of a cell mean per cell.
     accel = still(rng, 300.0, (0.0, 0.0, 3000.0))
     accel[:, 2] += 0.015 * np.arange(len(accel)) / RATE_HZ
@@ -173,7 +173,7 @@ def test_stamps_that_do_not_rise_are_left_out(rng):
     assert bag.intervals[0].count.sum() == 3000
 
 
-def test_time_origin_does_not_matter(rng):
+def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
     samples = still(rng, 30.0, (0.0, 0.0, 3000.0))
     results = []
     for origin in (0, 1_900_000_000_000_000_000):
@@ -243,7 +243,7 @@ def test_impossible_places_are_refused(latitude, height):
 
 
 @pytest.mark.parametrize('gravity', [98.1, -1.0, np.nan])
-def test_gravity_is_that_of_the_earth(gravity):
+def test_a_gravity_not_found_on_earth_is_refused(gravity):
     with pytest.raises(FitError, match='not found on Earth'):
         FitOptions(gravity=gravity)
 
@@ -278,13 +278,13 @@ def test_a_quantum_of_a_degree_is_estimated():
     assert quantum_of(np.full(100, 20.0)) == 0.0
 
 
-def test_no_readings_keep_the_defaults():
+def test_without_readings_the_thermometer_settings_are_the_defaults():
     empty = Readings(np.zeros(0, dtype=np.int64), np.zeros(0))
     base = DetectorSettings()
     assert learn_thermometer([empty], base.board) == base.board
 
 
-def test_a_slow_ramp_is_not_to_be_missed(rng):
+def test_the_detector_settings_follow_the_slowest_ramp(rng):
     n = 9 * 3600
     time = np.arange(0.0, n)
     celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
@@ -298,7 +298,7 @@ def test_a_slow_ramp_is_not_to_be_missed(rng):
 
 
 @pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
-def test_a_coarse_sensor_rests_too(step, rng):
+def test_an_axis_with_a_coarse_quantum_is_at_rest(step, rng):
     # An axis that is constant, or alternates between two values, is at rest at any quantum.
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))

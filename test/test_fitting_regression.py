@@ -154,7 +154,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
-def test_truth_comes_out_without_noise(rng):
+def test_without_noise_the_regression_gives_the_truth(rng):
     truth = Truth(sigma=np.full(3, 1e-9 * MICRO))
     windows, up = table_of(truth, 12, rng)
     regression, state = begin(windows, up)
@@ -174,7 +174,7 @@ def test_truth_comes_out_without_noise(rng):
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 
 
-def test_claimed_sd_is_the_scatter():
+def test_the_claimed_sd_of_the_regression_is_the_scatter_of_errors():
     # With true priors (the inverse Hessian is the Cramer-Rao bound) errors / sd have an RMS of 1,
     # determined by 36 units with 33 partly correlated numbers to 13 % or better.
     rng = np.random.default_rng(11)
@@ -352,7 +352,7 @@ def test_published_huygens_coefficients_come_back(rng):
 
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
-def test_inactive_columns_are_known_as_if_they_took_part(noise):
+def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
     # Linear problem: S is the inverse covariance of the columns, S^-1 Q the estimated weight.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
@@ -404,7 +404,7 @@ def test_tangent_basis_is_orthonormal(rng):
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-14)
 
 
-def test_a_dead_axis_is_refused():
+def test_an_axis_that_reads_one_value_is_refused():
     means = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     with pytest.raises(FitError, match='reads the same in all positions'):
         constant_calibration(means, GRAVITY, with_misalignment=False)

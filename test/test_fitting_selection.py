@@ -167,7 +167,7 @@ def test_prior_sds_are_those_of_the_weights(calm):
         assert len(group.prior_sd) == 2
 
 
-def test_no_weight_is_believed_steeper_than_a_data_sheet():
+def test_the_prior_sd_of_slopes_is_limited_by_data_sheets():
     # For a unit with ten times the steepest plausible slope the prior sd stays at its limit.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
@@ -180,7 +180,7 @@ def test_no_weight_is_believed_steeper_than_a_data_sheet():
     assert per_kelvin == pytest.approx(STEEPEST[0])
 
 
-def test_truth_lies_within_the_claimed_sd(noisy):
+def test_the_truth_of_a_table_is_within_the_claimed_sd(noisy):
     regression, chosen, truth = noisy
     errors = truth.errors(regression, chosen.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
@@ -223,7 +223,7 @@ def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
-def test_outliers_do_not_pull(calm):
+def test_outliers_do_not_shift_the_fit(calm):
     regression, one, truth = calm
     rng = np.random.default_rng(6)
     clean = regression.windows
@@ -284,7 +284,7 @@ def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, up
 
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
-def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
+def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, away):
     # Siblings may differ by less or more than their sd: the evidence selects the true prior.
     _, one, truth = calm
     state = one.posterior.state
@@ -346,7 +346,7 @@ def claimed(n_positions, gravity_sd=0.0):
     return claim.covariance, selection.posterior.covariance
 
 
-def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
+def test_the_claimed_sd_is_larger_if_positions_do_not_determine_the_mounting():
     ratios = []
     for n in (9, 24):
         claim, fitted = claimed(n)

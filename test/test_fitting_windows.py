@@ -56,7 +56,7 @@ def windows_of(bags):
     )
 
 
-def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng):
+def test_memory_on_a_grid_equals_memory_stepped_reading_by_reading(rng):
     spec = MemorySpec(
         ('case', 'tip'),
         (('board', 60.0), ('board', 900.0), ('case', 240.0), ('tip', 7680.0)),
@@ -159,7 +159,7 @@ def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
     np.testing.assert_array_equal(windows.data.columns[both], whole.data.columns[kept])
 
 
-def test_the_lag_of_a_column_moves_it_as_its_slope_says():
+def test_the_derivative_of_a_column_by_its_lag_equals_differences():
     # The expected derivatives are differences of columns with lags shifted by a microkelvin.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
@@ -188,7 +188,7 @@ def test_the_lag_of_a_column_moves_it_as_its_slope_says():
         ({'static_curve': 'linear', 'dynamic_curve': 'linear'}, Polynomial, 1, False),
     ],
 )
-def test_curves(bags, options, static, dynamic, is_shared):
+def test_curves_of_the_fit_by_hand(bags, options, static, dynamic, is_shared):
     sets = sets_of(replace(OPTIONS, **options), bags)
     assert isinstance(sets.static, static)
     assert sets.is_shared == is_shared
@@ -243,7 +243,7 @@ def states_of(windows, calibration):
     return states.T
 
 
-def test_the_file_corrects_as_the_regression(fitted):
+def test_the_calibration_file_corrects_as_the_regression(fitted):
     # Powers of means over a minute differ from means of powers by some ppm at 1 K/min.
     result, _ = fitted
     windows, calibration = result.fit.windows, result.calibration

@@ -144,7 +144,7 @@ def test_unreadable_bags_leave_earlier_results_in_place(client, tmp_path):
     assert third.rows == first.rows
 
 
-def test_an_interrupted_run_goes_on_where_it_was(client, tmp_path):
+def test_an_interrupted_fleet_run_continues(client, tmp_path):
     fleet, out = tmp_path / 'bags', tmp_path / 'out'
     for seed in range(3):
         write_unit(fleet / 'A' / f'u{seed}', seed, 1)
@@ -268,7 +268,7 @@ def command(folder, out, *options):
     return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
 
 
-def test_the_command_s_mistakes(tmp_path, capsys):
+def test_mistakes_of_fleet_fit_end_in_one_line(tmp_path, capsys):
     assert command(tmp_path, tmp_path / 'out') == 2
     assert 'give --gravity, or --latitude and --height' in capsys.readouterr().err
     assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 1
@@ -298,14 +298,14 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(client, tmp_path, capsy
     assert (data['n_fitted'], data['n_done'], data['verdicts']) == (0, 0, {'refused': 1})
 
 
-def test_options_are_part_of_a_result(client, fleet, tmp_path):
+def test_other_options_fit_a_unit_again(client, fleet, tmp_path):
     refused = fleet / 'B'
     fit_fleet(str(refused), tmp_path / 'out', OPTIONS, client=client)
     other = replace(OPTIONS, fit=replace(OPTIONS.fit, min_rest_s=4.0))
     assert fit_fleet(str(refused), tmp_path / 'out', other, client=client).n_done == 1
 
 
-def test_siblings_help_a_unit_that_lacks_data(client, tmp_path):
+def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
     # WHY: one position in the chamber does not separate bias from scale.
     kind = unit_preset('mems', 1)
     siblings = [sibling(kind, number) for number in range(4)]

@@ -119,11 +119,11 @@ class TestDiscovery:
             (['top.bag', 'u/x.db3'], ['top.bag', 'u/x.db3']),
         ],
     )
-    def test_files_to_bags(self, files, bags):
+    def test_files_of_a_folder_are_grouped_into_bags(self, files, bags):
         stored = [StoredFile(name, 1, '') for name in files]
         assert list(group_files(stored)) == bags
 
-    def test_a_folder_per_unit_and_lot(self, tmp_path):
+    def test_folders_give_unit_and_lot(self, tmp_path):
         for name in ('lot-A/u1/1.mcap', 'lot-A/u1/2.mcap', 'lot-B/u2/1.mcap', 'u3/1.mcap'):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).touch()
@@ -192,7 +192,7 @@ class TestDiscovery:
                 find_units(Storage(url))
 
 
-def test_damage_is_the_bag_s_not_the_file_system_s(tmp_path):
+def test_a_damaged_bag_is_no_failure_of_the_file_system(tmp_path):
     (path,) = write_unit(tmp_path / 'u', 1, 1)
     damage(path)
     (units,) = find_units(Storage(str(tmp_path)))

@@ -78,7 +78,7 @@ class TestOutliers:
         assert summarise(rows).outliers == ()
         assert outlier_limit(6, 20) == float('inf')
 
-    def test_alike_units_have_no_spread_to_stand_out_of(self, rng):
+    def test_equal_units_give_no_outliers(self, rng):
         rows = [{**row, 'm_10_urad': 0.0} for row in fleet_of(20, rng)]
         spread = next(one for one in summarise(rows).spreads if one.quantity.name == 'm_10_urad')
         assert (spread.sd, set(spread.z.tolist())) == (0.0, {0.0})
@@ -106,7 +106,7 @@ class TestDrift:
         assert (drift.worst.constant, drift.worst.unit) == ('scale factor z', 'ppm')
         assert drift.worst.change == pytest.approx(90.0)
 
-    def test_an_earlier_table_counts(self, rng, tmp_path):
+    def test_the_table_of_an_earlier_fleet_gives_drifts(self, rng, tmp_path):
         first = fleet_of(3, rng)
         table, _ = write_tables(first, tmp_path)
         before = read_parquet(table)

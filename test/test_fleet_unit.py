@@ -67,7 +67,7 @@ def test_the_verdict_is_that_of_evaluate(fleet, brief, cli, tmp_path):
 
 class TestRow:
     @pytest.mark.usefixtures('no_figures')
-    def test_a_good_unit(self, fleet, brief):
+    def test_the_row_of_a_good_unit(self, fleet, brief):
         outcome = processed(fleet, certificates=True)
         row = outcome.row
         assert (row['name'], row['serial'], row['lot']) == ('lot-A/unit1', 'mems-0001', 'lot-A')
@@ -96,7 +96,7 @@ class TestRow:
         )
         json.dumps(row, allow_nan=False)
 
-    def test_a_corrupt_bag_costs_itself_and_one_cut_off_is_read_up_to_there(self, tmp_path):
+    def test_a_corrupt_bag_is_left_out_and_a_torn_bag_is_read_up_to_the_cut(self, tmp_path):
         paths = write_unit(tmp_path / 'u', 2, 8)
         paths[2].write_bytes(paths[2].read_bytes()[:-300])
         damage(paths[3])

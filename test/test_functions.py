@@ -108,7 +108,7 @@ def test_impossible_functions_are_refused(build, message):
         build()
 
 
-def test_hold():
+def test_hold_clips_values_to_a_range():
     assert [hold(x, -1.0, 2.0) for x in (-3.0, 0.5, 4.0)] == [-1.0, 0.5, 2.0]
     assert hold(np.array([-3.0, 0.5, 4.0]), -1.0, 2.0).tolist() == [-1.0, 0.5, 2.0]
 

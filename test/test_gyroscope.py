@@ -160,7 +160,7 @@ def test_residuals_within_positions_do_not_depend_on_levels(places, seed):
         np.testing.assert_allclose(within[position == p].sum(axis=0), 0.0, atol=1e-12)
 
 
-def test_file_and_triad_round_trip():
+def test_the_round_trip_of_a_gyroscope_is_exact():
     whole = rich_calibration()
     assert parse_calibration(dump_calibration(whole).encode()) == whole
     triad = rate_triad(whole)
@@ -181,7 +181,7 @@ def test_file_and_triad_round_trip():
         rate_triad(calibration())
 
 
-def test_a_file_is_refused_by_key():
+def test_a_bad_gyroscope_in_a_file_is_refused_by_key():
     text = dump_calibration(rich_calibration())
     for old, new, said in (
         ('bias_rad_s: [0.02', 'bias_rad_s: [.nan', r'gyroscope\.bias_rad_s\[0\]'),

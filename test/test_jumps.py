@@ -19,7 +19,7 @@ def look(rest, **keys):
     return find_jumps(bag)
 
 
-def test_quiet_rest_has_none(rng):
+def test_a_quiet_rest_has_no_jump(rng):
     assert look(Rest(rng)) == ()
 
 
@@ -59,7 +59,7 @@ def turned(rest, from_s, angle, with_rate):
 
 
 @pytest.mark.parametrize('seen', [True, False])
-def test_turn_is_told_by_the_gyro(rng, seen):
+def test_a_turn_is_recognised_by_the_gyroscope(rng, seen):
     # A turn by 20 mrad in one sample does not change the norm, so only a gyroscope shows it.
     rest = Rest(rng)
     turned(rest, 250.0, 0.02, with_rate=seen)
@@ -67,7 +67,7 @@ def test_turn_is_told_by_the_gyro(rng, seen):
     assert [round(event.time) for event in events] == ([] if seen else [250])
 
 
-def test_without_a_gyro_it_may_have_been_a_turn(rng):
+def test_without_a_gyroscope_a_turn_is_no_jump(rng):
     rest = Rest(rng)
     turned(rest, 250.0, 0.02, with_rate=False)
     assert look(rest) == ()
@@ -90,7 +90,7 @@ def test_bump_that_passes_is_no_jump(rng):
     assert look(rest) == ()
 
 
-def test_cut_into_blocks_it_is_the_same(rng):
+def test_jumps_do_not_depend_on_the_blocks(rng):
     rest = Rest(rng)
     rest.add((0.0, 5.0 * MG, 20.0 * MG), from_s=300.0)
     whole = look(rest)

@@ -136,7 +136,7 @@ def test_play_names_topics_without_subscriber_and_best_effort_subscribers(peer, 
     assert report.n_messages['/accel/counts'] == 20
 
 
-def test_imu_and_the_bags_own_names(peer, tmp_path, rng):
+def test_imu_messages_are_played_under_the_names_of_the_bag(peer, tmp_path, rng):
     stamps = START_NS + np.arange(300) * CYCLE_NS
     rest = ImuColumns(*(rng.standard_normal((300, k)) for k in (4, 9, 3, 9, 9)))
     with BagWriter(tmp_path / 'bag') as writer:

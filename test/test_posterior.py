@@ -44,7 +44,7 @@ def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, toleranc
     assert posterior.matrix.shape == (n, posterior.rank)
 
 
-def test_a_tolerance_makes_it_smaller():
+def test_a_tolerance_makes_the_factor_smaller():
     covariance = random_covariance(1, 30)
     ranks = [posterior_of(covariance, share).rank for share in (0.1, 1e-3, 1e-5)]
     assert ranks == sorted(ranks)
@@ -86,13 +86,13 @@ def test_negative_rest_is_refused():
         Posterior.of(np.ones((1, 1)), np.array([-1.0]))
 
 
-def test_views_are_read_only():
+def test_arrays_of_a_posterior_are_read_only():
     posterior = posterior_of(np.eye(2))
     with pytest.raises(ValueError, match='read-only'):
         posterior.matrix[0, 0] = 1.0
 
 
-def test_layout_by_hand():
+def test_the_order_of_parameters_by_hand():
     spline = CubicSpline((-5.0, 0.0, 5.0, 9.0), (0.1, 0.0, 0.2, 0.3))
     value = calibration(
         static=regime_set(axis_set((0.0, 1.0, 2.0)), axis_set(), axis_set(scale=(1.0, 1e-4))),

@@ -150,7 +150,7 @@ class TestGrowing:
         with pytest.raises(RecordingError, match=r'text\.mcap'):
             list(growing_blocks(tmp_path / 'text.mcap', Topics(), lambda _: False))
 
-    def test_a_whole_bag_becomes_one_for_each_position(self, session, cli, tmp_path):
+    def test_a_whole_bag_is_split_into_a_bag_per_position(self, session, cli, tmp_path):
         options = ('--positions', f'{N_POSITIONS}', '--soak', '80s', '-o', tmp_path / 'bags')
         finished = cli('record', session, *options, '--json')
         result = json.loads(finished.stdout)
@@ -175,7 +175,7 @@ class TestGrowing:
         other = ('record', bag, '-o', bags, '--serial', 'lab-8')
         assert '01.mcap is of unit lab-7, not lab-8' in cli(*other, code=1).stderr
 
-    def test_usage(self, session, cli, tmp_path):
+    def test_wrong_options_of_record_are_refused(self, session, cli, tmp_path):
         out = ('-o', tmp_path / 'bags')
         printed = cli('record', session, '--soak', '45', *out, code=2).stderr
         assert "--soak: expected a duration like 45min, 1.5h or 30s, got '45'" in printed

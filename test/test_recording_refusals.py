@@ -65,7 +65,7 @@ def test_messages_of_another_layout_are_named(tmp_path, data, reason):
         read(path)
 
 
-def test_ros_1_messages_in_an_mcap_file(tmp_path):
+def test_ros_1_messages_in_an_mcap_file_are_read(tmp_path):
     path = tmp_path / 'bag.mcap'
     numbers = struct.pack('<3d', 1.5, -2.5, 3.5)
     data = struct.pack('<IIII', 9, 12, 34, 4) + b'link' + numbers
@@ -158,7 +158,7 @@ def test_absent_topics_and_topics_of_other_types_are_refused(tmp_path):
     assert len(read(path).columns) == 0
 
 
-def test_a_required_topic_without_messages(tmp_path):
+def test_a_required_topic_without_messages_is_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         bag.write_counts('accel/counts', [1, 2], np.zeros((2, 3)))

@@ -133,7 +133,7 @@ def test_page_has_each_id_once_and_refers_to_ids_it_has(page):
     assert set(re.findall(r'(?:url\(|href=")#([^)"]*)', page.source)) <= set(ids)
 
 
-def test_bag_says_whether_its_fit_has_seen_it(opened):
+def test_the_page_states_whether_a_bag_is_of_the_fit(opened):
     calibration = fitted().calibration
     assert 'positions in bags of the fit' in Page(certificate()).text
     unseen = evidence_of_bags(opened, calibration)
@@ -240,7 +240,7 @@ def test_calibration_alone_makes_a_page_and_its_figures_as_png(tmp_path):
     assert all(path.read_bytes().startswith(b'\x89PNG') for path in files)
 
 
-def test_page_is_written_atomically(tmp_path):
+def test_the_page_is_written_atomically(tmp_path):
     target = tmp_path / 'page.html'
     target.write_text('<!doctype html>old')
     folder = tmp_path / 'figures'
@@ -252,7 +252,7 @@ def test_page_is_written_atomically(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']
 
 
-def test_verdict_and_its_colour(opened):
+def test_the_verdict_has_a_colour(opened):
     assert evidence().level in ('good', 'reserved')
     calibration = fitted().calibration
     narrow = {

@@ -192,7 +192,7 @@ def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
     assert {one.name: one.standard for one in budget(stated, info)}['gravity'] == 0.0
 
 
-def test_table_over_temperature(tmp_path):
+def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
     info = load_certificate_info(lab(tmp_path))
     tables = over_temperature(evidence(), info)
     assert [table.axis for table in tables] == ['x', 'y', 'z']
@@ -254,7 +254,7 @@ def test_conformity_is_stated_to_a_limit_alone():
 
 
 @pytest.mark.usefixtures('no_figures')
-def test_command_takes_the_statements(cli, tmp_path):
+def test_fit_and_report_take_the_statements_of_a_laboratory(cli, tmp_path):
     save_calibration(fitted().calibration, tmp_path / 'unit.yaml')
     given = ('-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'page.html', '--certificate-info')
     cli('report', *given, lab(tmp_path))

@@ -58,7 +58,7 @@ drawings = st.builds(
 
 
 @given(drawings)
-def test_plain_values_build_the_same_again(drawing):
+def test_a_dataclass_is_unchanged_by_a_round_trip_of_plain_values(drawing):
     assert build(Drawing, plain(drawing)) == drawing
 
 

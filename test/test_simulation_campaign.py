@@ -209,7 +209,7 @@ def test_mems_bias_moves_by_hundreds_of_micro_g(seed):
     assert np.all((slope > 90.0) & (slope < 550.0))
 
 
-def test_specimens_differ_and_return():
+def test_specimens_differ_by_seed_and_are_reproducible():
     for name in NAMES:
         assert unit_of(name, 1) == unit_of(name, 1)
         assert unit_of(name, 1) != unit_of(name, 2)

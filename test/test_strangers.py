@@ -64,7 +64,7 @@ def test_the_integration_is_exact_on_the_way():
     assert behind == pytest.approx(3.0 * (1.0 - np.exp(-at / 300.0)), abs=1e-12)
 
 
-def test_still_air_is_another_law_of_the_hidden_node():
+def test_still_air_changes_the_temperature_of_the_hidden_node():
     # In still air the hidden node has another temperature than chamber data predict.
     shares = []
     for environment in (units.CHAMBER, units.STILL_AIR):
@@ -112,7 +112,7 @@ def test_cold_start_is_as_cold_as_the_air_and_then_warms_up():
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
-def test_a_carry_on_loses_no_part_of_a_count():
+def test_a_carried_remainder_loses_no_part_of_a_count():
     words = np.full((1000, 3), 0.3)
     kept, lost = (units.quantised(words, carries) for carries in (True, False))
     assert np.abs(np.cumsum(kept, axis=0) - np.cumsum(words, axis=0)).max() <= 0.5

@@ -84,7 +84,7 @@ def test_possible_serials_are_accepted(serial):
     ],
     ids=lambda command: command[0],
 )
-def test_a_command_line_with_another_serial(command, capsys):
+def test_an_impossible_serial_as_an_option_is_refused(command, capsys):
     assert run([*command, '--serial', FORGED]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('thermo_comp: error: ')

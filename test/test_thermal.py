@@ -52,7 +52,7 @@ def test_memory_start_is_unknown_and_settles():
     assert tracker.is_settled(round((settled_s + 10.0) * 1e9))
 
 
-def test_state_does_not_depend_on_when_it_is_asked_for():
+def test_the_thermal_state_does_not_depend_on_earlier_queries():
     one = ThermalTracker(DetectorSettings(), LAG)
     other = ThermalTracker(DetectorSettings(), LAG)
     t = np.arange(0, 3000)
@@ -67,7 +67,7 @@ def test_state_does_not_depend_on_when_it_is_asked_for():
     assert one.sample(at) == other.sample(at)
 
 
-def test_results_do_not_depend_on_the_origin_of_time():
+def test_the_thermal_state_does_not_depend_on_the_origin_of_time():
     epoch_ns = 1_790_000_000 * SECOND_NS
     one = ThermalTracker(DetectorSettings(), LAG)
     other = ThermalTracker(DetectorSettings(), LAG)

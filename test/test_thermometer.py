@@ -99,7 +99,7 @@ def test_claimed_variances_match_squared_errors(errors, sensor, part):
         ('10 mK, 1 K steps', 0.1, 0.06),
     ],
 )  # fmt: skip
-def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
+def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min):
     # Limits: 1.5 times the errors found (averaged noise); steps of 1 K give the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]

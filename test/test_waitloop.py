@@ -185,7 +185,7 @@ def test_a_regular_call_goes_on_with_and_without_samples(node, peer):
     assert len(called) <= n_called + 1
 
 
-def test_stops_when_the_context_is_shut_down(node):
+def test_the_loop_stops_when_the_context_is_shut_down(node):
     with Running(node) as running:
         node.context.shutdown()
         running.thread.join(TIMEOUT)
