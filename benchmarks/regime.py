@@ -105,7 +105,7 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
 
 
 def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
-    """Switches per hour of soak by sensor."""
+    """Return the rows of false switches per hour of soak by sensor."""
     runs = max(1, round(hours / len(SENSORS) / SOAK_H))
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, SOAK_H, seed + k) for scene in scenes for k in range(runs)]

@@ -148,7 +148,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
     lines = path.read_text().splitlines()
     for k in range(201, 401):
         at, _, rest = lines[k].partition(',')
-        lines[k] = f'{float(at) - 2500.0},{rest}'  # set back by 2.5 s
+        lines[k] = f'{float(at) - 2500.0},{rest}'  # the clock is set back by 2.5 s
     path.write_text('\n'.join(lines))
     write_log(table_log(path, column_map()), tmp_path / 'bag')
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']

@@ -339,7 +339,7 @@ def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
 
 
 def write(path, rng, unit, **columns):
-    """Write three rests with other data before and after."""
+    """Write a table of rests with forces in `unit` per g, and times and rates if given."""
     accel = unit * (UP + 0.002 * rng.standard_normal(UP.shape))
     parts = [columns['time'][:, None]] if 'time' in columns else []
     parts += [accel, columns['rate']] if 'rate' in columns else [accel]

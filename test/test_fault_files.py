@@ -108,7 +108,7 @@ def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
 
-#: Runs the command; kills itself when the temporary file is open, or before its renaming.
+#: A process that runs a command and kills itself as its temporary file is open or complete.
 KILLED = """
 import os, signal, sys
 point, target = sys.argv[1:3]

@@ -32,7 +32,7 @@ ZERO = np.zeros(3)
 
 
 def known(**keys):
-    """Make a calibration that knows its biases to 10 ug and its scales to 10 ppm."""
+    """Make a calibration with an sd of 10 ug of its biases and of 10 ppm of its scales."""
     value = calibration(noise_density_m_s2_sqrt_hz=(60 * MICRO_G,) * 3, **keys)
     layout = parameter_layout(value)
     sd = np.zeros(layout.n_parameters)

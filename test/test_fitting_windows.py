@@ -79,7 +79,7 @@ def test_memory_on_a_grid_equals_memory_stepped_reading_by_reading(rng):
 
 
 def test_columns_are_those_of_the_tracker(bags):
-    # The expected columns come from a tracker that gets readings and samples as online.
+    # The expected columns come from a tracker that gets readings and samples one by one.
     windows = windows_of(bags)
     spec = memory_of(bank())
     table = ColumnTable(bank(), spec, 20.0)

@@ -172,7 +172,7 @@ def test_ramp_is_what_the_memory_makes_of_one(rate):
         if isinstance(quantity, Gradient):
             assert state[place] == pytest.approx(100.0 * rate)
         elif isinstance(quantity, Lag):
-            # Here the gradient rises within the first of 900 s, in `ramp_states` at once.
+            # In the memory the gradient rises within the first of 900 s, in `ramp_states` at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
             # A play on the lag would reach its end only after half an hour.

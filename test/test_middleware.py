@@ -121,7 +121,7 @@ def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, mo
     monkeypatch.setenv(VARIABLE, str(other))
     drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's profile timed events are due 50 times, samples 700 times a second.
+    # With the node's profile events are due 50 times a second, samples 700 times.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 

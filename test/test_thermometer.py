@@ -79,8 +79,8 @@ PARTS = {
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_claimed_variances_match_squared_errors(errors, sensor, part):
     # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claimed
-    # variance is up to a few times too large, for changes that might have begun; after an onset or
-    # an end it holds. The few independent errors of a coarse sensor scatter by a factor of 2.
+    # variance allows for changes that have not begun, and is a few times too large; at an onset or
+    # an end a change begins. The few errors of a coarse sensor scatter by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
