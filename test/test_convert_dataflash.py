@@ -166,7 +166,7 @@ def test_a_log_of_a_simulator_with_noise_is_reported(tmp_path, rng):
     assert 'SIM_' in read_autopilot(path).metadata['ardupilot_simulated']
 
 
-def test_torn_log_is_read_up_to_the_tear(tmp_path, rng):
+def test_a_torn_dataflash_log_is_read_up_to_the_cut(tmp_path, rng):
     path = tmp_path / 'torn.BIN'
     force = write_new(path, rng)
     whole = path.read_bytes()

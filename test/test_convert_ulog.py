@@ -139,7 +139,7 @@ def test_a_chip_without_a_thermometer_is_recognised(tmp_path, rng):
     assert not read_autopilot(path).temperatures
 
 
-def test_torn_log_is_read_up_to_the_tear(flight):
+def test_a_torn_ulog_is_read_up_to_the_cut(flight):
     path, truth = flight
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])

@@ -52,7 +52,7 @@ def test_a_command_on_a_full_disk_fails_in_one_line(small_disk, folder, cli, nam
 
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
-def test_a_conversion_on_a_full_disk_leaves_no_draft(small_disk, tmp_path, cli):
+def test_a_conversion_on_a_full_disk_leaves_no_file(small_disk, tmp_path, cli):
     table = tmp_path / 'log.csv'
     samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
     rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]

@@ -106,7 +106,7 @@ def test_derivatives_of_nonlinear_terms_equal_differences(rng):
                 np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 
 
-def test_square_and_cube_are_found_within_their_claims(rng):
+def test_square_and_cube_are_estimated_within_their_claimed_sd(rng):
     _, posterior, terms = chosen(rng, k2=1e-5, k3=-1e-6)
     assert [term.kind for term in terms] == ['square', 'cube']
     places = posterior.layout.nonlinear[:, [0, 2, 3, 5]]
@@ -238,7 +238,7 @@ def source(run, spin, name):
     return source_of(*arrays_of(run), name=name, force=force)
 
 
-def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
+def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
     # For speed the test has one temperature, and nine mountings at 1, 3 and 8 g.
     unit = replace(triad('plain', 3), bend=Bend((10.0, -10.0, 10.0), (1.0, 1.0, -1.0)))
     time, rate = steps((150.0,), tuple(np.sqrt([3.0 * G, 8.0 * G])), 150.0, 20.0)

@@ -98,7 +98,7 @@ def test_windows_are_means_of_their_samples(rng):
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
 
 
-def test_positions_in_one_bag_are_told_apart(rng):
+def test_positions_in_one_bag_are_separated(rng):
     turn = np.linspace((0.0, 0.0, 3000.0), (3000.0, 0.0, 0.0), 3 * RATE_HZ)
     turn += 40.0 * rng.standard_normal(turn.shape)
     accel = np.vstack(
@@ -189,7 +189,7 @@ def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
     # Cells of 0.5 s fill a window of 10 s; cells of 30 samples do not at 4 Hz and 1 Hz.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
-def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):
+def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng):
     n = round(150 * rate_hz)
     accel = np.array((0.0, 0.0, 3000.0)) + 0.3 * rng.standard_normal((n, 3))
     bag = reduced([ArrayBlock(stamps(n, rate_hz), accel)])
@@ -225,7 +225,7 @@ def test_fast_readings_are_averaged(rng):
     # Expected: gravity by WGS 84 at the equator, the pole and 45 degrees, as published.
     [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
 )
-def test_normal_gravity_of_the_tables(latitude, height, expected):
+def test_normal_gravity_agrees_with_published_values(latitude, height, expected):
     assert normal_gravity(latitude, height) == pytest.approx(expected, abs=1e-8)
     assert normal_gravity(-latitude, height) == normal_gravity(latitude, height)
 

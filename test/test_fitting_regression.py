@@ -223,7 +223,7 @@ def scored(groups, n, rng, *, n_windows, step_s, **changes):
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.2)])
-def test_leaving_a_position_out_is_a_fit_without_it(rng, groups, tolerance):
+def test_the_left_out_error_of_a_position_is_that_of_a_fit_without_it(rng, groups, tolerance):
     windows, _, regression, prior, whole, score = scored(
         groups, 14, rng, n_windows=20, step_s=240.0, offset_sd=3.0 * MICRO,
         noise=Noise(0.1, 1000.0),
@@ -243,7 +243,7 @@ def test_leaving_a_position_out_is_a_fit_without_it(rng, groups, tolerance):
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.05)])
-def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
+def test_the_left_out_error_of_a_section_is_that_of_a_fit_without_it(rng, groups, tolerance):
     windows, up, regression, prior, whole, score = scored(
         groups, 12, rng, n_windows=24, step_s=200.0
     )
@@ -384,7 +384,7 @@ def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
     assert not inactive.chosen(wide, asked, 1e9, 9).any()
 
 
-def test_only_the_matrix_that_rounding_made_indefinite_gets_more_jitter(rng):
+def test_only_a_matrix_made_indefinite_by_rounding_gets_more_jitter(rng):
     root = rng.standard_normal((3, 3))
     good, bad = root @ root.T, np.ones((3, 3)) - 1e-10 * np.eye(3)
     factor = factored(np.stack((good, bad)))

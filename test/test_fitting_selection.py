@@ -108,7 +108,7 @@ def test_a_forced_group_stays_in_the_model(calm):
 @pytest.mark.parametrize(
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
-def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
+def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen):
     # The evidence favours the group in all cases; left-out data reject it in the first two.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
@@ -191,7 +191,7 @@ def test_the_truth_of_a_table_is_within_the_claimed_sd(noisy):
     assert np.abs(every).max() < 4.0
 
 
-def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
+def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_without_it():
     # Savage-Dickey against a solution without the group: exact except for the directions.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))

@@ -78,7 +78,7 @@ def test_memory_on_a_grid_equals_memory_stepped_reading_by_reading(rng):
             np.testing.assert_allclose(on_grid[k], row, atol=1e-9)
 
 
-def test_columns_are_those_of_the_tracker(bags):
+def test_columns_of_the_fit_are_those_of_the_tracker(bags):
     # The expected columns come from a tracker that gets readings and samples one by one.
     windows = windows_of(bags)
     spec = memory_of(bank())
@@ -111,7 +111,7 @@ def test_columns_are_those_of_the_tracker(bags):
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
-def test_sets_and_start_states_by_hand(bags):
+def test_columns_of_sets_and_start_states_by_hand(bags):
     windows = windows_of(bags)
     data = windows.data
     t, w = windows.temperature - 20.0, windows.weight
@@ -262,7 +262,7 @@ def test_the_calibration_file_corrects_as_the_regression(fitted):
     assert prior.sigma.min() > 0.0
 
 
-def test_covariance_of_the_file_is_that_of_the_claim(fitted):
+def test_the_covariance_of_the_file_is_that_of_the_regression(fitted):
     # The parameters of the file and of the regression give the same variance of levels.
     result, claim = fitted
     calibration = result.calibration
@@ -284,7 +284,7 @@ def test_covariance_of_the_file_is_that_of_the_claim(fitted):
     np.testing.assert_allclose(by_file[-3:][[0, 2]], sd[places], rtol=1e-4)
 
 
-def test_sections_and_kelvins_by_hand(bags):
+def test_sections_and_column_scales_in_kelvins_by_hand(bags):
     windows = windows_of(bags)
     data, t = windows.data, windows.temperature - 20.0
     for p in range(data.n_positions):

@@ -170,7 +170,7 @@ def children_of(pid):
     return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
-def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
+def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
     # WHY: on Ctrl-C each starting worker, and then Dask, printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
@@ -245,7 +245,7 @@ class _Future:
         (_Future('lost'), 'the scheduler was lost'),
     ],
 )
-def test_a_task_that_ends_badly_is_a_row_to_be_done_again(future, problem, fleet, tmp_path):
+def test_a_failed_task_is_a_row_that_the_next_run_repeats(future, problem, fleet, tmp_path):
     unit = find_units(Storage(str(fleet)))[0]
     outcome = outcome_of(future, unit)
     assert outcome is not None
@@ -279,7 +279,7 @@ def test_mistakes_of_fleet_fit_end_in_one_line(tmp_path, capsys):
     assert len(printed.splitlines()) == 1
 
 
-def test_a_unit_without_a_calibration_leaves_exit_code_1(client, tmp_path, capsys):
+def test_a_unit_without_a_calibration_gives_exit_code_1(client, tmp_path, capsys):
     write_unit(tmp_path / 'bags' / 'u', 1, 3, is_exchanged=True)
     same = FleetOptions(FitOptions(gravity=9.81), Topics())
     fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', same, client=client)

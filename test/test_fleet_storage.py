@@ -75,7 +75,7 @@ class TestElsewhere:
         assert other.hashes == {name: digest(unit.parent / name) for name in here.bags}
 
     @pytest.mark.parametrize('name', ['pos1', 'pos1.db3'])
-    def test_any_storage_is_read_from_elsewhere_and_leaves_no_copy(
+    def test_bags_of_any_storage_are_read_from_a_url_and_leave_no_copy(
         self, name, tmp_path, memory, monkeypatch
     ):
         fs, url = memory
@@ -94,7 +94,7 @@ class TestElsewhere:
         assert outcome.hashes == {f'unit/{name}': digest(path.with_name(name))}
         assert list((tmp_path / 'scratch').iterdir()) == []
 
-    def test_a_file_that_vanishes_may_come_back(self, memory):
+    def test_a_unit_whose_bag_vanished_is_not_final(self, memory):
         _, url = memory
         gone = {'unit/a.mcap': [StoredFile('unit/a.mcap', 5, '')]}
         outcome = process_unit(FoundUnit('unit', '', gone), url, OPTIONS)

@@ -60,14 +60,14 @@ class TestOutliers:
         assert outliers.value == 600.0
         assert outliers.z == pytest.approx(12.0, rel=0.3)
 
-    def test_a_twelfth_of_bad_units_does_not_hide_them(self, rng):
+    def test_a_twelfth_of_bad_units_is_reported(self, rng):
         rows = fleet_of(60, rng)
         for i in range(5):
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
         assert {one.serial for one in summarise(rows).outliers} == {f'S{i:03d}' for i in range(5)}
 
     @pytest.mark.parametrize('n', [10, 40])
-    def test_a_fleet_without_oddities_alarms_once_in_twenty(self, n, rng):
+    def test_fleets_without_outliers_have_a_false_alarm_in_one_of_twenty(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
         # 60 fleets with a false alarm rate of 0.05 give 3 alarms on average, and 12 once in 30000.
         assert n_alarms < 12
@@ -145,7 +145,7 @@ class TestPage:
         assert "default-src 'none'" in page
         assert page.count('<figure') == 2
 
-    def test_a_fleet_without_a_calibration(self):
+    def test_the_page_of_a_fleet_without_a_calibration(self):
         rows = [row_of(name='u', serial='u', verdict='failed', problem='x: damaged')]
         page = render_fleet(rows, summarise(rows), lambda _: '')
         assert '0 of 1 test gave a calibration.' in page
@@ -162,7 +162,7 @@ class TestTable:
         assert (cells['name'], cells['serial']) == ("'=cmd()", "'-1")
         assert (cells['n_bags'], cells['raw_ug'], cells['board_lag_s']) == ('3', '-1.5', '')
 
-    def test_what_is_no_fleet_table(self, tmp_path):
+    def test_a_file_that_is_no_fleet_table_is_refused(self, tmp_path):
         (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')
         with pytest.raises(ThermoCompError, match=r'x\.parquet: not a fleet table'):
             read_parquet(tmp_path / 'x.parquet')
@@ -172,14 +172,14 @@ class TestTable:
         with pytest.raises(ThermoCompError, match='lacks the columns serial and verdict'):
             read_parquet(tmp_path / 'y.parquet')
 
-    def test_the_page_of_the_docs_lists_every_column(self):
+    def test_the_page_on_fleets_lists_every_column(self):
         text = (ROOT / 'docs' / 'fleet.md').read_text()
         listed = re.findall(r'^\| `(\w+)` \| (\w+) \| (.*) \|$', text, re.MULTILINE)
         assert [(name, kind, meaning.replace('\\|', '|')) for name, kind, meaning in listed] == [
             (column.name, column.kind, column.meaning) for column in COLUMNS
         ]
 
-    def test_a_strange_column_is_a_mistake(self):
+    def test_a_row_with_an_unknown_column_is_refused(self):
         with pytest.raises(ValueError, match="no column 'colour'"):
             row_of(colour='red')
 
@@ -195,7 +195,7 @@ def test_no_name_leads_out_of_the_results(name, tmp_path):
     assert inside in folder.resolve().parents
 
 
-def test_results_need_a_folder(tmp_path):
+def test_results_are_not_written_into_a_file(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(ThermoCompError, match='file: cannot be created'):
         Results(tmp_path / 'file')

@@ -37,7 +37,7 @@ def test_residual_of_a_good_calibration_is_within_its_sd(rng):
     assert result.is_still
 
 
-def test_aged_calibration_shows(rng):
+def test_an_aged_calibration_is_reported(rng):
     result = watch(rng, bias=3e-3)
     assert result.residual == pytest.approx(3e-3, abs=5 * NOISE_SD / math.sqrt(100 * 15))
     assert result.residual > 10 * result.residual_sd
@@ -47,7 +47,7 @@ def test_motion_gives_no_verdict(rng):
     assert watch(rng, motion=0.05) is None
 
 
-def test_time_that_jumps_starts_a_new_window(rng):
+def test_a_jump_of_time_starts_a_new_window(rng):
     monitor = GravityCheck(GRAVITY)
     watch(rng, seconds=10, monitor=monitor)
     result = watch(rng, seconds=10, monitor=monitor)
@@ -85,7 +85,7 @@ def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 
 
-def test_the_message_gives_the_deviation_now(rng):
+def test_the_message_states_the_present_deviation(rng):
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)
     assert not monitor.is_refuted

@@ -115,7 +115,7 @@ def test_left_out_residuals_of_the_fit_hold_for_new_positions(fitted):
     assert row.fitted.rms <= row.left_out.rms < 1.05 * FLOOR
 
 
-def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
+def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     program = parse_cyclogram('20 10min, 35@1.5 10min, 10@1.5 15min')
     stations = [replace(station, program=program) for station in plan('chamber-9', 2)[:2]]
     records = arrays(unit, stations, 2, rate_hz=RATE_HZ)
@@ -232,7 +232,7 @@ def test_the_rate_is_corrected_by_hand_numbers():
     np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)
 
 
-def test_with_a_prior_the_gyroscope_is_the_priors(unit, fitted):
+def test_a_fit_with_a_prior_keeps_the_gyroscope_of_the_prior(unit, fitted):
     record = arrays(unit, plan('tumble', 2)[:1], 5, rate_hz=RATE_HZ)[0]
     again = fit([source_of(record, unit.scale_factor)], replace(OPTIONS, prior=fitted.calibration))
     assert again.calibration.gyroscope == fitted.calibration.gyroscope
@@ -244,7 +244,7 @@ def reduced(unit, records):
     return [reduce_source(source, full_scale=None) for source in sources]
 
 
-def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
+def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, held_out)
     # The first third of the bag has enough ramps and soaks to show an error.
     thirds = [replace(interval, n_whole=interval.n_whole // 3) for interval in bags[0].intervals]

@@ -84,7 +84,7 @@ def test_a_change_during_a_motion_is_no_jump(rng, end, sd, step):
     assert look(rest) == ()
 
 
-def test_bump_that_passes_is_no_jump(rng):
+def test_a_bump_of_two_seconds_is_no_jump(rng):
     rest = Rest(rng)
     rest.add((0.0, 0.0, 40.0 * MG), from_s=300.0, to_s=302.0)
     assert look(rest) == ()
@@ -125,7 +125,7 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
 
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
-def test_a_jump_in_such_noise_is_found(rng, tau_s, sd):
+def test_a_jump_in_noise_behind_a_low_pass_is_found(rng, tau_s, sd):
     # WHY: coloured noise of 3 mg remains in means over 10 s: jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)

@@ -198,7 +198,7 @@ def test_calibrations_are_taken_from_one_folder_only(peer, unit, tmp_path):
         assert peer.describe('calibration_directory')[0].read_only
 
 
-def test_a_reader_that_ends_is_begun_anew(unit):
+def test_a_calibration_reader_that_ends_is_restarted(unit):
     # WHY: a file may crash or hang the process that reads it, but not the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
@@ -213,7 +213,7 @@ def test_a_reader_that_ends_is_begun_anew(unit):
     reader.close()
 
 
-def test_a_reader_that_hangs_is_given_up(unit):
+def test_a_calibration_reader_that_hangs_is_ended(unit):
     # WHY: a lost network drive blocked every request, and also the end of the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
@@ -229,7 +229,7 @@ def test_a_reader_that_hangs_is_given_up(unit):
         reader.read(str(unit), '')
 
 
-def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch):
+def test_a_calibration_file_that_hangs_at_the_start_is_refused(monkeypatch):
     forever = threading.Event()
     monkeypatch.setattr('thermo_comp.ros.reader.read', lambda *_: forever.wait())
     with pytest.raises(CalibrationError, match=r'^a\.yaml: cannot be read: no answer within 0\.2'):
@@ -237,7 +237,7 @@ def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch):
     forever.set()
 
 
-def test_while_a_file_hangs_the_other_parameters_go_on(peer, unit):
+def test_while_a_calibration_file_hangs_other_parameters_can_be_set(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
@@ -260,7 +260,7 @@ def test_while_a_file_hangs_the_other_parameters_go_on(peer, unit):
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
-def test_while_a_file_hangs_the_node_ends_and_nothing_stays(peer, unit, number):
+def test_while_a_calibration_file_hangs_the_node_can_be_ended(peer, unit, number):
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
         children = Path(f'/proc/{node.process.pid}/task').glob('*/children')
@@ -293,7 +293,7 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 """
 
 
-def test_a_start_that_hangs_ends_with_one_signal():
+def test_a_node_that_hangs_at_the_start_ends_with_one_signal():
     # WHY: SIGTERM was stored but not handled; a second SIGTERM was needed.
     with subprocess.Popen(
         [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True

@@ -72,7 +72,7 @@ class Flow:
         self._peer.wait_for(lambda: stamp_of(self.heard[-1]) == last, 'the last sample')
 
 
-def test_reload_while_samples_flow(peer, tmp_path):
+def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
     first, second, third = (tmp_path / f'{name}.yaml' for name in ('first', 'second', 'third'))
     save_calibration(of_bias(1.0), first)
     save_calibration(of_bias(2.0), second)

@@ -43,7 +43,7 @@ def contested(peer, heard, topic, send):
     return status
 
 
-def test_samples_of_a_second_publisher_never_go_out(peer, unit):
+def test_samples_of_a_second_publisher_are_never_published(peer, unit):
     # WHY: samples of a second driver in another attitude were published as the unit's.
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
@@ -113,7 +113,7 @@ def driver_process(name):
         process.stdout.close()
 
 
-def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer, unit):
+def test_after_a_driver_was_killed_output_continues_within_two_seconds(peer, unit):
     # WHY: after a driver was killed the node was silent for 20 s, until the DDS lease ended.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
@@ -205,7 +205,7 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
         status_with(peer, heard, text)
 
 
-def test_reports_more_often_than_samples_are_no_silence(peer, tmp_path):
+def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path):
     # WHY: with diagnostics_period below the sample interval each empty report was an ERROR.
     from thermo_comp.unit.calibration import Unit
 

@@ -64,7 +64,7 @@ def test_a_part_contains_exactly_the_messages_inside(bag, begin, end, n_messages
         assert all(len(raw.data) == raw.size.sum() for raw in block.raw.values())
 
 
-def test_stamps_say_the_same_as_seconds(bag):
+def test_a_part_by_stamps_equals_a_part_by_seconds(bag):
     start = START_NS * 1e-9
     (by_stamp, since), (by_time, _) = (
         part_of(bag, start + 20.0, start + 50.0),
@@ -91,7 +91,7 @@ def test_a_part_without_samples_is_refused(bag):
         (5.0, 1.7e9, 'or both as stamps'),
     ],
 )
-def test_no_part_is_refused(begin, end, reason):
+def test_bounds_that_are_no_part_are_refused(begin, end, reason):
     with pytest.raises(ValueError, match=reason):
         Part(begin, end)
 
@@ -111,7 +111,7 @@ def test_the_part_before_a_jump_is_fitted(rng, tmp_path):
     assert result.calibration.provenance.sources[0].name == 'bag.mcap[100:299]'
 
 
-def test_a_clock_that_was_set_does_not_count(rng, tmp_path):
+def test_a_jump_of_the_clock_does_not_change_a_part(rng, tmp_path):
     rest = Rest(rng, duration_s=120.0)
     path = bag_of(tmp_path / 'bag.mcap', rest)
     block = read_recording(path, require=()).columns

@@ -113,7 +113,7 @@ def test_a_standstill_within_the_quantum_is_no_fault():
     assert tracker.checks['board'].fault == tracker.checks['case'].fault == Fault.NONE
 
 
-def test_readings_that_chance_may_repeat():
+def test_readings_that_may_repeat_by_chance_are_no_fault():
     # With noise of half a quantum a reading repeats with p = 0.68, 54 times with p = 1e-9.
     assert still_readings(ThermometerSettings(0.005, 0.01)) == 54
     assert still_readings(ThermometerSettings(0.005, 0.0)) == STILL_READINGS

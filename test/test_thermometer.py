@@ -255,7 +255,7 @@ def test_noise_declared_too_small_is_learnt():
     assert np.mean((out[1000:, 0] - 20.0) ** 2 / out[1000:, 2]) < 2.0
 
 
-def test_a_frozen_sensor_shows_by_its_last_change():
+def test_a_frozen_sensor_is_known_by_the_time_of_its_last_change():
     thermometer = settled()
     for k in range(600, 700):
         thermometer.update(k * SECOND_NS, 20.0)
