@@ -145,7 +145,7 @@ class TestWindows:
         assert windows.window_s == window_s
         np.testing.assert_array_equal(windows.count, rate_hz * window_s)
         np.testing.assert_allclose(np.diff(windows.start_ns) * 1e-9, window_s, atol=1e-6)
-        # Every rest of this length is in a window, except for the time before the first reading.
+        # All of a rest is in windows, except for the time before the first reading.
         assert len(windows) >= int(20.5 * 60.0 / window_s) - 1
 
     def test_samples_too_slow_for_a_window_are_refused(self, tmp_path):
