@@ -262,7 +262,7 @@ def short(accel, board, name='bag'):
         ),
     ],
 )
-def test_bags_without_what_a_fit_needs_are_refused(accel, board, message):
+def test_bags_without_rests_or_samples_are_refused(accel, board, message):
     with pytest.raises(FitError, match=f'bag: {message}'):
         fit([short(accel, board)], FitOptions(gravity=STANDARD_GRAVITY))
 

@@ -160,7 +160,7 @@ def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
 
 
-def test_a_side_that_was_never_up_is_named(rng):
+def test_the_attitude_of_a_side_that_was_never_up_is_named(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
     # The attitude may be the grid point beside -z.
@@ -169,7 +169,7 @@ def test_a_side_that_was_never_up_is_named(rng):
     assert said(result) in ' '.join(result.calibration.provenance.notes)
 
 
-def test_spread_positions_leave_nothing_unseen(rng):
+def test_no_undetermined_attitude_is_named_for_spread_positions(rng):
     result = fitted(rng, positions(18, 4))
     assert result.least_known.sd_m_s2 < 2.0 * result.least_known.seen_sd_m_s2
     assert not said(result)

@@ -195,7 +195,7 @@ def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
 
 
-def test_a_full_disk_loses_nothing_silently(small_disk):
+def test_rests_lost_on_a_full_disk_are_counted(small_disk):
     log = RestLog(str(small_disk))
     for k in range(100):
         log.put(rest(k).stamp_ns, encode(START), encode(rest(k)))
@@ -206,7 +206,7 @@ def test_a_full_disk_loses_nothing_silently(small_disk):
     assert log.reason == 'No space left on device'
 
 
-def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(tmp_path, unit, peer):
+def test_the_node_logs_rests_and_a_kill_tears_at_most_one_line(tmp_path, unit, peer):
     folder = tmp_path / 'rests'
     samples = standing(200 * RATE_HZ)
     words = node_arguments(unit, f'rest_log:={folder}')

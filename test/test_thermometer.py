@@ -119,7 +119,7 @@ def test_a_crossed_edge_locates_the_temperature():
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
-def test_an_unchanged_coarse_reading_is_not_an_ever_better_one():
+def test_equal_coarse_readings_keep_the_sd_of_their_quantum():
     # A thousand equal readings leave the sd of a uniform distribution, 1 / sqrt(12) quantum.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
