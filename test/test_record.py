@@ -264,7 +264,7 @@ class TestLive:
             assert len(messages) > 0.95 * len(sent[topic])
         check_fit({**result, 'command': result['command'].replace(str(bags), '.')}, cli, bags)
 
-    def test_imu_messages_under_other_names_until_a_signal(self, play, tmp_path):
+    def test_imu_messages_under_other_names_are_recorded_until_a_signal(self, play, tmp_path):
         n, force = 2000, 9.81 * UPS[0]
         stamps = START_NS + np.arange(n) * 20_000_000
         bag, bags = tmp_path / 'imu.mcap', tmp_path / 'bags'

@@ -171,7 +171,7 @@ def test_the_directory_is_what_rosbag2_writes(tmp_path):
     assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
 
 
-def test_a_bare_file_names_itself(tmp_path):
+def test_metadata_of_a_bare_file_have_its_final_name(tmp_path):
     """WHY: a bag is written under a temporary name, which must not be in its metadata."""
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:

@@ -148,7 +148,7 @@ def test_services_and_timers_are_served_while_samples_flow(node, peer):
     assert OTHERS_PERIOD_NS <= 20_000_000
 
 
-def test_a_regular_call_goes_on_with_and_without_samples(node, peer):
+def test_a_periodic_call_goes_on_with_and_without_samples(node, peer):
     called = []
     running = Running(node)
 
