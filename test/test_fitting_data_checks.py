@@ -60,7 +60,7 @@ def good(rng):
     return windows, up
 
 
-def test_a_complete_thermal_test_has_no_findings(good):
+def test_a_complete_thermal_test_has_only_good_findings(good):
     findings = findings_of(*good)
     assert {finding.level for finding in findings.values()} == {'good'}
 
