@@ -4,7 +4,7 @@
 # make demo   sets up .venv, plays the sample bag over DDS into the node, prints the table
 # make test   sets up .venv, runs the whole test suite
 # make lint   ruff, mypy --strict and the layering test
-# make nightly  the properties, ten thousand examples each
+# make nightly  the properties of test_properties.py, ten thousand examples each
 # make oldest  the suite with the oldest versions that setup.py allows, in .venv-oldest
 # make fuzz   the fuzz targets, FUZZ_SECONDS (60) each
 # make bench  installs the package in .venv-bench and measures its speed (half an hour)
@@ -95,7 +95,7 @@ $(BIN)/python:
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=24'
 
 $(VENV)/.installed: setup.py setup.cfg pyproject.toml | $(BIN)/python
-	@echo "thermo_comp: pip installs it with numpy, scipy, matplotlib and rclpy into $(VENV): a few minutes"
+	@echo "thermo_comp: pip installs the package, numpy, scipy, matplotlib and rclpy into $(VENV): a few minutes"
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -e '.[ros]'
 	@touch $@
 

@@ -123,7 +123,7 @@ def fitted(records: Sequence[SimulatedRun], **options: Any) -> Calibration:
 def fit_and_correct(
     records: Sequence[SimulatedRun], test_records: Sequence[SimulatedRun], **options: Any
 ) -> Corrected:
-    """Fit on one test and apply to another."""
+    """Fit one test, and correct another test with the result."""
     began = time.perf_counter()
     calibration = fitted(records, **options)
     took = time.perf_counter() - began
@@ -137,8 +137,7 @@ def fit_and_correct(
         columns = np.column_stack((corrected.specific_force, corrected.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # In means of 60 s white noise and rounding average out, the rest of the published variance
-        # does not.
+        # Means of 60 s average out white noise and rounding, not the other published variance.
         white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs the main job on the sample bags, end to end.
+Fits the sample bags, plays another bag through the live node, and judges the output.
 
     python benchmarks/demo.py [--bags bags] [--out out]
 
@@ -99,7 +99,7 @@ def main() -> int:
     parser.add_argument('--out', default='out', help='folder for the results')
     arguments = parser.parse_args()
     if not Path(arguments.bags, 'held_out.mcap').is_file():
-        parser.error(f'no sample bags in {arguments.bags}: run it in a clone of the repository')
+        parser.error(f'no sample bags in {arguments.bags}: run it in a clone of thermo_comp')
     return 0 if demo(Path(arguments.bags), Path(arguments.out)) else 1
 
 

@@ -102,7 +102,7 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
 
 def efficiency(n_units: int) -> None:
-    """Bias and scale at the reference against the Cramer-Rao bound."""
+    """Compare bias and scale at the reference with the Cramer-Rao bound."""
     print(
         '| positions | units | bias: RMS error / bound | scale | bias: error / claimed sd | scale '
         '| 95 % intervals, bias | scale |'

@@ -37,7 +37,7 @@ Matrix = list[tuple[Scene, Outcome]]
 
 
 def quantiles(delays: list[float]) -> tuple[float, float]:
-    """Median and 95 % quantile; infinite if empty."""
+    """Return median and 95 % quantile of the delays; infinite if there is no delay."""
     if not delays:
         return np.inf, np.inf
     return float(np.median(delays)), float(np.percentile(delays, 95))
@@ -63,7 +63,7 @@ def table(title: str, rows: Rows) -> None:
 
 
 def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
-    """Delays of the named ramp by sensor, and of the CUSUM with known ramp."""
+    """Return onset delays by sensor, and those of a CUSUM test that knows the ramp."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, n, seed, rippled) for scene in scenes for rippled in (False, True)]
@@ -105,7 +105,7 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
 
 
 def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
-    """Switches per hour of soak by sensor."""
+    """Return the rows of false switches per hour of soak by sensor."""
     runs = max(1, round(hours / len(SENSORS) / SOAK_H))
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, SOAK_H, seed + k) for scene in scenes for k in range(runs)]
@@ -185,7 +185,7 @@ Tables = Iterator[tuple[str, Rows]]
 
 
 def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Run the ramp of the requirement."""
+    """Measure the onset delays for ramps of 0.5 K/min behind a lag of 15 min."""
     rows = onset_table(pool, arguments.quick, arguments.seed)
     yield 'Onset of 0.5 K/min behind 15 min at 1 Hz', rows
 

@@ -8,7 +8,7 @@ and deserialize each message, correct it with the same compensator one by one, s
 it. Our side and the peer write chunks packed with zstd. All bags hold 400 Hz of counts and two
 temperatures at 1 Hz.
 
-    python benchmarks/replay.py --hours 24        # the day: read, compensate, linear in length
+    python benchmarks/replay.py --hours 24        # time of reading and compensating a day
     python benchmarks/replay.py --gigabytes 10    # peak memory of a replay of a large bag
 """
 

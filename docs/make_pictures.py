@@ -35,7 +35,7 @@ sys.path.insert(0, str(ROOT / 'benchmarks'))
 
 
 def draw_chamber(axes: Axes) -> None:
-    """Draw the arrangement, not to scale."""
+    """Draw the chamber test, not to scale."""
     axes.set_xlim(0, 10)
     axes.set_ylim(0, 6)
     axes.set_axis_off()

@@ -101,7 +101,7 @@ relative scale including the largest contributions of all columns must stay betw
 INTERFACE = """\
 # ROS interface of the node
 
-Node `thermo_comp`, executable `thermo_comp_node`. All names are relative and can be remapped. Input
+Node `thermo_comp`, executable `thermo_comp_node`. All names but `/diagnostics` are relative, and can be remapped. Input
 stamps are carried through; the node never stamps with its own clock and needs no `use_sim_time`.
 
 ## Topics
@@ -135,7 +135,7 @@ an output that is its input.
 
 ## Recording a test
 
-`thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the inputs above, and to every other
+`thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the node's inputs, and to every other
 `temperature/<name>`, once they have a publisher, reliably if offered. `thermo_comp_record` publishes nothing. See
 [Recording](recording.md#recording).
 
@@ -143,10 +143,10 @@ an output that is its input.
 
 {parameters}
 
-A change is checked as a whole before anything is applied. A separate process reads and checks a calibration while samples
-flow; the node then exchanges one reference. An invalid `calibration_file` is refused in the response, with the reason, and
-the running calibration stays. The coefficients are not parameters, because parameters arrive one at a time, and a polynomial
-with half of its coefficients is wrong.
+A change of parameters is checked as a whole before any is applied. A separate process reads and checks a calibration
+while samples flow; the node then exchanges the calibration between two samples. An invalid `calibration_file` is refused
+in the response, with the reason, and the running calibration stays. The coefficients are not parameters, because
+parameters arrive one at a time, and a polynomial with half of its coefficients is wrong.
 
 ```console
 $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml

@@ -48,7 +48,7 @@ def _fuzz(name: str, seconds: int, n_inputs: int) -> None:
         import targets
 
         if name in {'cdr', 'parameters'}:
-            import thermo_comp.ros.parameters  # noqa: F401 - here it is instrumented
+            import thermo_comp.ros.parameters  # noqa: F401 - instrumented by this import
     target = targets.targets()[name]
     folder = CORPUS / name
     folder.mkdir(parents=True, exist_ok=True)

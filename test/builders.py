@@ -58,7 +58,7 @@ def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
 def rich_calibration():
     """Make a calibration with a posterior and every kind of term, on all axes, in both regimes."""
 
-    def one(sign, dynamic):
+    def axis_of(sign, dynamic):
         size = 2 if dynamic else 1
         bias = (0.0, *(sign * 0.3 / k for k in range(1, size + 1)))
         scale = (1.0, *(sign * 7e-5 / k for k in range(1, size + 1)))
@@ -66,8 +66,8 @@ def rich_calibration():
 
     value = calibration(
         axes=Axes(AxisReference(300.0, 5.0), AxisReference(-295.0, -3.0), AxisReference(310, 1)),
-        static=regime_set(one(1, False), one(-1, False), one(1, False)),
-        dynamic=regime_set(one(-1, True), one(1, True), one(-1, True)),
+        static=regime_set(axis_of(1, False), axis_of(-1, False), axis_of(1, False)),
+        dynamic=regime_set(axis_of(-1, True), axis_of(1, True), axis_of(-1, True)),
         misalignment=((1.0, 0.0, 0.0), (1e-3, 1.0, 0.0), (-2e-3, 3e-4, 1.0)),
         misalignment_sd=(1e-6, 1e-6, 2e-6), slow_noise_m_s2_sqrt_h=(1e-5, 2e-5, 1e-5),
         sensors=('case', 'frame'),
@@ -106,24 +106,24 @@ def rich_calibration():
 
 
 def rich_gyroscope():
-    """Make a gyroscope with some columns of `rich_calibration` and with other columns."""
+    """Make a gyroscope with biases, noise, four terms of the response and a posterior."""
 
-    def one(size):
+    def rate_set(size):
         curve = RateCurve(Polynomial((0.0, *(size / k for k in (1e4, 1e6)))), delta=size * 1e-5)
         return RateSet(curve, RateCurve(Polynomial((0.0, 2e-4))), curve)
 
-    def of(kind, bias, **keys):
+    def rate_term(kind, bias, **keys):
         return RateTerm(group=kind, kind=kind, bias=bias, range=(-50.0, 50.0), **keys)
 
     response = (
-        of('gradient', (1e-4, -2e-4, 3e-4)),
-        of('board', (3e-4, 1e-4, -1e-4), tau_s=600.0),
-        of('board', (-2e-4, 1e-4, 1e-4), tau_s=120.0),
-        of('gradient_lag', (1e-4, 0.0, 1e-4), tau_s=240.0, sensor='frame'),
+        rate_term('gradient', (1e-4, -2e-4, 3e-4)),
+        rate_term('board', (3e-4, 1e-4, -1e-4), tau_s=600.0),
+        rate_term('board', (-2e-4, 1e-4, 1e-4), tau_s=120.0),
+        rate_term('gradient_lag', (1e-4, 0.0, 1e-4), tau_s=240.0, sensor='frame'),
     )
     n = 3 * (2 + len(response)) + 2 * (2 + 1 + 2)
     return Gyroscope(
-        bias_rad_s=(0.02, -0.03, 0.01), static=one(1.0), dynamic=one(-2.0),
+        bias_rad_s=(0.02, -0.03, 0.01), static=rate_set(1.0), dynamic=rate_set(-2.0),
         noise_density_rad_s_sqrt_hz=(1e-4, 2e-4, 1e-4), slow_noise_rad_s_sqrt_h=(1e-6, 1e-6, 1e-6),
         residual_sd_rad_s=(1e-5, 2e-5, 1e-5), response=response,
         posterior=posterior_of(1e-10 * np.eye(n) + np.full((n, n), 1e-12)),
@@ -200,6 +200,6 @@ def source_of(*arrays, name='bag', **keys):
 
 
 def arrays_of(run, every=1):
-    """Return the arrays of a simulated run for a block, with some of its readings."""
+    """Return samples and every `every`-th reading of a simulated run, as arrays of a block."""
     readings = (run.board_stamp_ns, run.board, run.case_stamp_ns, run.case)
     return (run.accel_stamp_ns, run.counts.astype(float), *(part[::every] for part in readings))

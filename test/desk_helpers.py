@@ -135,7 +135,7 @@ class Desk:
             write_new(path, np.random.default_rng(5))
 
     def run(self, command, cli=None):
-        """Run one example with a short wait for subscribers, in a new folder (fleets: one)."""
+        """Run one example with short waits for subscribers, in a new folder (fleets share one)."""
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}

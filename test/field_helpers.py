@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns rests of a unit with any calibration, for tests, as its node would have logged them."""
+"""Owns rests of a unit with any calibration, for tests, as the unit's node logs rests."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ FIRST_DAY = 21_915
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
-    """Log 3 starts a day of 4 windows, at `rate` [K/s]; `error` of a day is a bias [m/s^2]."""
+    """Log 3 starts a day of 4 windows, at `rate` [K/s]; `error(day)` is a bias [m/s^2]."""
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
     M, logged = np.array(calibration.misalignment), []
@@ -55,6 +55,6 @@ def upright(_rng):
     return np.array([0.0, 0.0, 1.0])
 
 
-def any_way(rng):
+def in_any_attitude(rng):
     u = rng.standard_normal(3)
     return np.asarray(u / np.linalg.norm(u))

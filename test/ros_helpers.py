@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the other end of the node in tests: a peer on DDS with publishers and clients."""
 
-import contextlib
 import threading
+from contextlib import contextmanager, suppress
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from live_node import node_in_thread  # noqa: F401 - for the tests
 from rcl_interfaces.srv import DescribeParameters, SetParameters, SetParametersAtomically
@@ -53,7 +54,7 @@ class Peer:
         self._thread.start()
 
     def _spin(self):
-        with contextlib.suppress(ExternalShutdownException):
+        with suppress(ExternalShutdownException):
             self._executor.spin()
 
     def close(self):
@@ -93,7 +94,7 @@ class Peer:
         return publisher
 
     def join(self, node):
-        """Wait until both ends of every topic have discovered each other: then nothing is lost."""
+        """Wait until both ends of every topic have discovered each other."""
         topics = {subscription.topic_name for subscription in self.node.subscriptions}
         outputs = [output for output in node.node.publishers if output.topic_name in topics]
         # Not every test has all thermometers of the unit.
@@ -172,12 +173,26 @@ def node_arguments(unit, *overrides):
     return [word for override in words for word in ('-p', override)]
 
 
+@contextmanager
+def bare_node(*overrides):
+    """Make a node of rclpy alone, with overridden parameters."""
+    context = Context()
+    words = [word for override in overrides for word in ('-p', override)]
+    rclpy.init(args=['--ros-args', *words], context=context)
+    node = rclpy.create_node('thermo_comp', context=context)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
 class Samples:
     def __init__(self, peer, node):
         self._peer = peer
         self.heard = peer.listen(Imu, 'imu/data_raw')
+        self.reports = peer.listen(DiagnosticArray, '/diagnostics')
         self.driver = drive(peer, node)
         self.n_sent = 0
+        self.go_on()
 
     def send(self, n=20):
         for k in range(self.n_sent, self.n_sent + n):
@@ -192,13 +207,15 @@ class Samples:
         self._peer.wait_for(lambda: len(self.heard) >= before + 20, '20 further samples')
 
 
-def status_with(peer, heard, text):
+def status_with(peer, heard, text, send=lambda: None):
+    """Send until a report contains the text; return the status of the report."""
     del heard[:]
     collected = []
 
     def look():
+        send()
         collected.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
         return bool(collected)
 
-    peer.wait_for(look, f'{text!r} among {[a.status[0].message for a in heard][-3:]}')
+    peer.poll(look, f'{text!r} among {[a.status[0].message for a in heard][-3:]}')
     return collected[0]

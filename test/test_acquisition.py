@@ -59,7 +59,7 @@ def reasons(test):
 
 
 @pytest.mark.parametrize('seconds', [0.7, 25.0, 1e4])
-def test_positions_are_found_however_the_blocks_fall(stream, seconds):
+def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
     begins = []
     for up in UPS:
         begins.append(stream.seconds)
@@ -104,7 +104,7 @@ def test_a_position_grows_until_it_is_good(stream):
     assert account.next_deg == pytest.approx(np.degrees(np.arccos(account.next_up @ account.now)))
 
 
-def test_what_is_wrong_with_a_position_is_said(stream):
+def test_faults_of_a_position_are_reported(stream):
     stream.rest((0, 0, 1), 60.0)
     stream.turn()
     stream.rest((1, 0, 0), 20.0)
@@ -146,7 +146,7 @@ def test_a_clock_that_goes_back_begins_a_position(stream):
     assert [one.still_s for one in test.account().positions] == pytest.approx([40.0] * 2, abs=1.0)
 
 
-def test_a_dead_sensor_points_nowhere():
+def test_a_dead_sensor_has_no_direction():
     stamp_ns = START_NS + np.arange(3000) * 20_000_000
     test = Acquisition(1, 30.0)
     log_ns = {'accel': stamp_ns}
@@ -156,7 +156,7 @@ def test_a_dead_sensor_points_nowhere():
     assert (account.n_good, account.hole_deg) == (0, 180.0)
 
 
-def test_words_without_a_sign_have_their_zero_in_the_middle(stream):
+def test_unsigned_words_have_their_zero_in_mid_range(stream):
     for up in UPS:
         stream.rest(up, 40.0)
         stream.turn()
@@ -170,7 +170,7 @@ def test_words_without_a_sign_have_their_zero_in_the_middle(stream):
     assert [place.reason for place in positions] == [''] * 6 + ['repeats position 1']
 
 
-def test_nothing_has_come():
+def test_without_samples_all_positions_are_missing():
     account = Acquisition(18, 60.0).account()
     assert not account.is_still
     assert np.isnan(account.now).all()

@@ -61,7 +61,7 @@ def swapped(source, rest):
         ('compensated', compensated, FORCE, 12),
     ],
 )
-def test_what_is_allowed_goes_on_to_the_end(rng, name, spoil, options, n):
+def test_an_allowed_refusal_ends_in_a_calibration(rng, name, spoil, options, n):
     assert name in REFUSALS
     sources = []
     for number, up in enumerate(positions(n, 3)):
@@ -76,12 +76,12 @@ def test_what_is_allowed_goes_on_to_the_end(rng, name, spoil, options, n):
     assert f'{name}: allowed' in ' '.join(result.calibration.provenance.notes)
 
 
-def test_what_cannot_be_allowed_is_said():
+def test_unknown_names_in_allow_are_refused():
     with pytest.raises(ValueError, match=r'`allow` must be of prior, saturation, .* got .span.'):
         FitOptions(gravity=GRAVITY, allow=('span',))
 
 
-def test_a_bag_at_the_rails_says_so(rng):
+def test_a_saturated_bag_is_refused_with_the_share_of_samples(rng):
     rest = Rest(rng)
     rest.accel[:] = -40000.0
     with pytest.raises(FitError, match='100 % of its samples are at the full scale, see --full'):
@@ -121,7 +121,7 @@ def in_kelvins(rest):
         (dead, 'an axis is exactly zero at rest'),
     ],
 )
-def test_what_gives_no_numbers_is_a_sentence(rng, spoil, text):
+def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text):
     # WHY: temperatures of another clock or in mK, or a dead axis, ended in a traceback.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
@@ -139,7 +139,7 @@ def test_what_gives_no_numbers_is_a_sentence(rng, spoil, text):
         ),
     ],
 )
-def test_what_is_likely_a_mistake_is_said(rng, spoil, name, text):
+def test_likely_mistakes_are_refused_by_name(rng, spoil, name, text):
     findings = {note.name: note.message for note in fit(spoilt(rng, spoil), FORCE).findings}
     assert re.search(text, findings[name])
 

@@ -11,18 +11,18 @@ STYLE = ['D200', 'D205', 'D400', 'D403']
 pytestmark = pytest.mark.filterwarnings('ignore')
 
 
-def test_flake8():
+def test_ament_flake8_finds_nothing():
     linter = pytest.importorskip('ament_flake8.main')
     code, errors = linter.main_with_errors(argv=['--config', str(ROOT / 'setup.cfg'), *SOURCES])
     assert code == 0, '\n'.join(errors)
 
 
-def test_pep257():
+def test_ament_pep257_finds_nothing():
     linter = pytest.importorskip('ament_pep257.main')
     assert linter.main(argv=['--add-ignore', *STYLE, '--', *SOURCES]) == 0
 
 
-def test_xmllint():
+def test_ament_xmllint_finds_nothing():
     linter = pytest.importorskip('ament_xmllint.main')
     assert (
         linter.main(argv=[str(ROOT / name) for name in ('package.xml', 'config', 'launch')]) == 0

@@ -36,7 +36,7 @@ def arrays(rng):
     return {'time_s': time_s, 'counts': counts, 'board': board, 'case': case}
 
 
-def test_the_root_is_light_and_knows_its_names():
+def test_importing_the_package_is_light_and_unknown_names_fail():
     # The first import of a script must not load the libraries of a fit.
     heavy = ('numpy', 'scipy', 'yaml', 'rosbags', 'mcap', 'matplotlib')
     assert loaded_after('import thermo_comp', *heavy) == []
@@ -65,7 +65,7 @@ def test_arrays_have_the_bits_of_a_replayed_bag(root, tmp_path, fitted):
     np.testing.assert_array_equal(changes, np.searchsorted(stamps, switches))
 
 
-def test_no_reading_is_lost_however_many(rng):
+def test_no_reading_of_a_large_number_is_lost(rng):
     # WHY: `correct` queued all readings at once, and the limited queue dropped some of them.
     time_s = np.arange(5000) * 0.1
     readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
@@ -75,7 +75,7 @@ def test_no_reading_is_lost_however_many(rng):
     assert (counters.n_board_rejected, counters.n_case_rejected) == (0, 0)
 
 
-def test_readings_beside_the_samples_are_those_at_times_of_their_own(arrays):
+def test_readings_per_sample_equal_readings_with_separate_times(arrays):
     unit = rich_calibration()
     out = unit.correct(**arrays)
     pairs = {
@@ -94,7 +94,7 @@ def test_readings_beside_the_samples_are_those_at_times_of_their_own(arrays):
         np.testing.assert_array_equal(other.covariance, out.covariance)
 
 
-def test_any_origin_and_any_kind_of_array_will_do(arrays):
+def test_any_origin_of_time_and_any_kind_of_array_are_accepted(arrays):
     unit = rich_calibration()
     out = unit.correct(**arrays)
     lists = {name: value.tolist() for name, value in arrays.items()}
@@ -119,7 +119,7 @@ def test_any_origin_and_any_kind_of_array_will_do(arrays):
         np.testing.assert_array_equal(same.covariance, out.covariance)
 
 
-def test_data_are_no_exceptions_but_rows_of_nan(arrays):
+def test_unusable_samples_give_rows_of_nan(arrays):
     counts = arrays['counts'].copy()
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
@@ -132,12 +132,12 @@ def test_data_are_no_exceptions_but_rows_of_nan(arrays):
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # Without a case thermometer the board decides the regime, not earlier than a case thermometer.
+    # Without a case thermometer the board decides the regime, not earlier than the case would.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 
 
-def test_nothing_in_is_nothing_out():
+def test_empty_arrays_give_empty_arrays():
     out = thermal_calibration().correct([], np.empty((0, 3)), board=[])
     assert out.specific_force.shape == (0, 3)
     assert out.covariance.shape == (0, 3, 3)
@@ -169,7 +169,7 @@ def test_nothing_in_is_nothing_out():
         ({'lid': [20.0] * 3}, r'`lid` is no thermometer of this calibration: it has board, case'),
     ],
 )
-def test_a_slip_is_said(change, text):
+def test_wrong_arguments_are_named(change, text):
     given = {'time_s': [0.0, 1.0, 2.0], 'counts': np.ones((3, 3)), 'board': [20.0] * 3, **change}
     with pytest.raises(ValueError, match=text):
         calibration().correct(**given)
@@ -184,7 +184,7 @@ def test_a_fit_of_arrays_is_the_fit_of_their_bags(root, tmp_path, fitted):
     assert tc.load(tmp_path / 'unit.yaml') == again
 
 
-def test_the_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):
+def test_the_python_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):
     (snippet,) = (body for kind, body in FENCE.findall(README) if kind == 'python')
     (tmp_path / 'bags').symlink_to(root / 'bags')
     tc.save(fitted, tmp_path / 'unit.yaml')
@@ -194,7 +194,7 @@ def test_the_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):
     assert names['out'].specific_force.shape == (15407, 3)
 
 
-def test_a_table_is_read_as_the_command_reads_it(tmp_path):
+def test_tc_read_reads_a_table_by_its_headings(tmp_path):
     table = tmp_path / 'log.csv'
     rows = [
         f'{k / 50},{0.01 * (k % 3)},0.02,{9.8 + 0.01 * (k % 2)},{20 + k // 100}'
@@ -219,10 +219,9 @@ def test_a_further_thermometer_goes_in_by_its_name(arrays):
 def test_a_bag_that_is_given_twice_is_refused(root, tmp_path):
     bag = root / 'bags' / 'fit' / '01.mcap'
     copy = shutil.copy(bag, tmp_path / 'copy.mcap')
-    with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
-        tc.fit([bag, copy], gravity=9.80665)
-    with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
-        open_bags([bag, copy])
+    for take in (lambda bags: tc.fit(bags, gravity=9.80665), open_bags):
+        with pytest.raises(tc.ThermoCompError, match=r'copy\.mcap: is .*01\.mcap once more'):
+            take([bag, copy])
 
 
 def test_arrays_that_cannot_be_fitted_are_refused():

@@ -15,7 +15,7 @@ DOCS = ROOT / 'docs'
 SOURCES = sorted((ROOT / 'thermo_comp').rglob('*.py'))
 
 
-def test_the_table_of_rooms_is_that_of_the_layers():
+def test_the_page_s_table_of_packages_is_that_of_test_layers():
     text = (DOCS / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| `(\w+)` \|', text, re.MULTILINE)
     assert {room: int(layer) for layer, room in rows} == LAYERS

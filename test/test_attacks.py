@@ -27,7 +27,7 @@ def of_kind(kind, cycle_s, path):
     return path
 
 
-def test_a_clock_that_goes_back_or_pauses_is_none_of_the_samples(peer, tmp_path):
+def test_a_clock_topic_that_goes_back_or_pauses_changes_no_sample(peer, tmp_path):
     from diagnostic_msgs.msg import DiagnosticArray
     from ros_helpers import drive, node_in_thread, stamp_of, standing
     from rosgraph_msgs.msg import Clock
@@ -63,7 +63,7 @@ def test_a_clock_that_goes_back_or_pauses_is_none_of_the_samples(peer, tmp_path)
         assert node._loop.n_failures == 0
 
 
-def test_a_rate_that_goes_up_twentyfold_and_back_loses_nothing(peer, tmp_path):
+def test_a_rate_that_goes_up_twentyfold_and_back_loses_no_sample(peer, tmp_path):
     from ros_helpers import drive, node_in_thread, stamp_of
     from sensor_msgs.msg import Imu
 
@@ -132,7 +132,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
         assert node._loop.n_failures == 0
 
 
-def test_links_exchanged_under_the_folder_lead_nowhere_else(tmp_path):
+def test_links_exchanged_in_the_folder_never_lead_out_of_it(tmp_path):
     # WHY: between the check of a path and its opening a folder can be replaced by a link.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from thermo_comp.ros.reader import read
@@ -199,7 +199,7 @@ for at in range(1, 1000):
 """
 
 
-def test_a_calibration_killed_at_any_line_of_its_writing_is_the_old_or_the_new(tmp_path):
+def test_a_write_killed_at_any_line_leaves_the_old_or_the_new_calibration(tmp_path):
     old, new, target = (tmp_path / f'{name}.yaml' for name in ('old', 'new', 'unit'))
     for path, serial in ((old, 'old'), (new, 'new'), (target, 'old')):
         save_calibration(calibration(unit=Unit(serial, 'counts', 32767.0, 0.01)), path)

@@ -16,13 +16,13 @@ COMMANDS = [line for line in README.splitlines() if line.startswith('thermo_comp
 SHIPPED = sorted((ROOT / 'bags').rglob('*.mcap'))
 
 
-def test_they_are_small():
+def test_sample_bags_are_small():
     assert len(SHIPPED) == 10
     assert sum(path.stat().st_size for path in (ROOT / 'bags').rglob('*')) <= 6_000_000
 
 
 @pytest.mark.parametrize('command', COMMANDS, ids=['fit', 'held_out'])
-def test_their_commands_make_them(command, tmp_path, cli):
+def test_the_readme_s_commands_make_the_sample_bags(command, tmp_path, cli):
     arguments = shlex.split(command)[1:]
     # Simulate the same content with a faster compression.
     arguments[arguments.index('--level') + 1] = '1'
@@ -48,7 +48,7 @@ def test_their_commands_make_them(command, tmp_path, cli):
             np.testing.assert_allclose(readings.celsius, before.celsius, rtol=1e-12)
 
 
-def test_every_sample_can_be_corrected():
+def test_every_sample_of_the_sample_bags_can_be_corrected():
     # Both temperatures come before the first sample, so that every sample is corrected.
     for path in SHIPPED:
         block = read_recording(path).columns
@@ -56,7 +56,7 @@ def test_every_sample_can_be_corrected():
         assert (np.diff(block.accel_stamp_ns) > 0).all()
 
 
-def test_the_readme_counts_right():
+def test_the_readme_s_counts_are_right():
     for name, samples in (('fit/01.mcap', '18 236'), ('held_out.mcap', '15 407')):
         n = len(read_recording(ROOT / 'bags' / name).columns)
         assert n == int(samples.replace(' ', ''))

@@ -77,12 +77,12 @@ def calibrations(draw):
 
 @given(calibrations())
 @settings(max_examples=40, deadline=None)
-def test_round_trip_is_exact(value):
+def test_the_round_trip_of_a_calibration_is_exact(value):
     assert parse_calibration(dump_calibration(value).encode()) == value
 
 
 @pytest.mark.parametrize('closes', ['board', 'case'])
-def test_when_the_dynamic_state_closes_is_in_the_file(closes):
+def test_the_end_condition_of_the_dynamic_regime_is_in_the_file(closes):
     value = calibration(detector=DetectorSettings(closes=closes))
     text = dump_calibration(value)
     assert parse_calibration(text.encode()) == value
@@ -92,12 +92,12 @@ def test_when_the_dynamic_state_closes_is_in_the_file(closes):
 
 
 @pytest.mark.parametrize('serial', ['no', '1e5', '0x1F', '12', 'null', '~', 'a: b', '- x', '1:30'])
-def test_serials_that_look_like_something_else_stay_texts(serial):
+def test_serials_that_look_like_numbers_or_dates_stay_texts(serial):
     value = calibration(unit=replace(calibration().unit, serial=serial))
     assert parse_calibration(dump_calibration(value).encode()).unit.serial == serial
 
 
-def test_numbers_as_people_write_them():
+def test_numbers_of_a_calibration_may_have_any_yaml_form():
     text = dump_calibration(calibration())
     text = text.replace('full_scale: 32767.0', 'full_scale: 32767')
     text = text.replace('cycle_time_s: 0.01', 'cycle_time_s: 1e-02')
@@ -202,7 +202,7 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
         (b'"\\ud800": 1', 'not valid YAML|invalid'),
     ],
 )
-def test_bytes_that_are_no_calibration(content, message):
+def test_bytes_that_are_no_calibration_are_refused(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
     # `rule` is the message for peers without access to the file: it quotes nothing of the file.
@@ -223,7 +223,7 @@ def test_any_damage_gives_a_calibration_or_a_calibration_error(data):
         assert parse_calibration(dump_calibration(value).encode()) == value
 
 
-def test_files_that_are_no_files(tmp_path):
+def test_paths_that_are_no_regular_file_are_refused(tmp_path):
     fifo = tmp_path / 'fifo'
     os.mkfifo(fifo)
     large = tmp_path / 'large'
@@ -274,7 +274,7 @@ def test_functions_that_overflow_are_refused(old, new, key, message):
     assert caught.value.key == key
 
 
-def test_value_that_the_reader_would_refuse_is_not_written():
+def test_a_calibration_that_the_reader_refuses_is_not_written():
     with pytest.raises(CalibrationError, match='noise_density_m_s2_sqrt_hz'):
         dump_calibration(calibration(noise_density_m_s2_sqrt_hz=(0.0, 1.0, 1.0)))
 
@@ -290,7 +290,7 @@ def test_value_that_the_reader_would_refuse_is_not_written():
         ('rest', '', 'must hold 0 x'),
     ],
 )
-def test_posterior_that_is_none_is_refused(key, value, message):
+def test_a_posterior_of_wrong_content_is_refused(key, value, message):
     old = getattr(RICH.posterior, key)
     assert old in TEXT
     with pytest.raises(CalibrationError, match=message) as caught:
@@ -298,7 +298,7 @@ def test_posterior_that_is_none_is_refused(key, value, message):
     assert caught.value.key.startswith('posterior.')
 
 
-def test_posterior_of_other_size_is_refused():
+def test_a_posterior_of_another_size_is_refused():
     n = parameter_layout(RICH).n_parameters
     with pytest.raises(
         ValueError, match=rf'`posterior.rest` .*per parameter \({n + 6}\), got {n}'
@@ -314,6 +314,6 @@ def test_former_names_of_columns_are_read():
     assert parse_calibration(text.encode()) == RICH
 
 
-def test_shipped_example_loads():
+def test_the_shipped_example_of_a_calibration_loads():
     value = load_calibration(REPOSITORY / 'config' / 'calibration.example.yaml')
     assert value.unit.serial == 'EXAMPLE-1'

@@ -81,7 +81,7 @@ def test_counts_become_an_imu(order, sec, nanosec, frame, values):
     override=st.sampled_from(['', 'other_link']),
     values=st.lists(floats, min_size=37, max_size=37),
 )
-def test_imu_passes_everything_else_bit_for_bit(order, frame, override, values):
+def test_other_fields_of_an_imu_pass_bit_for_bit(order, frame, override, values):
     converter = SampleConverter(Imu, override)
     (written,) = convert(converter, cdr(order, (5, 7), frame, values))
     assert converter.traffic.n_fallback == (order == '>')
@@ -102,7 +102,7 @@ def test_signalling_nan_survives_the_byte_swap():
     assert doubles(written)[:25] == [struct.pack('<Q', payload)] * 25
 
 
-def test_frames_of_other_lengths_in_one_stream():
+def test_frame_ids_of_several_lengths_in_one_stream():
     # WHY: another length of frame_id, as of a second driver, shifts all later bytes of a message.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
@@ -115,7 +115,7 @@ def test_frames_of_other_lengths_in_one_stream():
 
 @pytest.mark.parametrize('kind', [Vector3Stamped, Imu])
 @pytest.mark.parametrize('override', ['', 'other_link'])
-def test_what_has_another_form_goes_through_rclpy(kind, override):
+def test_messages_of_another_form_go_through_rclpy(kind, override):
     values = [float(k) for k in range(37 if kind is Imu else 3)]
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
@@ -154,7 +154,7 @@ def test_the_first_message_may_be_any_bytes():
         assert converter.traffic.n_malformed == 1
 
 
-def test_dropped_samples_give_nothing():
+def test_dropped_samples_give_no_message():
     converter = SampleConverter(Vector3Stamped)
     good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
     for message in (good, good + bytes(8)):

@@ -42,7 +42,7 @@ def unit(bag):
 
 
 class TestHelp:
-    def test_version(self, cli):
+    def test_the_option_version_prints_the_version(self, cli):
         from thermo_comp import __version__
 
         assert cli('--version').stdout == f'thermo_comp {__version__}\n'
@@ -57,7 +57,7 @@ class TestOutput:
         row = next(line for line in printed.splitlines() if line.startswith('/accel/counts'))
         assert row.split() == ['/accel/counts', 'geometry_msgs/msg/Vector3Stamped', '8996']
 
-    def test_a_reader_that_has_seen_enough_is_no_error(self, bag):
+    def test_a_closed_pipe_is_no_error(self, bag):
         command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
         finished = ran('bash', '-c', f'set -o pipefail; {command}')
         assert finished.stderr == ''
@@ -117,7 +117,7 @@ class TestPlay:
     def needs_ros(self):
         pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-    def test_sends_everything_under_the_names_asked_for(self, bag, cli):
+    def test_sends_every_message_under_the_requested_names(self, bag, cli):
         arguments = ('play', bag, '--rate', '0', '--wait', '0', '--json')
         finished = cli(*arguments, '--ros-args', '-r', '__ns:=/here')
         data = parsed(finished.stdout)
@@ -135,7 +135,7 @@ class TestPlay:
 
 
 class TestSimulate:
-    def test_several_positions_are_several_bags(self, tmp_path, cli):
+    def test_simulate_writes_a_bag_per_position(self, tmp_path, cli):
         program = ('--profile', '20 1min', '--rate-hz', '20', '--positions', '3')
         cli('simulate', *program, '--unit', 'mems', '-o', tmp_path / 'sim')
         paths = sorted((tmp_path / 'sim').iterdir())
@@ -154,7 +154,7 @@ class TestSimulate:
             assert [temperature.after[0] for temperature in block.temperatures.values()] == [0, 0]
         assert len({tuple(up) for up in ups}) == 3
 
-    def test_a_plan_is_a_whole_test(self, tmp_path, cli):
+    def test_a_plan_simulates_a_whole_test(self, tmp_path, cli):
         plan = ('--plan', 'tumble-1', '--unit', 'demo')
         cli('simulate', *plan, '--rate-hz', '1', '-o', tmp_path / 'sim')
         infos = [inspect_recording(path) for path in sorted((tmp_path / 'sim').iterdir())]
@@ -164,7 +164,7 @@ class TestSimulate:
 
 
 class TestInfo:
-    def test_lists_nonlinear_terms(self, unit, cli, tmp_path):
+    def test_info_lists_nonlinear_terms(self, unit, cli, tmp_path):
         square = NonlinearTerm('square', (1e-5, -2e-5, 0.0), (1e-7, 0.0, 0.0), 1e-4)
         bent = Nonlinearity((9.8, 98.0), 1e-4, (square,))
         known = replace(rich_calibration(), nonlinearity=bent, posterior=None)
@@ -188,7 +188,7 @@ class TestTopics:
                 writer.write_temperature(topic, [10_000_000], [20.0 + row])
         return tmp_path / 'bag'
 
-    def test_a_file_for_all_and_an_option_for_one(self, named, cli):
+    def test_options_override_topics_of_a_file(self, named, cli):
         profile = named.with_name('lab.yaml')
         profile.write_text('counts: /imu/raw\nboard: /t2\ntemperature/magnet: /t3\n')
         arguments = ('--topics', profile, '--topic', 'board=/t1', '--topic=case=/t2')
@@ -197,14 +197,14 @@ class TestTopics:
         assert degrees == {'board': 20.0, 'case': 21.0, 'magnet': 22.0}
         assert seen['chosen'] is None
 
-    def test_the_only_one_of_its_type_is_said(self, named, unit, cli):
+    def test_the_only_topic_of_its_type_is_taken_and_named(self, named, unit, cli):
         text = '/imu/raw, its only Vector3Stamped, is taken for counts'
         assert text in cli('info', named).stdout
         topics = ('--topic', 'board=/t1', '--topic', 'case=/t2')
         arguments = ('-o', named.with_name('out.mcap'), '--serial', '', *topics)
         assert f'{named}: {text}' in cli('replay', named, '-c', unit, *arguments).stderr
 
-    def test_a_file_that_is_no_profile(self, named, cli):
+    def test_a_topics_file_of_another_form_is_refused(self, named, cli):
         profile = named.with_name('lab.yaml')
         profile.write_text('board: [1]\n')
         refused = cli('info', named, '--topics', profile, code=1).stderr
@@ -221,20 +221,20 @@ class TestCells:
             (123456.7, '123457'),
         ],
     )  # fmt: skip
-    def test_text(self, cell, text):
+    def test_cells_of_tables_as_text(self, cell, text):
         assert output.text(cell) == text
 
-    def test_plain_is_json_without_nan(self):
+    def test_plain_values_are_json_without_nan(self):
         data = {'a': np.array([1.0, np.nan]), 'b': (np.int64(3), Path('x')), 3: np.True_}
         assert output.plain(data) == {'a': [1.0, None], 'b': [3, 'x'], '3': True}
 
-    def test_columns_are_aligned(self):
+    def test_columns_of_tables_are_aligned(self):
         lines = list(output.aligned(('n', 'name'), [(1, 'a'), (10, 'bc')]))
         assert lines == [' n  name', ' 1  a', '10  bc']
         assert list(output.aligned(('n',), [], 'title')) == ['title', 'n']
 
 
-def test_what_sets_the_exit_code_is_said_to_the_quiet(capsys):
+def test_findings_that_set_the_exit_code_are_printed_despite_quiet(capsys):
     out = output.Output(quiet=True)
     out.sources([('01.mcap', 'the only topic', 'cut off after 3 s')])
     with pytest.raises(typer.Exit):

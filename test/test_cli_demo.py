@@ -20,7 +20,7 @@ def needs_ros():
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 
-def test_end_to_end(tmp_path):
+def test_the_demonstration_runs_end_to_end(tmp_path):
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     words = [sys.executable, str(ROOT / 'benchmarks' / 'demo.py')]
     environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
@@ -44,8 +44,7 @@ def test_end_to_end(tmp_path):
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # One set leaves the difference of the regimes, two sets the lags; the noise is below 10
-        # ug.
+        # One set leaves the regimes' difference, two sets leave lags; noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

@@ -96,7 +96,7 @@ class TestUsage:
         ],
         ids=lambda value: ' '.join(value) if isinstance(value, tuple) else '',
     )  # fmt: skip
-    def test_wrong_command_lines(self, cli, tmp_path, arguments, message):
+    def test_wrong_command_lines_are_refused_in_one_line(self, cli, tmp_path, arguments, message):
         finished = cli(*arguments, code=2, cwd=tmp_path)
         lines = finished.stderr.splitlines()
         assert len(lines) == 1, finished.stderr
@@ -108,7 +108,7 @@ class TestUsage:
         assert 'Usage: thermo_comp' in finished.stdout + finished.stderr
 
 
-def test_a_prior_whose_curves_cannot_be_compared(cli, tmp_path):
+def test_a_prior_with_curves_that_differ_by_axis_is_refused(cli, tmp_path):
     prior = ROOT / 'config' / 'calibration.example.yaml'
     words = ('fit', bag(tmp_path / 'bag'), '-o', tmp_path / 'o.yaml', '--gravity', '9.81')
     refused(cli, 1, r'the curves of the prior differ from axis to axis', *words, '--prior', prior)
@@ -121,36 +121,36 @@ class TestBags:
         assert not out.exists()
         assert not list(unit.parent.glob('.out*')), 'a partial output was left'
 
-    def test_missing(self, cli, unit, tmp_path):
+    def test_a_missing_bag_is_refused(self, cli, unit, tmp_path):
         self.replayed(cli, unit, tmp_path / 'absent', r'absent: no such file or directory')
 
-    def test_garbage_in_a_bag_s_clothes(self, cli, unit, tmp_path):
+    def test_garbage_with_the_suffix_of_a_bag(self, cli, unit, tmp_path):
         for name in ('noise.mcap', 'noise.db3', 'noise.bag'):
             (tmp_path / name).write_bytes(b'\x89MCAP0\r\n' + bytes(range(256)) * 8)
             self.replayed(cli, unit, tmp_path / name, name)
 
-    def test_missing_board_temperature(self, cli, unit, tmp_path):
+    def test_a_bag_without_board_temperature_is_refused(self, cli, unit, tmp_path):
         path = bag(tmp_path / 'bag', board=False)
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')
         refused(cli, 1, r'temperature/board', 'evaluate', path, '-c', unit)
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.8')
         assert 'no change of temperature was read' in cli('fit', path, *arguments).stdout
 
-    def test_another_unit_s_bag(self, cli, unit, tmp_path):
+    def test_a_bag_of_another_unit_is_refused(self, cli, unit, tmp_path):
         path = bag(tmp_path / 'bag', serial='T-2')
         self.replayed(cli, unit, path, r'unit.serial: this calibration is of unit T-1.*of T-2')
         refused(cli, 1, r'is of unit T-1', 'evaluate', path, '-c', unit)
 
 
 class TestFits:
-    def test_what_is_no_group_or_model(self, cli, tmp_path):
+    def test_unknown_groups_and_models_are_refused(self, cli, tmp_path):
         arguments = ('fit', bag(tmp_path / 'a.mcap'), '-o', tmp_path / 'new.yaml')
         arguments += ('--gravity', '9.80665')
         refused(cli, 2, r'`groups` must be of curve, .*memory', *arguments, '--groups', 'memory')
         refused(cli, 2, r'quadratic', *arguments, '--model', 'quadratic')
         assert not (tmp_path / 'new.yaml').exists()
 
-    def test_bags_of_two_units(self, cli, tmp_path):
+    def test_bags_of_two_units_are_refused(self, cli, tmp_path):
         paths = [bag(tmp_path / f'{i}.mcap', serial=f'T-{i}') for i in range(2)]
         arguments = ('-o', tmp_path / 'new.yaml', '--gravity', '9.80665')
         refused(
@@ -160,7 +160,7 @@ class TestFits:
 
 
 class TestEvaluations:
-    def test_a_calibration_that_does_not_hold_is_exit_code_1(self, cli, tmp_path):
+    def test_a_calibration_that_is_not_valid_gives_exit_code_1(self, cli, tmp_path):
         # The unit reads exactly g at 20 degC; the calibration wrongly adds 50 mg by a function.
         wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
         sets = regime_set(wrong, wrong, wrong)
@@ -175,7 +175,7 @@ class TestEvaluations:
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
         assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # The second calibration (no covariance): delta +10 mg, -10 mg in the constants.
+        # A calibration without covariance: delta of +10 mg, constant biases of -10 mg.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = Axes(*[AxisReference(300.0, -30.0)] * 3)
@@ -189,7 +189,7 @@ class TestEvaluations:
 
 
 @pytest.mark.usefixtures('no_figures')
-def test_a_torn_bag_is_worked_through_and_the_exit_code_tells(cli, unit, tmp_path):
+def test_a_torn_bag_is_processed_and_sets_the_exit_code(cli, unit, tmp_path):
     whole = bag(tmp_path / 'whole.mcap').read_bytes()
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(whole[:-100])

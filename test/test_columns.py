@@ -36,7 +36,7 @@ def by_group(columns):
     return {name: len(group) for name, group in groups.items()}
 
 
-def test_the_bank():
+def test_the_bank_of_columns_by_group():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()) == {
@@ -57,7 +57,7 @@ def test_the_bank():
     assert all(-10.0 < column.knee_k < 2.0 for column in bends)
 
 
-def test_change_is_even_about_rest():
+def test_gradient_even_about_rest_is_even_about_rest():
     warm = bank(('case', 'tip'), {'case': -0.5, 'tip': 0.0})
     change = [column for column in warm if column.group == 'gradient_even_about_rest']
     assert by_group(warm)['gradient_even_about_rest'] == 21
@@ -73,7 +73,7 @@ def test_change_is_even_about_rest():
     np.testing.assert_allclose(slopes[:, 1], -slopes[:, 2])
 
 
-def test_what_the_bank_needs_remembered():
+def test_memory_that_the_bank_of_columns_needs():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
     taus = {
@@ -87,7 +87,7 @@ def test_what_the_bank_needs_remembered():
         memory_of(bank(('tip',)))
 
 
-def test_each_value_by_hand():
+def test_each_value_of_a_column_by_hand():
     columns = [
         Column('gradient', 'gradient', 'tip', **WIDE),
         Column('rate', 'rate', **WIDE),
@@ -141,7 +141,7 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     assert flow.slopes(np.zeros((7, 1)))[1] is None
 
 
-def test_a_new_kind_is_one_class(monkeypatch):
+def test_a_new_kind_of_column_is_one_class(monkeypatch):
     class RateSquare(Term):
         kind, formula, order, form = 'rate_square', '(dT_s/dt)^2', 2, TERMS['square'].form
 
@@ -170,7 +170,7 @@ def test_a_new_kind_is_one_class(monkeypatch):
 
 @given(st.lists(st.floats(-60.0, 60.0), min_size=5, max_size=5))
 @settings(max_examples=50, deadline=None)
-def test_one_state_has_the_bits_of_many(boards):
+def test_columns_of_one_state_have_the_bits_of_those_of_many(boards):
     columns = bank(('case', 'tip'), span_k=(-10.0, 10.0))
     tracker = ThermalTracker(DetectorSettings(), memory_of(columns, ('case', 'tip')))
     rows = []
@@ -195,7 +195,7 @@ def test_one_state_has_the_bits_of_many(boards):
         ({'kind': 'play', **WIDE}, '`width_k` must be greater than 0 for play'),
     ],
 )
-def test_refusals(keys, message):
+def test_impossible_columns_are_refused(keys, message):
     with pytest.raises(ValueError, match=message):
         Column(**{'group': 'gradient', 'kind': 'gradient', **keys})
 

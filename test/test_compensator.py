@@ -63,7 +63,7 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # Counts of +g, -g: offset = sum / 2, scale = difference / 2; Eq. (3), (4) swap the two.
+    # Counts of +g and -g: offset = sum / 2, scale = difference / 2, which Eq. (3), (4) exchange.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -72,7 +72,7 @@ def test_signed_counts_and_the_printed_equations():
     assert corrected == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
 
 
-def test_every_term_by_hand():
+def test_every_term_of_the_correction_by_hand():
     # The expected values are the formula of the static set at t = 10 K without a gradient or rate.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
@@ -135,7 +135,7 @@ def at_seconds(*events):
     ]
 
 
-# A reading from tomorrow, or an applied one, tells which waiting readings are of another clock.
+# An applied reading, or a reading a day later, shows that waiting readings are of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -172,7 +172,7 @@ def assert_sound(block, counters, events):
     assert np.count_nonzero(backward) <= counters.n_time_jumps
 
 
-def test_unknown_regime_is_paid_for_in_the_covariance():
+def test_an_unknown_regime_widens_the_covariance():
     unit = calibration(dynamic=regime_set(axis_set(delta=3.0)))
     compensator = Compensator(unit)
     warm(compensator, until_s=1)
@@ -185,7 +185,7 @@ def test_unknown_regime_is_paid_for_in_the_covariance():
     assert late[3] == pytest.approx(NOISE, rel=1e-6)
 
 
-def test_nothing_goes_out_before_a_temperature_or_long_after_one():
+def test_nothing_is_published_before_a_temperature_or_long_after_the_last():
     compensator = Compensator(thermal_calibration(), CompensatorConfig(temperature_timeout_s=20.0))
     assert compensator.process(1, 0.0, 0.0, 1.0) is None
     compensator.push('board', 2, 20.0)
@@ -204,7 +204,7 @@ def test_nothing_goes_out_before_a_temperature_or_long_after_one():
 @pytest.mark.parametrize(
     'run', [lambda *given: stream(*given)[1], lambda *given: batch(*given).index.tolist()]
 )
-def test_a_stamp_that_leaps_ahead_needs_a_second_one(run):
+def test_a_stamp_that_leaps_ahead_needs_a_second_stamp(run):
     # WHY: a single stamp 20 s ahead made all later samples late and reset the memory.
     leap, step = 20 * SECOND_NS, SECOND_NS // 100
     usual = np.arange(1, 6) * step
@@ -223,7 +223,7 @@ def test_a_stamp_that_leaps_ahead_needs_a_second_one(run):
 
 
 @pytest.mark.parametrize('is_read', [False, True])
-def test_a_reading_that_is_stamped_there_confirms_a_leap(is_read):
+def test_a_reading_with_a_near_stamp_confirms_a_leap_of_a_sample(is_read):
     compensator = Compensator(thermal_calibration())
     compensator.push('board', 0, 20.0)
     assert compensator.process(1, 1.0, 2.0, 3.0) is not None
@@ -242,7 +242,7 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
 
 @pytest.mark.parametrize('n_before', [0, 3])
 @pytest.mark.parametrize('ahead_s', [0, 2])
-def test_readings_of_a_long_time_without_samples_all_count(n_before, ahead_s):
+def test_readings_from_a_long_time_without_samples_are_all_applied(n_before, ahead_s):
     """Temperatures at 50 Hz that arrive 41 s before the samples are applied in order."""
     first = [('accel', k * SECOND_NS // 100, (1.0, 2.0, 2930.0)) for k in range(1, 1 + n_before)]
     readings = [
@@ -297,7 +297,7 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
-def test_what_is_not_finite_is_never_published_whatever_led_to_it(monkeypatch, bad):
+def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
     # The compensator drops what is not finite even if the checks of the calibration missed it.
     line = Correction.line
 

@@ -11,7 +11,7 @@ from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.unit.calibration import Axes, AxisReference
 
 
-def test_switch_makes_no_step():
+def test_a_switch_of_sets_makes_no_step():
     # Sets that differ by 5 counts = 1.7 mg are blended over 300 s: 0.057 ug per sample at 100 Hz.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
     compensator = Compensator(
@@ -36,13 +36,13 @@ def test_switch_makes_no_step():
     # A difference of 0.3 counts is 1e-3 m/s^2 = 102 ug, which takes 102 s at 1 ug per second.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
-def test_sets_that_differ_take_longer(delta, given_s, expected_s):
+def test_a_switch_of_sets_that_differ_much_takes_longer(delta, given_s, expected_s):
     unit = calibration(dynamic=regime_set(axis_set(delta=delta)))
     compensator = Compensator(unit, CompensatorConfig(transition_time_s=given_s))
     assert compensator.thermal.tracker.config.transition_time_s == pytest.approx(expected_s)
 
 
-def test_swap_takes_effect_between_two_samples():
+def test_a_swap_of_calibrations_takes_effect_between_two_samples():
     compensator = Compensator(calibration())
     warm(compensator, until_s=5)
     before = compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0)
@@ -51,7 +51,7 @@ def test_swap_takes_effect_between_two_samples():
     assert (before[0], after[0]) == (1.0, 2.0)
 
 
-def test_swap_to_another_detector_loses_no_sample():
+def test_a_swap_to_another_detector_loses_no_sample():
     compensator = Compensator(calibration())
     warm(compensator, until_s=5)
     assert compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0) is not None

@@ -51,7 +51,7 @@ def column_map(**changes):
     return build(ColumnMap, {**data, **changes})
 
 
-def test_round_trip_through_the_bag(tmp_path):
+def test_a_table_is_unchanged_by_a_round_trip_through_a_bag(tmp_path):
     path, columns = table(tmp_path / 'log.csv')
     gyro = {'columns': ['wx', 'wy', 'wz'], 'unit': 'deg/s'}
     report = write_log(table_log(path, column_map(gyro=gyro)), tmp_path / 'bag')
@@ -67,7 +67,7 @@ def test_round_trip_through_the_bag(tmp_path):
     np.testing.assert_allclose(
         np.degrees(block.imu.angular_velocity),
         np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
-        rtol=1e-14,  # deg/s to rad/s and back round once each
+        rtol=1e-14,  # conversions to rad/s and back to deg/s round once each
     )
     # The Imu marks the missing orientation by -1, and the unknown covariance of the rate by 0.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
@@ -100,7 +100,7 @@ def test_counts_become_an_imu_with_a_sensitivity(tmp_path):
     assert not (tmp_path / 'other').exists()
 
 
-def test_an_offset_is_taken_away(tmp_path):
+def test_an_offset_of_raw_words_is_subtracted(tmp_path):
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
     rows = path.read_text().splitlines()
     at = [rows[0].split(',').index(name) for name in ('ax', 'ay', 'az')]
@@ -148,7 +148,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
     lines = path.read_text().splitlines()
     for k in range(201, 401):
         at, _, rest = lines[k].partition(',')
-        lines[k] = f'{float(at) - 2500.0},{rest}'  # set back by 2.5 s
+        lines[k] = f'{float(at) - 2500.0},{rest}'  # the clock is set back by 2.5 s
     path.write_text('\n'.join(lines))
     write_log(table_log(path, column_map()), tmp_path / 'bag')
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']
@@ -157,7 +157,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
 
 
 def test_readings_that_are_no_temperatures_are_left_out(tmp_path):
-    # WHY: with 46 readings of -127 degC (DS18B20 without contact) a fit left 0.68 mg, not 0.02.
+    # WHY: with 46 readings of -127 degC (DS18B20 without contact) a fit left 0.68, not 0.02 mg.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in (50, 51, 300):
@@ -196,7 +196,7 @@ def test_every_odd_row_is_accounted_for(tmp_path):
     assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 
-def test_a_fixed_rate_gathers_no_rounding(tmp_path):
+def test_stamps_of_a_fixed_rate_do_not_accumulate_rounding(tmp_path):
     path, _ = table(tmp_path / 'log.csv', n=300)
     write_log(table_log(path, column_map(stamp={'rate_hz': 3.0})), tmp_path / 'bag')
     stamps = read_recording(tmp_path / 'bag').columns.accel_stamp_ns
@@ -205,7 +205,7 @@ def test_a_fixed_rate_gathers_no_rounding(tmp_path):
     assert stamps[-1] == 10**9 + round(299 * 1e9 / 3.0)
 
 
-def test_runs_of_rows_make_no_difference(tmp_path, monkeypatch):
+def test_the_number_of_rows_in_a_block_makes_no_difference(tmp_path, monkeypatch):
     path, _ = table(tmp_path / 'log.csv')
     write_log(table_log(path, column_map()), tmp_path / 'whole')
     monkeypatch.setattr('thermo_comp.convert.log._RUN_ROWS', 64)
@@ -220,7 +220,7 @@ def test_runs_of_rows_make_no_difference(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ('unit', 'celsius'), [('K', 300.0), ('degF', 212.0), ('raw', 160.0), ('degC', 30.0)]
 )
-def test_temperature_units(tmp_path, unit, celsius):
+def test_temperatures_of_any_unit_become_degc(tmp_path, unit, celsius):
     path, _ = table(tmp_path / 'log.csv')
     raw = {'degc_per_count': 0.0625, 'degc_at_zero': 20.0} if unit == 'raw' else {}
     text = path.read_text().replace(',25.', f',{celsius:g}.')
@@ -251,15 +251,15 @@ class TestThinning:
         stamps = np.arange(len(values), dtype=np.int64) * step_s * 10**9
         return (Readings(stamps, np.array(values)).thinned().stamp_ns // 10**9).tolist()
 
-    def test_a_change_or_ten_seconds_without_one(self):
+    def test_a_reading_is_kept_if_it_changes_or_after_ten_seconds(self):
         assert self.kept([1, 1, 2, 2, 2, 1]) == [0, 2, 5]
         assert self.kept([1] * 10, step_s=4) == [0, 12, 24, 36]
 
-    def test_missing_cells_are_no_readings(self):
+    def test_missing_cells_are_not_kept_as_readings(self):
         assert self.kept([float('nan'), 1, float('nan'), 1, 2]) == [1, 4]
         assert self.kept([float('nan')] * 3) == []
 
-    def test_a_clock_that_starts_anew_is_worth_a_message(self):
+    def test_a_clock_that_starts_anew_gives_a_message(self):
         readings = Readings(np.array([5, 6, 1, 2]) * 10**9, np.full(4, 20.0))
         assert (readings.thinned().stamp_ns // 10**9).tolist() == [5, 1]
 
@@ -274,7 +274,7 @@ class TestColumnMap:
         path.write_text(yaml.safe_dump({**data, **changes}))
         return path
 
-    def test_shipped_examples_are_valid(self):
+    def test_shipped_column_maps_are_valid(self):
         paths = sorted((ROOT / 'config' / 'columns').glob('*.yaml'))
         assert paths
         for path in paths:
@@ -309,14 +309,14 @@ class TestColumnMap:
              "column 'b' is given twice"),
         ],
     )  # fmt: skip
-    def test_mistakes_name_their_key(self, tmp_path, changes, key, message):
+    def test_mistakes_in_a_column_map_name_their_key(self, tmp_path, changes, key, message):
         path = self.write(tmp_path, **changes)
         with pytest.raises(RecordingError, match=message) as caught:
             load_column_map(path)
         assert str(path) in str(caught.value)
         assert key is None or (caught.value.key or '').startswith(key)
 
-    def test_files_that_are_no_maps(self, tmp_path):
+    def test_files_that_are_no_column_maps_are_refused(self, tmp_path):
         path = tmp_path / 'map.yaml'
         with pytest.raises(ThermoCompError, match=r'map\.yaml: .*No such file'):
             load_column_map(path)
@@ -330,7 +330,7 @@ class TestColumnMap:
 
 
 class TestCommand:
-    def test_says_what_it_did(self, tmp_path, cli):
+    def test_convert_reports_rows_rate_and_topics(self, tmp_path, cli):
         path, _ = table(tmp_path / 'log.csv')
         map_path = tmp_path / 'map.yaml'
         map_path.write_text(
@@ -361,7 +361,7 @@ class TestFreezer:
             pytest.skip(f'no {path}')
         return path
 
-    def test_every_row_is_there_and_the_faults_are_seen(self, path, tmp_path):
+    def test_every_row_is_in_the_bag_and_the_faults_are_reported(self, path, tmp_path):
         columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
         report = write_log(table_log(path, columns), tmp_path / 'bag')
         assert report.rows == report.messages['accel'] == 24514

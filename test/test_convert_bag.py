@@ -46,28 +46,20 @@ def messages(ros, rng, scale, names):
                 yield topic, kind, now, types[kind](header(now), value, 0.0)
 
 
-def write_ros2(path, rng, scale=G, names=None):
-    names = names or NAMES
-    with Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        store = typestore(2)
-        links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in names.items()}
-        for topic, kind, log_ns, message in messages(2, rng, scale, names):
-            writer.write(links[topic], log_ns, store.serialize_cdr(message, kind))
-    return path
-
-
-def write_ros1(path, rng):
-    with Writer1(path) as writer:
-        store = typestore(1)
+def write_bag(path, rng, ros=2, scale=G):
+    store = typestore(ros)
+    new = {'version': 9, 'storage_plugin': StoragePlugin.SQLITE3}
+    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
+    with Writer1(path) if ros == 1 else Writer2(path, **new) as writer:
         links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in NAMES.items()}
-        for topic, kind, log_ns, message in messages(1, rng, G, NAMES):
-            writer.write(links[topic], log_ns, store.serialize_ros1(message, kind))
+        for topic, kind, log_ns, message in messages(ros, rng, scale, NAMES):
+            writer.write(links[topic], log_ns, serialize(message, kind))
     return path
 
 
 @pytest.mark.parametrize('ros', [1, 2])
-def test_topics_of_any_name_become_ours(tmp_path, rng, ros):
-    path = write_ros1(tmp_path / 'old.bag', rng) if ros == 1 else write_ros2(tmp_path / 'new', rng)
+def test_topics_of_any_name_become_the_usual_topics(tmp_path, rng, ros):
+    path = write_bag(tmp_path / ('old.bag' if ros == 1 else 'new'), rng, ros)
     report = write_log(bag_log(path), tmp_path / 'bag.mcap')
     recording = read_recording(tmp_path / 'bag.mcap')
     assert report.messages['accel'] == N
@@ -86,8 +78,8 @@ def test_topics_of_any_name_become_ours(tmp_path, rng, ros):
     assert recording.info.metadata['topic_board'] == '/mpu/die'
 
 
-def test_unit_is_checked_at_rest(tmp_path, rng):
-    path = write_ros2(tmp_path / 'g', rng, scale=1.0)
+def test_the_stated_unit_is_checked_at_rest(tmp_path, rng):
+    path = write_bag(tmp_path / 'g', rng, scale=1.0)
     with pytest.raises(RecordingError, match=r'stated in m/s\^2, but .* looks like g'):
         write_log(bag_log(path), tmp_path / 'bag.mcap')
     write_log(bag_log(path, unit='g'), tmp_path / 'bag.mcap')
@@ -116,13 +108,13 @@ def present(imu, temperature=(), pressure=()):
         (('/robot/baro/t',), ('/robot/baro/p',), None, '/robot/baro/t'),
     ],
 )  # fmt: skip
-def test_neighbours_tell_the_thermometers(temperature, pressure, board, case):
+def test_thermometers_are_identified_by_topics_beside_them(temperature, pressure, board, case):
     imu = '/robot/imu/data' if temperature and temperature[0].startswith('/robot') else '/imu/data'
     topics = find_topics(present([imu], temperature, pressure), None, None, None)
     assert topics == {'imu': imu, 'board': board, 'case': case}
 
 
-def test_what_neighbours_cannot_tell_is_asked():
+def test_ambiguous_topics_must_be_named():
     with pytest.raises(RecordingError, match=r'several topics may be the Imu.*--topic imu='):
         find_topics(present(['/a/data', '/b/data']), None, None, None)
     with pytest.raises(RecordingError, match=r'several topics may be the board.*--topic board='):
@@ -135,8 +127,8 @@ def test_what_neighbours_cannot_tell_is_asked():
     assert chosen['case'] == '/imu/t1'
 
 
-def test_command(tmp_path, rng, cli):
-    bag = write_ros2(tmp_path / 'bag', rng, scale=1.0)
+def test_convert_takes_a_bag(tmp_path, rng, cli):
+    bag = write_bag(tmp_path / 'bag', rng, scale=1.0)
     refused = cli('convert', bag, '-o', tmp_path / 'out.mcap', code=1)
     assert 'looks like g' in refused.stderr
     finished = cli('convert', bag, '--unit', 'g', '-o', tmp_path / 'out.mcap')
@@ -171,13 +163,13 @@ def test_command(tmp_path, rng, cli):
         (32.2, 'unknown'),  # gravity in ft/s^2
     ],
 )
-def test_what_a_still_sensor_reads_says_its_unit(magnitude, unit):
+def test_the_magnitude_at_rest_tells_the_unit(magnitude, unit):
     believed, reason = believed_unit(magnitude)
     assert believed == unit
     assert f'{magnitude:.4g}' in reason
 
 
-def test_nothing_is_said_against_what_may_be_true():
+def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
     # Any magnitude at rest above that of mg may be counts of a precise converter.
@@ -218,7 +210,7 @@ def test_a_sensor_that_shows_no_noise_is_not_moving(rng):
     assert stillness.magnitude == pytest.approx(1.0, rel=1e-3)
 
 
-def test_too_short_to_tell():
+def test_the_stillness_of_five_samples_is_unknown():
     stillness = find_stillness(np.arange(5), np.ones((5, 3)))
     assert np.isnan(stillness.magnitude)
     assert stillness.moving_ns == ()

@@ -74,7 +74,7 @@ def write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)):
 
 @pytest.mark.parametrize('imu', [0, 1])
 @pytest.mark.parametrize('baro', [0, 1])
-def test_new_instances(tmp_path, rng, imu, baro):
+def test_logs_of_the_new_format_give_each_instance(tmp_path, rng, imu, baro):
     path = tmp_path / 'new.BIN'
     force = write_new(path, rng)
     write_log(read_autopilot(path, imu=imu, baro=baro), tmp_path / 'bag.mcap')
@@ -95,7 +95,7 @@ def test_new_instances(tmp_path, rng, imu, baro):
     np.testing.assert_allclose(bag.temperatures['case'].celsius, hundredths / 100, rtol=1e-15)
 
 
-def test_old_types_are_the_instances(tmp_path, rng):
+def test_types_of_old_logs_are_the_instances(tmp_path, rng):
     log = DataflashWriter()
     for name in ('IMU', 'IMU2'):
         log.define(name, *OLD_IMU)
@@ -117,7 +117,7 @@ def test_old_types_are_the_instances(tmp_path, rng):
         np.testing.assert_array_equal(read.temperatures['case'].celsius, [21.5 + i])
 
 
-def test_chip_without_a_thermometer(tmp_path, rng):
+def test_a_temperature_of_0_means_no_thermometer(tmp_path, rng):
     # ArduPilot writes 0 if a driver gives no temperature.
     log = DataflashWriter()
     log.define('IMU', *NEW_IMU)
@@ -128,7 +128,7 @@ def test_chip_without_a_thermometer(tmp_path, rng):
     assert not read_autopilot(path).temperatures
 
 
-def test_corrected_log_is_refused(tmp_path, rng):
+def test_a_log_corrected_by_ardupilot_is_refused(tmp_path, rng):
     path = tmp_path / 'corrected.BIN'
     write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 1.0),))
     with pytest.raises(RecordingError, match=r'INS_TCAL1_ENABLE was 1.*already'):
@@ -149,24 +149,24 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
-def test_what_was_corrected_is_left_out(tmp_path, rng, course, kept, share):
+def test_samples_corrected_by_ardupilot_are_left_out(tmp_path, rng, course, kept, share):
     path = tmp_path / 'log.BIN'
     force = write_new(path, rng, [('INS_TCAL1_ENABLE', *step) for step in course])
     read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force[0][kept])
     assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # Temperatures of the dropped part stay, because the fit needs the thermal history.
+    # Temperatures are kept where samples are left out: the fit needs the thermal history.
     assert len(read.temperatures['board'].celsius) > 1
 
 
-def test_a_simulator_that_makes_noise_is_said(tmp_path, rng):
+def test_a_log_of_a_simulator_with_noise_is_reported(tmp_path, rng):
     path = tmp_path / 'noisy.BIN'
     write_new(path, rng, parameters=(('SIM_ACC1_RND', 0.1),))
     assert 'SIM_' in read_autopilot(path).metadata['ardupilot_simulated']
 
 
-def test_torn_log_is_read_up_to_the_tear(tmp_path, rng):
+def test_a_torn_dataflash_log_is_read_up_to_the_cut(tmp_path, rng):
     path = tmp_path / 'torn.BIN'
     force = write_new(path, rng)
     whole = path.read_bytes()
@@ -188,7 +188,7 @@ def test_absent_instances_are_named(tmp_path, rng):
 
 
 @pytest.mark.parametrize('content', [b'', b'time,x,y,z\n', b'\xa3\x95' + bytes(600)])
-def test_other_files_are_refused(tmp_path, content):
+def test_files_that_are_no_dataflash_logs_are_refused(tmp_path, content):
     path = tmp_path / 'other.BIN'
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r'not a DataFlash log|holds no IMU'):

@@ -33,7 +33,7 @@ def write(path, text):
     ],
     ids=['comma', 'semicolon-crlf', 'tab-bom', 'bar-comment', 'blanks'],
 )
-def test_every_layout_reads_alike(tmp_path, delimiter, newline, prefix):
+def test_every_layout_of_a_table_gives_equal_values(tmp_path, delimiter, newline, prefix):
     lines = [delimiter.join(('t', 'a', 'b'))]
     lines += [delimiter.join(map(str, row)) for row in ROWS]
     path = write(tmp_path / 'log.txt', prefix + newline.join(lines) + newline)
@@ -44,7 +44,7 @@ def test_every_layout_reads_alike(tmp_path, delimiter, newline, prefix):
     assert table.n_short == 0
 
 
-def test_headings_are_optional(tmp_path):
+def test_headings_of_a_table_are_optional(tmp_path):
     path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
     assert read_text(path, [2], ROWS_ALONE).values[2].tolist() == [3.0, 6.0]
     # A first line of words is the heading, unless the user says otherwise.
@@ -53,7 +53,7 @@ def test_headings_are_optional(tmp_path):
 
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
-def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path, separator):
+def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
     # A row of units counts as a row without numbers; the last row is incomplete.
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
@@ -65,7 +65,7 @@ def test_what_a_logger_writes_before_its_table_is_left_out(tmp_path, separator):
     assert table.n_short == 1
 
 
-def test_a_column_may_begin_late(tmp_path):
+def test_a_column_of_a_table_may_begin_late(tmp_path):
     # WHY: a table was not read if its last column, a thermometer, begins some rows late.
     rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
     path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
@@ -84,7 +84,7 @@ def test_line_numbers_are_those_of_an_editor(tmp_path):
     assert table.n_short == 1
 
 
-def test_stamps_are_exact():
+def test_stamps_of_a_table_are_exact():
     # A float64 of nanoseconds since 1970 has steps of 256 ns.
     cells = ['1767225600.123456789', '1767225600123456789e-9', ' +2 ', '1.5e-9']
     exact = [1767225600123456789, 1767225600123456789, 2 * 10**9, 2]
@@ -124,7 +124,7 @@ def test_bad_tables_are_refused(tmp_path, text, column, message):
     assert str(path) in str(caught.value)
 
 
-def test_missing_file_is_refused(tmp_path):
+def test_a_missing_table_is_refused(tmp_path):
     with pytest.raises(RecordingError, match='No such file'):
         read_text(tmp_path / 'absent.csv', ['a'], ROWS_ALONE)
 
@@ -141,7 +141,7 @@ class TestParquet:
         pq.write_table(pa.table(columns), tmp_path / 'log.parquet')
         return tmp_path / 'log.parquet'
 
-    def test_reads_what_text_reads(self, tmp_path):
+    def test_parquet_gives_the_values_of_the_text_table(self, tmp_path):
         path = self.table(
             tmp_path, t=[row[0] for row in ROWS], a=[row[1] for row in ROWS], b=[1, None, 3]
         )
@@ -150,19 +150,19 @@ class TestParquet:
         assert table.values['a'].tolist() == [row[1] for row in ROWS]
         np.testing.assert_array_equal(table.values['b'], [1.0, np.nan, 3.0])
 
-    def test_its_own_timestamps_state_their_unit(self, tmp_path):
+    def test_timestamps_of_parquet_state_their_unit(self, tmp_path):
         path = self.table(
             tmp_path, t=np.array([1767225600123, 0], dtype='datetime64[ms]'), a=[1.0, 2.0]
         )
         table = read_parquet(path, ['a'], Stamp('t', 's'))
         assert table.stamp_ns.tolist() == [1767225600123 * 10**6, 0]
 
-    def test_floats_of_seconds(self, tmp_path):
+    def test_stamps_of_parquet_may_be_floats_of_seconds(self, tmp_path):
         path = self.table(tmp_path, t=[0.5, float('nan')], a=[1.0, 2.0])
         table = read_parquet(path, ['a'], Stamp('t', 's'))
         assert table.stamp_ns.tolist() == [500_000_000, NO_STAMP]
 
-    def test_refusals(self, tmp_path):
+    def test_unreadable_parquet_is_refused(self, tmp_path):
         path = self.table(tmp_path, a=['one', 'two'])
         with pytest.raises(RecordingError, match="column 'a' holds string"):
             read_parquet(path, ['a'], ROWS_ALONE)
@@ -177,7 +177,7 @@ class TestParquet:
 
 @pytest.mark.parametrize('suffix', ['csv', 'parquet'])
 @pytest.mark.parametrize('unit', ['s', 'ns'])
-def test_stamps_that_ros_cannot_hold(tmp_path, suffix, unit):
+def test_stamps_that_ros_cannot_hold_are_left_out(tmp_path, suffix, unit):
     """A row is in the bag with its stamp, or left out and counted; stamps of 2e10 s overflowed."""
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]

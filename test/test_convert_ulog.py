@@ -80,7 +80,7 @@ def flight(tmp_path, rng):
 
 
 @pytest.mark.parametrize('imu', [0, 1])
-def test_log_arrives_in_the_bag(flight, tmp_path, imu):
+def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     path, truth = flight
     report = write_log(read_autopilot(path, imu=imu), tmp_path / 'bag.mcap')
     recording = read_recording(tmp_path / 'bag.mcap')
@@ -96,7 +96,7 @@ def test_log_arrives_in_the_bag(flight, tmp_path, imu):
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
 
 
-def test_gyro_of_the_same_instance_travels_along(flight, tmp_path):
+def test_the_gyroscope_of_an_instance_is_in_its_bag(flight, tmp_path):
     path, _ = flight
     write_log(read_autopilot(path, imu=0), tmp_path / 'bag.mcap')
     rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
@@ -105,13 +105,13 @@ def test_gyro_of_the_same_instance_travels_along(flight, tmp_path):
     assert read_autopilot(path, imu=1).gyro is None
 
 
-def test_gyro_logged_sparsely_is_left_out(tmp_path, rng):
+def test_a_sparsely_logged_gyroscope_is_left_out(tmp_path, rng):
     path = tmp_path / 'flight.ulg'
     write_two_imus(path, rng, gyro_every=5)
     assert read_autopilot(path).gyro is None
 
 
-def test_old_layout_without_sample_time(tmp_path, rng):
+def test_a_log_without_sample_times_is_read(tmp_path, rng):
     log = UlogWriter(OLD_ACCEL)
     number = log.subscribe('sensor_accel', 0)
     force = still(rng)
@@ -126,7 +126,7 @@ def test_old_layout_without_sample_time(tmp_path, rng):
     np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
 
 
-def test_thermometer_that_is_not_there(tmp_path, rng):
+def test_a_chip_without_a_thermometer_is_recognised(tmp_path, rng):
     log = UlogWriter(ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, (x, y, z) in enumerate(still(rng)):
@@ -139,7 +139,7 @@ def test_thermometer_that_is_not_there(tmp_path, rng):
     assert not read_autopilot(path).temperatures
 
 
-def test_torn_log_is_read_up_to_the_tear(flight):
+def test_a_torn_ulog_is_read_up_to_the_cut(flight):
     path, truth = flight
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -155,7 +155,7 @@ def refused(folder, content, message):
         read_autopilot(folder / 'refused.ulg')
 
 
-def test_simulator_is_refused(tmp_path):
+def test_a_log_of_a_simulator_without_noise_is_refused(tmp_path):
     log = UlogWriter(OLD_ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k in range(N):
@@ -202,7 +202,7 @@ def parameter(name, value):
     return bytes([len(key)]) + key + struct.pack('<i', value)
 
 
-def test_the_combined_sensor_stands_in(tmp_path, rng, cli):
+def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
     path = tmp_path / 'default.ulg'
     force = write_combined(path, rng)
     read = read_autopilot(path)
@@ -226,7 +226,7 @@ def test_a_combined_sensor_that_px4_compensated_is_refused(tmp_path, rng):
 
 
 @pytest.mark.parametrize('begin', [0, 1])
-def test_what_px4_compensated_is_left_out(tmp_path, rng, begin):
+def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     path = tmp_path / 'half.ulg'
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
@@ -237,7 +237,7 @@ def test_what_px4_compensated_is_left_out(tmp_path, rng, begin):
     np.testing.assert_array_equal(read.accel[part], force[part])
 
 
-def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):
+def test_the_use_of_a_log_of_1_hz_is_reported(tmp_path, rng, cli):
     log = UlogWriter(OLD_ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, force in enumerate(still(rng)):
@@ -249,18 +249,18 @@ def test_a_log_of_1_hz_says_what_it_is_good_for(tmp_path, rng, cli):
     assert 'sensor_accel at 10 Hz' in printed
 
 
-def test_log_without_an_accelerometer(tmp_path):
+def test_a_log_without_an_accelerometer_is_refused(tmp_path):
     log = UlogWriter(BARO)
     log.data(log.subscribe('sensor_baro', 0), struct.pack('<QQIffI', 1, 1, 9, 1e5, 20.0, 0))
     refused(tmp_path, log.body, 'the log holds no IMU')
 
 
-def test_other_files_are_refused(tmp_path):
+def test_files_that_are_no_ulog_are_refused(tmp_path):
     for content in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10):
         refused(tmp_path, content, 'not a ULog file')
 
 
-def test_format_without_a_time_stamp_is_left_out(tmp_path):
+def test_a_format_without_a_time_stamp_is_left_out(tmp_path):
     log = UlogWriter('sensor_accel:float x;float y;float z;')
     log.data(log.subscribe('sensor_accel', 0), struct.pack('<fff', 0.0, 0.0, 1.0))
     refused(tmp_path, log.body, r'not a ULog file|holds no IMU')

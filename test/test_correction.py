@@ -233,7 +233,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
             assert a + b * x + c * x * x == pytest.approx(expected, rel=0.09)
 
 
-def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
+def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
     # Only the start of a lag of 60 s is uncertain: the sd falls as exp(-t/60).
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     compensator = Compensator(unit, UNCHECKED)
@@ -262,7 +262,7 @@ def test_what_is_slow_is_held_for_ten_seconds_of_the_stamps():
         assert [v for _, v in span] == pytest.approx([variance] * len(span), abs=part)
 
 
-def test_a_further_sensor_that_is_lost_is_paid_for():
+def test_a_lost_further_sensor_widens_the_claimed_sd():
     unit = calibration(
         sensors=SENSORS, response=(term('gradient', (30.0, 0.0, 0.0), sensor='tip'),)
     )
@@ -286,7 +286,7 @@ def test_a_thermometer_that_the_calibration_does_not_know_changes_nothing(rng):
     )
 
 
-def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
+def test_a_swap_of_calibrations_keeps_the_lags_that_the_two_share(rng):
     unit = full_bank(rng)
     events = run_of(rng, seconds=60)
     compensator = Compensator(unit, UNCHECKED)
@@ -300,7 +300,7 @@ def test_a_swap_keeps_the_memory_where_the_same_is_remembered(rng):
     assert compensator.process(61 * SECOND_NS, 0.0, 0.0, 2900.0) is not None
 
 
-def test_the_state_at_the_edge_of_a_column_is_held_and_what_is_cut_off_is_paid_for():
+def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
         response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
@@ -329,7 +329,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
     return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
 
 
-def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
+def test_beyond_the_range_lagging_parts_do_not_lower_the_claimed_sd():
     # Slopes of curve and lag cancel for an error of the thermometer, but not outside the range.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
@@ -342,7 +342,7 @@ def test_beyond_the_range_a_unit_whose_parts_lag_is_as_wrong_as_any():
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
 
 
-def test_beyond_the_range_slopes_that_cancel_are_no_knowledge():
+def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
     # The slope of the bias is 0.8 counts/K at the upper edge; a force of 10 m/s^2 cancels it.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
@@ -361,7 +361,7 @@ def curves_at(unit, celsius):
 BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
 
 
-def test_beyond_the_range_curves_go_on_along_their_tangent_for_a_quarter_of_the_span():
+def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span():
     one, two = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
     unit = calibration(static=regime_set(one), dynamic=regime_set(two))
     for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
@@ -395,10 +395,9 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
     np.testing.assert_allclose(static[6:] - static[6], upper * np.array([0, 3, 7.5, 7.5]))
 
 
-def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng):
-    # Correction and regressors are linear in the parameters: the correction must change by the
-    # regressors times the change of the parameters. The range of the dynamic set ends first above,
-    # the range of the static set below.
+def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
+    # The correction must change by the regressors times the change of the parameters. The range of
+    # the dynamic set is the first to end above, the range of the static set the first below.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -428,7 +427,7 @@ def test_the_claim_beyond_the_range_follows_every_parameter_of_the_tangents(rng)
             np.testing.assert_allclose(row, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_the_claim_grows_all_the_way_out_of_the_range():
+def test_the_claimed_sd_grows_with_the_distance_from_the_range():
     unit = rich_calibration()
     correction = Correction(unit)
     slow = SlowUncertainty(unit, correction)
@@ -446,13 +445,13 @@ def test_the_claim_grows_all_the_way_out_of_the_range():
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 
 
-def test_a_part_that_is_still_outside_is_paid_for():
+def test_a_part_that_is_still_outside_the_range_widens_the_claimed_sd():
     bent = axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bent), dynamic=regime_set(bent),
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
-    # The board is back at 33 degC; a part at 34 degC adds nothing, a part still at 41 degC does.
+    # The board is back at 33 degC; a part at 34 degC adds no variance, a part at 41 degC does.
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     bends = 0.6 / math.sqrt(12.0)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)

@@ -33,7 +33,7 @@ def mean_variance(ups, at):
     return float(np.mean(np.trace(columns @ covariance @ columns.transpose(0, 2, 1), 0, 1, 2)))
 
 
-def test_columns_are_the_derivatives_of_the_measured_force(rng):
+def test_the_columns_are_derivatives_of_the_measured_force(rng):
     up, step = units(rng, 20), 1e-6
 
     def force(constants):
@@ -51,14 +51,14 @@ def test_columns_are_the_derivatives_of_the_measured_force(rng):
         )
 
 
-def test_without_positions_the_prior_is_left():
+def test_without_positions_the_covariance_is_that_of_the_prior():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
-    # If an axis is vertical, the variance of |f| is the sum of those of its bias and its scale.
+    # If an axis is vertical, the variance of |f| is that of the bias plus that of the scale.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
-def test_two_opposite_faces_tell_bias_and_scale_of_their_axis():
+def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
     # Bias and scale of x are half the difference and half the sum of two readings.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
@@ -93,12 +93,12 @@ def test_the_next_direction_lowers_the_mean_variance(n, rng):
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
 
-def test_who_follows_the_proposals_gets_a_good_test():
+def test_the_proposed_directions_make_a_good_test():
     up = NOTHING
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
         up = np.vstack([up, next_direction(covariance, SD, up)])
-    # Recommended are first the faces, upright before all, then directions for the misalignment.
+    # Faces are proposed first, beginning with upright, then directions for the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))
@@ -107,7 +107,7 @@ def test_who_follows_the_proposals_gets_a_good_test():
     assert farthest(up)[1] < 36.0
 
 
-def test_the_hole_in_the_sphere():
+def test_the_largest_angle_to_the_nearest_direction():
     # The corners of a cube are equally far from its faces.
     up, angle = farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))
@@ -125,5 +125,5 @@ def test_the_hole_in_the_sphere():
         ((3, 1, 0), '+x and +y up in part: x +0.95 g, y +0.32 g, z +0.00 g'),
     ],
 )
-def test_a_direction_in_words(up, words):
+def test_a_direction_is_described_in_words(up, words):
     assert spoken_direction(np.array(up, float) / np.linalg.norm(up)) == words

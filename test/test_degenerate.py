@@ -15,7 +15,7 @@ import pytest
         ('all values 1e308', 'report'), ('name not UTF-8', 'replay'),
     ],
 )  # fmt: skip
-def test_it_ends_with_a_sentence_in_bounded_memory(name, command, tmp_path):
+def test_a_degenerate_input_ends_with_a_sentence_in_bounded_memory(name, command, tmp_path):
     folder = tmp_path / 'in' / 'unit'
     folder.mkdir(parents=True)
     path = degenerate.INPUTS[name].make(folder)
@@ -39,7 +39,7 @@ def test_it_ends_with_a_sentence_in_bounded_memory(name, command, tmp_path):
         ('axes that lean', 'with one unit for three axes at right angles?'),
     ],
 )
-def test_the_cause_is_said_in_the_users_words(name, text, tmp_path, cli):
+def test_the_cause_of_a_refusal_is_named_in_the_users_words(name, text, tmp_path, cli):
     path = degenerate.INPUTS[name].make(tmp_path)
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
     (line,) = [text for text in failed.stderr.splitlines() if ': error: ' in text]

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# Tested elsewhere: the session of cli.md, a bag that plays for minutes, a growing bag.
+# Commands that other files test: a bag that plays for minutes, a recording of 18 positions.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',
     'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',
@@ -49,7 +49,7 @@ COMMANDS = commands()
 
 
 @pytest.mark.parametrize(('page', 'command', 'output'), COMMANDS, ids=[c for _, c, _ in COMMANDS])
-def test_the_command_does_what_the_page_says(page, command, output, desk):
+def test_a_command_on_a_page_gives_the_output_shown(page, command, output, desk):
     if '--install-completion' in command:
         pytest.skip('writes into the home folder of the user')
     finished = desk.run(command)
@@ -59,11 +59,11 @@ def test_the_command_does_what_the_page_says(page, command, output, desk):
         assert is_alike(finished.stdout, output), finished.stdout
 
 
-def test_there_are_commands_to_run():
+def test_pages_have_commands_to_test():
     assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
 
 
-def test_completion_is_a_script_that_bash_takes():
+def test_bash_takes_the_completion_script():
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')
@@ -114,7 +114,7 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch):
     assert n_figures == 2
 
 
-def test_refusals_are_quoted_as_they_are_said():
+def test_refusals_on_the_page_are_those_of_the_source():
     text = (ROOT / 'docs' / 'recording.md').read_text()
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10

@@ -98,7 +98,7 @@ def test_the_node_finds_the_type_while_it_runs(peer, unit, is_file):
         ('imu=/imu/data_raw', "must be 'm/s^2' (parameter `input` is imu), got 'counts'"),
     ],
 )
-def test_topics_that_cannot_be(unit, topics, text, capfd):
+def test_impossible_topics_are_refused(unit, topics, text, capfd):
     command = ['thermo_comp_node', '--ros-args', *node_arguments(unit, f'topics:={topics}')]
     assert main(command) == 1
     (line,) = capfd.readouterr().err.splitlines()
@@ -121,7 +121,7 @@ def test_a_drivers_imu_data_raw_needs_another_output(unit, capfd):
         assert node.node.count_publishers('/imu/compensated') == 1
 
 
-def test_record_writes_them_as_temperatures(peer):
+def test_record_writes_fields_of_messages_as_temperatures(peer):
     outputs = {}
     pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
     messages = [

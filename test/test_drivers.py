@@ -33,7 +33,7 @@ OWN = {
     'float32 mean_temp\n',
     'microstrain_inertial_msgs/msg/MipHeader': 'std_msgs/Header header\nuint8 event_source\n',
 }
-#: Topics of each driver as in docs/drivers.md, and further topics of such a bag.
+#: Topics of each driver as in docs/drivers.md, and further topics of a bag of the driver.
 LAYOUTS = {
     'microstrain': {'/imu/data': IMU, '/mip/sensor/temperature_statistics': MIP},
     'xsens': {
@@ -67,14 +67,14 @@ LAYOUTS = {
 }
 #: Drivers without a temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
-#: Drivers whose bags are fitted, in addition to `LACKS`: one with each kind of message.
+#: Drivers whose bags are fitted, in addition to `LACKS`: one driver for each kind of message.
 FITTED = {'xsens', 'mavros', 'px4', 'phidgets'}
-#: Six faces and the first one again, for REST_S each, while the board warms [K/s].
+#: Six faces and the first face again, for REST_S each, while the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
 RATE, REST_S, WARMING = 10, 75, 0.05
 SECONDS = len(UPS) * REST_S
 GRAVITY, MICRO_G = 9.80665, 9.80665e-6
-#: Errors of the unit [m/s^2], constant and per K, and its noise: 4 ug in the mean of a minute.
+#: Biases of the unit [m/s^2], constant and per K, and noise: 4 ug in the mean of a minute.
 BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]), 1e-3
 
 
@@ -142,7 +142,7 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page():
 @pytest.mark.parametrize(
     ('path', 'bag'), [(path, path.stem) for path in FILES], indirect=['bag'], ids=str
 )
-def test_every_command_works_on_the_drivers_bag(path, bag, tmp_path, cli):
+def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
     names, topics = read_names(path), ('--topics', path)
     has_board = path.stem not in LACKS
     printed = cli('info', bag, *topics).stdout
@@ -192,9 +192,9 @@ def warming_unit():
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.stem)
-def test_the_node_works_as_the_file_says(path, tmp_path):
+def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-    from ros_helpers import Peer, node_in_thread, stamped
+    from ros_helpers import Peer, node_arguments, node_in_thread, stamped
     from sensor_msgs.msg import Imu, Temperature
     from std_msgs.msg import Float64
 
@@ -203,8 +203,8 @@ def test_the_node_works_as_the_file_says(path, tmp_path):
     names = {'imu': '/imu/uncompensated', 'board': '/temperature/board', **read_names(path)}
     layout = LAYOUTS[path.stem]
     save_calibration(warming_unit(), tmp_path / 'unit.yaml')
-    words = [f'calibration_file:={tmp_path / "unit.yaml"}', f'topics:={path}', 'input:=imu']
-    with node_in_thread(*(word for text in words for word in ('-p', text))) as node:
+    words = node_arguments(tmp_path / 'unit.yaml', f'topics:={path}', 'input:=imu')
+    with node_in_thread(*words) as node:
         heard_topics = {subscription.topic_name for subscription in node.node.subscriptions}
         topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
         board, _, field = names['board'].partition(':')

@@ -51,7 +51,7 @@ def cubic():
 
 
 @pytest.mark.parametrize('to', TOOLS)
-def test_foreign_text_makes_no_live_line(cubic, to):
+def test_foreign_text_adds_no_line_to_an_export(cubic, to):
     # WHY: a serial with a line break set a parameter of the vehicle.
     clean = export_calibration(cubic, to).text
     unit = replace(cubic.unit)
@@ -81,7 +81,7 @@ def bias_at(calibration, axis, celsius):
     return reference.bias + one.bias_function.value(celsius - calibration.reference_temperature_c)
 
 
-def test_px4_formula_gives_our_bias(cubic):
+def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):
     p = numbers(export_calibration(cubic, 'px4', number=2, device_id=1376264).text, '\t')
     assert (p['TC_A_ENABLE'], p['TC_A2_ID']) == (1, 1376264)
     assert (p['TC_A2_TMIN'], p['TC_A2_TMAX']) == (5.0, 45.0)
@@ -93,7 +93,7 @@ def test_px4_formula_gives_our_bias(cubic):
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
 
 
-def test_ardupilot_formula_gives_our_bias_changes(cubic):
+def test_the_formula_of_ardupilot_gives_the_bias_changes_of_the_calibration(cubic):
     p = numbers(export_calibration(cubic, 'ardupilot', number=3).text, ',')
 
     def polynomial(axis, celsius):
@@ -118,7 +118,7 @@ def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic):
         assert bias_at(back, axis, 41.0) == pytest.approx(ours, rel=1e-7, abs=1e-9)
 
 
-def test_the_angular_rate_goes_both_ways(cubic):
+def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     curves = [(0.0, 2e-4, -3e-6, 1e-8), (0.0, -1e-4, 2e-6, 0.0), (0.0, 5e-5, 0.0, -2e-8)]
     rates = RateSet(*(RateCurve(Polynomial(curve)) for curve in curves))
     gyroscope = Gyroscope((0.02, -0.01, 0.03), rates, rates, (1e-4,) * 3)
@@ -195,7 +195,7 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic):
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
 
 
-def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic):
+def test_px4_gets_the_offset_of_readings_in_si(cubic):
     # WHY: PX4 subtracts the offset from readings in m/s^2; a scale error of 0.5 % is 5 mg at rest.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
@@ -213,7 +213,7 @@ def test_px4_gets_what_it_subtracts_from_readings_in_si(cubic):
         assert reading - offset == pytest.approx(9.81 * up[axis], abs=1e-7)
 
 
-def test_what_is_lost_is_said(cubic):
+def test_losses_of_an_export_are_noted(cubic):
     spline = CubicSpline((-15.0, 0.0, 10.0, 25.0), (0.01, 0.0, 0.02, -0.01))
     static = replace(cubic.static, x=AxisSet(spline, ONE))
     dynamic = replace(static, y=replace(static.y, delta=0.1))
@@ -255,7 +255,7 @@ def test_what_is_lost_is_said(cubic):
         ('imu0: {rostopic: /imu}', 'nor the matrices of imu_tk'),
     ],
 )
-def test_what_is_no_calibration_is_refused(text, message):
+def test_files_that_are_no_calibrations_are_refused(text, message):
     with pytest.raises(CalibrationError, match=message):
         import_calibration(text, serial='7')
 
@@ -269,7 +269,7 @@ def test_an_absent_set_and_an_empty_range_are_refused(cubic):
         import_calibration(empty, serial='7')
 
 
-def test_impossible_arguments_are_refused(cubic):
+def test_impossible_arguments_of_export_are_refused(cubic):
     for to, given, reason in (
         ('px4', {'number': 4}, r'`number` must be 0\.\.3, got 4'),
         ('ardupilot', {'number': 0}, r'`number` must be 1\.\.3, got 0'),
@@ -308,7 +308,7 @@ def turn(notes):
 RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 65535.0, 30000.0]])
 
 
-def test_imu_tk_formula_gives_our_correction(tumbled):
+def test_the_formula_of_imu_tk_gives_the_same_correction(tumbled):
     # X' = T K (X - B) as in imu_tk's header; its reader takes 9 + 9 + 3 numbers in rows.
     file = export_calibration(tumbled, 'imu_tk')
     numbers = [float(cell) for cell in file.text.split()]
@@ -324,7 +324,7 @@ def test_imu_tk_formula_gives_our_correction(tumbled):
     )
 
 
-def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled):
+def test_formulas_of_imu_calib_and_kalibr_give_the_same_correction(tumbled):
     data = yaml.safe_load(export_calibration(tumbled, 'imu_calib').text)
     theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
     np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)
@@ -337,7 +337,7 @@ def test_imu_calib_and_kalibr_formulas_give_our_correction(tumbled):
 
 
 @pytest.mark.parametrize('to', ['imu_tk', 'imu_calib', 'kalibr'])
-def test_tumble_round_trip(tumbled, to):
+def test_constants_are_unchanged_by_export_and_import(tumbled, to):
     file = export_calibration(tumbled, to)
     back = import_calibration(file.text, serial='7')
     assert back.unit.input == 'counts'
@@ -364,7 +364,7 @@ def test_a_file_that_imu_tk_saved_is_read():
     np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
 
 
-def test_a_full_matrix_is_taken_apart_into_ours_and_a_turn():
+def test_a_full_matrix_becomes_a_triangular_matrix_and_a_rotation():
     SM = np.array([[1.02, 0.03, -0.01], [-0.02, 0.99, 0.02], [0.01, -0.03, 1.01]])
     text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
     back = import_calibration(text, serial='7')
@@ -376,7 +376,7 @@ def test_a_full_matrix_is_taken_apart_into_ours_and_a_turn():
     assert not np.triu(back.misalignment, 1).any()
 
 
-def test_kalibr_without_bias_and_with_several_imus():
+def test_kalibr_files_without_bias_and_with_several_imus_are_read():
     imu = '  accelerometers:\n    M: [[1.01, 0, 0], [0.01, 0.99, 0], [0.02, -0.01, 1.02]]\n'
     back = import_calibration(f'imu0:\n{imu}  update_rate: 200.0\n', serial='7')
     assert back.unit.input == 'm/s^2'
@@ -402,5 +402,5 @@ def test_px4_rates_of_different_degree_keep_their_own_reference(cubic):
             assert ours == pytest.approx(theirs, abs=1e-12)
 
 
-def test_the_command_offers_every_tool():
+def test_the_command_export_offers_every_tool():
     assert get_args(Tool) == tuple(TOOLS)

@@ -40,7 +40,7 @@ def folder(tmp_path):
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_full_disk(small_disk, folder, cli, name):
+def test_a_command_on_a_full_disk_fails_in_one_line(small_disk, folder, cli, name):
     before, _ = COMMANDS[name]
     output = small_disk / name
     finished = cli(*before, output, code=1, cwd=folder)
@@ -52,7 +52,7 @@ def test_a_full_disk(small_disk, folder, cli, name):
 
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
-def test_a_conversion_on_a_full_disk_leaves_no_draft(small_disk, tmp_path, cli):
+def test_a_conversion_on_a_full_disk_leaves_no_file(small_disk, tmp_path, cli):
     table = tmp_path / 'log.csv'
     samples = np.random.default_rng(3).normal((0.0, 0.0, 9.8), 0.1, (9000, 3))
     rows = [f'{k / 100},{x},{y},{z},20.0' for k, (x, y, z) in enumerate(samples)]
@@ -96,7 +96,7 @@ def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_folder_that_is_read_only(folder, cli, name):
+def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
     if os.geteuid():
         locked = folder / 'locked'
         locked.mkdir(mode=0o500)
@@ -108,7 +108,7 @@ def test_a_folder_that_is_read_only(folder, cli, name):
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
 
-#: Runs the command; kills itself when the temporary file is open, or before its renaming.
+#: A process that runs a command and kills itself as its temporary file is open or complete.
 KILLED = """
 import os, signal, sys
 point, target = sys.argv[1:3]
@@ -167,7 +167,7 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
-def test_a_command_that_is_asked_to_end_leaves_nothing(folder, name):
+def test_a_terminated_command_leaves_no_file(folder, name):
     # WHY: a hidden file as large as the bag remained after each time-out and each shutdown.
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
@@ -185,7 +185,7 @@ def rewritten(torn, whole):
         bag.write_counts('accel/counts', columns.accel_stamp_ns, columns.accel, columns.frame_id)
 
 
-def test_a_fit_takes_what_torn_bags_hold_and_says_so(folder, cli):
+def test_a_fit_uses_the_readable_part_of_torn_bags_and_reports_it(folder, cli):
     torn, whole = folder / 'torn.mcap', folder / 'whole.mcap'
     content = (folder / FIT[0]).read_bytes()
     torn.write_bytes(content[: len(content) // 2])

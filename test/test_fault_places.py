@@ -48,7 +48,7 @@ SIGMAS = 5.0
     ],
     ids=['both stop early', 'both stop later', 'both freeze', 'case steps', 'both step'],
 )
-def test_nothing_wrong_is_published(inject):
+def test_no_published_sample_is_wrong_beyond_its_sd(inject):
     stamps, table = corrected(inject(bag()))
     seconds = (stamps - START_NS) * 1e-9
     sd = np.sqrt(table[:, [3, 6, 8]])
@@ -78,7 +78,7 @@ def ended_s(row):
     return seconds_of(clean[-1 - n_same][1])
 
 
-def test_every_transient_fault_is_over_within_the_detector_s_settling_time():
+def test_output_recovers_from_transient_faults_within_the_settling_time():
     back = {
         row.fault: row.recovered - ended_s(row) for row in ROWS if 0 < row.recovered < math.inf
     }

@@ -41,7 +41,7 @@ def sigmas(heard):
     return float((np.abs(heard.force - force_at(seconds)) / sd).max())
 
 
-def test_a_publisher_restarts(node):
+def test_a_restarted_publisher_changes_no_output(node):
     events = bag(duration_s=100.0)
     first = node.play([e for e in events if seconds_of(e[1]) < 50.0])
     node.restart_publishers()
@@ -51,7 +51,7 @@ def test_a_publisher_restarts(node):
     assert second.values['lost'] == '0'
 
 
-def test_the_node_is_killed_and_restarts_in_the_ramp(path):
+def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
     events = [e for e in bag() if seconds_of(e[1]) < 300.0]
     _, undisturbed = corrected(events)
     with bench(path) as node:
@@ -122,7 +122,7 @@ DAMAGES = {
 }  # fmt: skip
 
 
-def test_calibration_files_that_go_bad(path, tmp_path):
+def test_bad_calibration_files_leave_the_running_calibration(path, tmp_path):
     events = bag(duration_s=90.0)
     good = path.read_bytes()
     heard = []
@@ -148,7 +148,7 @@ def test_calibration_files_that_go_bad(path, tmp_path):
     assert n == sum(e[0] == 'counts' for e in events if seconds_of(e[1]) < 80.0)
 
 
-def test_a_storm_of_reloads_at_1_khz(tmp_path):
+def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
@@ -191,7 +191,7 @@ def test_a_storm_of_reloads_at_1_khz(tmp_path):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_samples_flow(path, number):
+def test_a_signal_while_samples_flow_ends_the_node_cleanly(path, number):
     with bench(path) as node:
         heard = node.play(bag(duration_s=20.0))
         node.send(bag(duration_s=40.0, start_s=20.0))
@@ -201,7 +201,7 @@ def test_a_signal_while_samples_flow(path, number):
     assert sigmas(heard) < SIGMAS
 
 
-def test_slope_and_its_error(rng):
+def test_the_slope_of_the_soak_benchmark_has_the_right_error(rng):
     time = np.arange(3600.0)
     values = 100.0 + 7.0 * time / 3600.0 + rng.standard_normal(3600)
     # `slope` leaves out the first tenth of the run, here 360 s.

@@ -70,7 +70,7 @@ def reference():
 
 
 @pytest.mark.parametrize('row', ROWS, ids=[row.fault for row in ROWS])
-def test_row(row, reference):
+def test_fault_row_without_dds(row, reference):
     source = row.source or bag()
     heard = direct(row.inject(list(source)))
     seconds = true_seconds(row, heard.stamp_ns)
@@ -96,7 +96,7 @@ def test_row(row, reference):
     assert late.any() == np.isfinite(row.recovered)
 
 
-def test_the_node_gives_the_same_over_dds(tmp_path):
+def test_fault_row_over_dds_gives_the_same_samples(tmp_path):
     save_calibration(unit(), tmp_path / 'unit.yaml')
     rows = [row for row in ROWS if row.fault in OVER_DDS]
     assert len(rows) == len(OVER_DDS)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders import calibration, rich_calibration
 from conftest import ROOT, parsed
-from field_helpers import any_way, rests, upright, write_log
+from field_helpers import in_any_attitude, rests, upright, write_log
 from scipy.stats import norm
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
@@ -32,7 +32,7 @@ ZERO = np.zeros(3)
 
 
 def known(**keys):
-    """Make a calibration that knows its biases to 10 ug and its scales to 10 ppm."""
+    """Make a calibration with an sd of 10 ug of its biases and of 10 ppm of its scales."""
     value = calibration(noise_density_m_s2_sqrt_hz=(60 * MICRO_G,) * 3, **keys)
     layout = parameter_layout(value)
     sd = np.zeros(layout.n_parameters)
@@ -56,7 +56,7 @@ def jump_of(size, day):
 def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     # A ramp excites every column and both sets; the expected derivatives are finite differences.
     unit = rich_calibration()
-    logged = rests(unit, any_way, no_error, days=1, rate=0.5 / 60.0)
+    logged = rests(unit, in_any_attitude, no_error, days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
     values, scale = parameters_of(unit), np.array([axis.scale_factor for axis in unit.axes])
     covariance = unit.posterior.covariance()
@@ -123,7 +123,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         assert abs(solved.shift[scale] - expected) < 0.2 * np.sqrt(solved.posterior[scale, scale])
 
 
-def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
+def test_updates_of_ageing_units_are_near_the_best_and_claim_their_errors():
     # The units age for 30 days by walks, turn-on and one shock, on a level and a carried platform.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
@@ -157,7 +157,7 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_what_they_leave():
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
 
 
-def test_axes_that_no_rest_shows_keep_their_bits():
+def test_axes_that_no_rest_observes_keep_their_bits():
     unit = known()
     updated = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     new = updated.calibration
@@ -174,7 +174,7 @@ def test_axes_that_no_rest_shows_keep_their_bits():
     assert new_sd > old_sd
 
 
-def test_a_jump_is_told_from_ageing(rng):
+def test_a_jump_is_distinguished_from_ageing(rng):
     unit = known()
     jumped = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     (change,) = jumped.changes
@@ -189,7 +189,7 @@ def test_a_jump_is_told_from_ageing(rng):
     assert along == pytest.approx(60.0 * MICRO_G, rel=0.4)
 
 
-def test_a_curve_that_has_changed_is_found_and_mended():
+def test_a_changed_curve_is_detected_and_corrected():
     # The z bias changes by 5 ug/K, and the log has temperatures of 15 to 25 degC.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
@@ -227,7 +227,7 @@ def test_too_few_starts_are_refused():
         update(series_of(logged, unit), unit)
 
 
-def test_the_first_passage_is_that_of_the_reflection_principle():
+def test_the_first_passage_follows_the_reflection_principle():
     # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
     # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t.
     rate, bound = 4.0, 50.0
@@ -269,7 +269,7 @@ def unit_file(tmp_path):
 
 
 @pytest.mark.usefixtures('no_figures')
-def test_update_by_the_command_line(tmp_path, unit_file, cli):
+def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     log, new = write_log(tmp_path / 'rests', logged), tmp_path / 'new.yaml'
@@ -289,7 +289,7 @@ def test_update_by_the_command_line(tmp_path, unit_file, cli):
     assert 'has been updated with all of these rests' in again.stderr
 
 
-def test_nothing_gained_writes_nothing(tmp_path, unit_file, cli):
+def test_an_update_without_gain_writes_no_file(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     log = write_log(tmp_path / 'rests', rests(unit, upright, no_error))
     finished = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', '--json', code=3)
@@ -301,7 +301,7 @@ def test_nothing_gained_writes_nothing(tmp_path, unit_file, cli):
     assert 'recalibration interval' in text
 
 
-def test_mistakes_end_in_one_sentence(tmp_path, unit_file, cli):
+def test_mistakes_of_update_end_in_one_sentence(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     other = replace(unit, unit=replace(unit.unit, serial='T-2'))
     log = write_log(tmp_path / 'rests', rests(other, upright, no_error, days=2))

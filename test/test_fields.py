@@ -63,7 +63,7 @@ parts = st.tuples(words, st.integers(0, 255), floats)
     cells=st.lists(floats, min_size=2, max_size=4),
     is_little=st.booleans(),
 )
-def test_any_field_of_any_layout(store, rows, cells, is_little):
+def test_any_number_of_any_message_layout_is_read(store, rows, cells, is_little):
     kind, part = 'lab_msgs/msg/Deep', store.types['lab_msgs/msg/Part']
     messages = [
         store.types[kind](
@@ -106,12 +106,12 @@ def test_any_field_of_any_layout(store, rows, cells, is_little):
         ('raw[', 'no `raw\\['),
     ],
 )
-def test_a_path_that_leads_nowhere_is_said(store, path, text):
+def test_a_path_to_no_number_is_refused(store, path, text):
     with pytest.raises(RecordingError, match=text):
         Field('lab_msgs/msg/Deep', path, store.fielddefs)
 
 
-def test_a_torn_message_is_damaged(store):
+def test_a_message_that_ends_inside_a_field_is_damaged(store):
     kind = 'px4_msgs/msg/SensorAccel'
     field = Field(kind, 'temperature', store.fielddefs)
     whole = serialized(
@@ -123,7 +123,7 @@ def test_a_torn_message_is_damaged(store):
         field.read(torn)
 
 
-def test_definitions_are_the_bags_own_or_known_or_said():
+def test_definitions_come_from_the_bag_or_are_known_or_refused():
     known = {'a/msg/B': ('ros2msg', 'float32 t\n'), 'a/msg/C': ('ros2msg', '?')}
     assert Field('a/msg/B', 't', definitions_of('a/msg/B', known)).has_stamp is False
     jazzy = definitions_of('sensor_msgs/msg/BatteryState', {})
@@ -173,7 +173,7 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
-def test_a_bag_with_a_drivers_own_type(tmp_path, store, storage):
+def test_a_bag_with_a_message_type_of_the_driver_is_read(tmp_path, store, storage):
     celsius = driver_bag(tmp_path / 'bag', store, storage)
     names = {'board': '/fmu/out/sensor_accel:temperature', 'case': '/case'}
     recording = read_recording(tmp_path / 'bag', Topics.named(names))
@@ -186,7 +186,7 @@ def test_a_bag_with_a_drivers_own_type(tmp_path, store, storage):
     assert case.stamp_ns.tolist() == [START_NS + row * 10**7 for row in range(0, 50, 5)]
 
 
-def test_two_fields_of_one_message_are_no_twins(tmp_path, store):
+def test_two_fields_of_one_message_are_two_inputs(tmp_path, store):
     driver_bag(tmp_path / 'bag', store)
     topic = '/fmu/out/sensor_accel'
     names = {'board': f'{topic}:temperature', 'case': f'{topic}:z'}
@@ -203,7 +203,7 @@ def test_two_fields_of_one_message_are_no_twins(tmp_path, store):
         Topics.named({'imu': '/imu/data:linear_acceleration'})
 
 
-def test_info_names_what_could_be_a_second_thermometer(tmp_path, store):
+def test_info_names_topics_that_could_be_a_second_thermometer(tmp_path, store):
     driver_bag(tmp_path / 'bag', store)
     topics = Topics.named({'board': '/case'})
     messages = [

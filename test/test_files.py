@@ -107,7 +107,7 @@ def test_an_output_is_never_an_input(folder, cli, command, source, output):
 
 @pytest.mark.parametrize('kind', FILES, ids=lambda kind: kind.name)
 @pytest.mark.parametrize('there', ['work', 'empty', 'folder', 'fifo', 'device'])
-def test_only_the_same_kind_is_replaced(tmp_path, kind, there):
+def test_an_output_replaces_only_files_of_its_kind(tmp_path, kind, there):
     path = tmp_path / 'output'
     if there == 'fifo':
         os.mkfifo(path)
@@ -127,7 +127,7 @@ def test_only_the_same_kind_is_replaced(tmp_path, kind, there):
         write_atomically(path, b'new', kind, overwrite=False)
 
 
-def test_what_a_command_wrote_is_of_its_kind(folder, cli):
+def test_an_output_of_a_command_is_recognised_as_its_kind(folder, cli):
     for command in (
         ('export', 'unit.yaml', '--to', 'px4', '-o', 'a.params'),
         ('export', 'unit.yaml', '--to', 'ardupilot', '-o', 'a.parm'),
@@ -219,7 +219,7 @@ def test_a_link_is_written_through(tmp_path):
         save_calibration(calibration(), tmp_path / 'round')
 
 
-def test_a_writer_that_fails_leaves_nothing(tmp_path):
+def test_a_writer_that_fails_leaves_no_file(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(OutputError, match=r'unit\.yaml: cannot be written: .*is no directory'):
         write_atomically(tmp_path / 'file' / 'unit.yaml', b'', CALIBRATION)
@@ -229,7 +229,7 @@ def test_a_writer_that_fails_leaves_nothing(tmp_path):
 
 
 @pytest.mark.parametrize('suffix', ['.db3', '.bag', '.csv', '.MCAP'])
-def test_a_bag_has_no_other_suffix(folder, cli, suffix):
+def test_a_bag_of_another_suffix_is_not_written(folder, cli, suffix):
     output = f'out{suffix}'
     finished = cli('convert', 'raw.mcap', '-o', output, code=1, cwd=folder)
     assert f'{output}: cannot be written: {suffix} is none of' in finished.stderr
@@ -237,7 +237,7 @@ def test_a_bag_has_no_other_suffix(folder, cli, suffix):
 
 
 @pytest.mark.parametrize(('kind', 'name'), [(CSV, 'w.parquet'), (PAGE, 'unit.pdf')])
-def test_a_table_and_a_page_are_what_their_suffix_says(kind, name, tmp_path):
+def test_the_suffix_states_the_format_of_tables_and_pages(kind, name, tmp_path):
     with pytest.raises(OutputError, match=rf'{name}: cannot be written: \.\w+ is not \*'):
         check_output(tmp_path / name, kind)
     for good in (Path(name).with_suffix(suffix).name for suffix in ('', *kind.suffixes)):

@@ -58,7 +58,7 @@ def test_a_curve_without_a_knee_has_no_bend(monkeypatch):
     assert not [term for term in unit.response if term.group == 'bend']
 
 
-def test_a_thermometer_on_two_topics_is_one():
+def test_a_thermometer_on_two_topics_counts_once():
     bags = []
     for copies in (('board',), ('board', 'case')):
         rng = np.random.default_rng(9)
@@ -92,7 +92,7 @@ def sd_of_a_correction(unit):
     return np.sqrt(np.diag(last)) / MICRO_G
 
 
-def test_a_bag_of_another_environment_takes_no_part_and_is_claimed():
+def test_a_bag_of_another_environment_is_excluded_and_widens_the_claimed_sd():
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',), 'mounting_sd': 1e-7}
     alone = tc.fit(columns_of([SLOPE] * 4), **options)
     with_another = columns_of([SLOPE] * 4 + [6.0 * SLOPE])

@@ -83,7 +83,7 @@ def pulls(found, unit):
                            (M - np.array(unit.M)[[1, 2, 2], [0, 0, 1]]) / M_sd))  # fmt: skip
 
 
-def test_truth_lies_within_the_claimed_sd(response):
+def test_the_constants_of_a_fit_are_within_their_claimed_sd(response):
     # The nine constants have correlated errors, so the largest may be at 4 sd.
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
@@ -95,7 +95,7 @@ def test_truth_lies_within_the_claimed_sd(response):
     assert M_sd.max() < 5e-6
 
 
-def test_the_response_reaches_the_noise(response):
+def test_the_fitted_response_leaves_only_noise(response):
     row = response.residuals[-1]
     # White noise of 5 ug / sqrt(Hz) leaves 0.65 ug over 60 s.
     assert row.fitted.rms / MICRO_G < 0.8
@@ -104,19 +104,19 @@ def test_the_response_reaches_the_noise(response):
     assert row.two_sets.rms / MICRO_G > 50.0
 
 
-def test_attitudes_have_unit_norm(response):
+def test_fitted_attitudes_have_unit_norm(response):
     up = np.array([position.up for position in response.positions])
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0, rtol=1e-14)
     # The directions are unknown to the fit and estimated within some urad.
     np.testing.assert_allclose(up, positions(12, 1), atol=3e-5)
 
 
-def test_the_paper_s_model_on_its_own_physics(golovach):
+def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     calibration = golovach.calibration
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # The paper's model has a separate curve for each regime, so there is no row of one set.
+        # The paper's model has a separate curve for each regime, so no residual of one set exists.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
     # The paper's model has a linear static set and a quadratic dynamic set.
@@ -149,7 +149,7 @@ def test_the_evidence_is_complete(response):
     assert {term.group for term in weighty} <= {group for _, group in judged}
 
 
-def test_the_file_holds_the_fit(response, tmp_path):
+def test_the_calibration_file_holds_the_fit(response, tmp_path):
     path = tmp_path / 'unit.yaml'
     save_calibration(response.calibration, path)
     assert load_calibration(path) == response.calibration
@@ -220,7 +220,7 @@ def test_bags_with_and_without_temperature_contradict_themselves():
         fit(sources, FitOptions(gravity=STANDARD_GRAVITY))
 
 
-def test_a_switch_of_the_sets_moves_the_output_gently(golovach):
+def test_a_switch_of_sets_changes_the_output_by_1_ug_per_second(golovach):
     # A switch of sets changes the output by 1 ug/s, or by the difference of the sets in 300 s.
     (record,) = records_of(PAPER, positions(1, 5), 905)
 
@@ -262,7 +262,7 @@ def short(accel, board, name='bag'):
         ),
     ],
 )
-def test_bags_without_what_a_fit_needs_are_refused(accel, board, message):
+def test_bags_without_rests_or_samples_are_refused(accel, board, message):
     with pytest.raises(FitError, match=f'bag: {message}'):
         fit([short(accel, board)], FitOptions(gravity=STANDARD_GRAVITY))
 

@@ -48,11 +48,11 @@ def recorded(rng, up, name, targets):
     return source_of(stamps, accel, stamps, board, stamps + 1, case, name=name)
 
 
-def test_what_a_change_does_is_found_about_rest(rng):
+def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # The estimate has a noise of 0.1 mK (1200 minutes of 3 mK) and an error as rates are means.
+    # The estimate has a noise of 0.1 mK (1200 minutes of 3 mK); means of rates add an error.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (
@@ -69,7 +69,7 @@ def test_what_a_change_does_is_found_about_rest(rng):
     assert about_0.residuals[-1].left_out.rms > 1.5 * about_rest.residuals[-1].left_out.rms
 
 
-def test_what_is_forced_takes_part_beside_the_groups_that_may(rng):
+def test_forced_groups_take_part_beside_permitted_groups(rng):
     bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(3, 3))]
     options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('gradient',))
     assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}

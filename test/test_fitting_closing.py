@@ -51,7 +51,7 @@ def weight(record, closes):
     ('closes', 'options'),
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
-def test_evidence_says_when_the_regime_closes(closes, options):
+def test_the_evidence_selects_the_end_condition_of_the_regime(closes, options):
     # A reading every four seconds suffices: the case changes by at most 0.1 K in 4 s.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
@@ -116,7 +116,7 @@ def drawn(rng, n, steps, noise):
 
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
-def test_ratio_and_time_are_found(rng, noise):
+def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
     # 240 correlation times determine the variance to sqrt(2 / 240) = 9 %, the time to 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     fitted = whitener.estimate(5.0 * series, weight)
@@ -132,7 +132,7 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
     ] == 10 * [Noise()]
 
 
-def test_a_time_that_no_position_holds_is_not_claimed(rng):
+def test_no_correlation_time_longer_than_a_position_is_estimated(rng):
     # Correlation times up to a fifth of the length of a position (20 min) are tried.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0

@@ -60,7 +60,7 @@ def good(rng):
     return windows, up
 
 
-def test_a_good_test_passes(good):
+def test_a_complete_thermal_test_has_only_good_findings(good):
     findings = findings_of(*good)
     assert {finding.level for finding in findings.values()} == {'good'}
 
@@ -80,7 +80,7 @@ def test_a_good_test_passes(good):
         ('swapped', lambda w: {'gradient': -w.gradient}, r'are the two sensors exchanged\?'),
     ],
 )  # fmt: skip
-def test_what_a_test_lacks_is_said(good, name, changed, message):
+def test_missing_data_of_a_test_are_reported(good, name, changed, message):
     windows, up = good
     findings = findings_of(replace(windows, **changed(windows)), up)
     assert re.search(message, findings[name].message)
@@ -89,8 +89,7 @@ def test_what_a_test_lacks_is_said(good, name, changed, message):
 
 
 def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, rng):
-    # WHY: soaks with interpolated temperatures, whose noise enters rate and gradient, were
-    # refused.
+    # WHY: soaks were refused for interpolated temperatures, whose noise enters rate and gradient.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)
@@ -104,11 +103,11 @@ def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, r
     assert 'soaks' not in findings_of(drift, up)
 
 
-def test_a_missing_case_is_said(good):
+def test_a_missing_case_temperature_is_reported(good):
     assert findings_of(*good, has_case=False)['case'].level == 'advice'
 
 
-def test_six_faces_tell_no_misalignment(good):
+def test_six_faces_do_not_determine_the_misalignment(good):
     windows, _ = good
     faces = np.vstack((np.eye(3), -np.eye(3)))
     assert not determines_misalignment(faces)
@@ -122,7 +121,7 @@ def test_six_faces_tell_no_misalignment(good):
     assert not determines_misalignment(np.vstack((faces, tilted)))
 
 
-def test_few_and_badly_spread_positions_are_said(good):
+def test_few_and_badly_spread_positions_are_reported(good):
     windows, up = good
     assert (
         '5 positions: bias and scale cannot be separated'
@@ -144,7 +143,7 @@ def test_geometry_is_the_scatter_of_the_parameters(rng):
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
 
 
-def test_refusals_stop_and_may_be_allowed():
+def test_a_refusal_stops_the_fit_unless_it_is_allowed():
     refusal = Finding('swapped', 'refusal', 'the board leads')
     with pytest.raises(FitError, match=r'the board leads \(override with --allow swapped\)'):
         enforce([refusal], FitOptions(gravity=9.81))
@@ -164,7 +163,7 @@ def judged(raw, fitted, slow, left_out=None, **options):
     return {finding.name: finding for finding in findings}
 
 
-def test_what_the_fit_left_is_said():
+def test_the_residual_of_the_fit_is_reported():
     good = judged(100.0, 1.0, 0.2, 1.5)
     assert set(good) == {'residual'}
     assert '100.0 ug RMS raw, 1.5 ug on data left out, 1.0 ug' in good['residual'].message
@@ -182,7 +181,7 @@ def test_what_the_fit_left_is_said():
         ((100.0, 1.0, 0.2, 1.5), 'units', 'expected near 1'),
     ],
 )
-def test_residuals_that_no_good_fit_leaves_are_said(given, name, message):
+def test_residuals_too_large_for_a_good_fit_are_reported(given, name, message):
     options = {'input': 'm/s^2'} if name == 'units' else {}
     assert message in judged(*given, **options)[name].message
 

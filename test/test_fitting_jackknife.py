@@ -45,7 +45,7 @@ def ratio(path):
     return float(np.sqrt(np.mean(scatter / np.concatenate((*claimed, variance[-3:])))))
 
 
-def test_claimed_sd_is_the_jackknife_s(real_data):
+def test_the_claimed_sd_agrees_with_a_jackknife(real_data):
     logs = [real_data / f'mikoff-mpu9150/mk_imu{k}.log' for k in range(3)]
     if not all(path.is_file() for path in logs):
         pytest.skip('the logs of the MPU-9150 units are not there')

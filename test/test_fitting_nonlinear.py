@@ -76,7 +76,7 @@ def chosen(rng, **terms):
     return truth, selected.posterior, found
 
 
-def test_derivatives_are_those_of_differences(rng):
+def test_derivatives_of_nonlinear_terms_equal_differences(rng):
     _, regression, state = table(rng, 1e-5, 1e-5, 1e-6, radius_sd=0.01)
     sd = rng.uniform(1e-4, 1e-3, 24)
     regression.forces = replace(regression.forces, sd=sd)
@@ -106,7 +106,7 @@ def test_derivatives_are_those_of_differences(rng):
                 np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 
 
-def test_square_and_cube_are_found_within_their_claims(rng):
+def test_square_and_cube_are_estimated_within_their_claimed_sd(rng):
     _, posterior, terms = chosen(rng, k2=1e-5, k3=-1e-6)
     assert [term.kind for term in terms] == ['square', 'cube']
     places = posterior.layout.nonlinear[:, [0, 2, 3, 5]]
@@ -118,7 +118,7 @@ def test_square_and_cube_are_found_within_their_claims(rng):
     assert all(term.left_out_gain > 1.0 and term.log_evidence_change > 100.0 for term in terms)
 
 
-def test_terms_that_are_not_there_leave_and_nothing_else_moves(rng):
+def test_absent_terms_are_pruned_without_effect_on_the_other_parameters(rng):
     truth, posterior, terms = chosen(rng)
     assert not terms
     assert not posterior.state.nonlinear.any()
@@ -129,14 +129,14 @@ def test_terms_that_are_not_there_leave_and_nothing_else_moves(rng):
         )
 
 
-def test_an_odd_square_joins_only_where_it_is(rng):
+def test_an_odd_square_is_chosen_only_where_it_is_present(rng):
     _, posterior, terms = chosen(rng, kq=1e-5, share=0.0)
     assert [term.kind for term in terms] == ['odd_square']
     assert posterior.state.nonlinear[:, 1] == pytest.approx(1e-5, rel=0.02)
     assert not posterior.state.nonlinear[:, 4].any()
 
 
-def test_a_radius_is_estimated(rng):
+def test_the_radius_of_a_rotation_is_estimated(rng):
     truth, regression, state = table(rng, 1e-5, radius_sd=0.01, radius_error=0.004)
     prior = prior_of(truth, (), nonlinear_sd=prior_sd(regression.forces.kinds, OPTIONS))
     solution = regression.solve(state, prior, n_steps=15)
@@ -162,7 +162,7 @@ def test_a_table_of_sections_states_the_force_of_each_rest():
             parse_sections(wrong)
 
 
-def test_a_bag_states_its_force_and_the_user_has_the_last_word(tmp_path):
+def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
     stamps = 10**18 + np.arange(0, 20 * 10**9, 10**8)
     rate = np.zeros((200, 3))
     rate[:, 2] = np.where(np.arange(200) < 100, 0.0, 5.0)
@@ -205,7 +205,7 @@ def test_a_bag_states_its_force_and_the_user_has_the_last_word(tmp_path):
         read('a', AskedForce(str(tmp_path / 'bad.txt')))
 
 
-def test_a_constant_rotation_is_a_rest_and_its_change_is_none(rng):
+def test_a_constant_rotation_is_a_rest_a_changing_rotation_is_not(rng):
     time = np.arange(0.0, 240.0, 0.02)
     rate = np.interp(time, [0, 80, 100, 180, 190], [0.0, 0.0, 3.0, 3.0, 0.0])
     force = np.column_stack((0.0 * time, rate**2, 9.8 + 0.0 * time))
@@ -238,7 +238,7 @@ def source(run, spin, name):
     return source_of(*arrays_of(run), name=name, force=force)
 
 
-def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
+def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
     # For speed the test has one temperature, and nine mountings at 1, 3 and 8 g.
     unit = replace(triad('plain', 3), bend=Bend((10.0, -10.0, 10.0), (1.0, 1.0, -1.0)))
     time, rate = steps((150.0,), tuple(np.sqrt([3.0 * G, 8.0 * G])), 150.0, 20.0)
@@ -287,7 +287,7 @@ def test_runs_give_a_calibration_that_holds_over_force_and_serves_as_a_prior():
     assert square.sd == pytest.approx(50.0, rel=0.2)
 
 
-def test_a_claim_has_the_terms_and_the_radius_as_the_posterior_has_them(rng):
+def test_the_claimed_covariance_includes_nonlinear_terms_and_radius(rng):
     truth, regression, state = table(rng, 1e-5, k3=1e-6, radius_sd=0.01)
     prior = prior_of(truth, (), nonlinear_sd=starting_sd(regression.forces, OPTIONS))
     posterior = regression.solve(state, prior, n_steps=12)

@@ -57,7 +57,7 @@ def still(rng, seconds, level):
     return np.array(level) + 0.3 * rng.standard_normal((int(seconds * RATE_HZ), 3))
 
 
-def test_chunks_do_not_matter(rng):
+def test_the_reduction_does_not_depend_on_the_blocks(rng):
     whole = block(np.rint(still(rng, 61.0, (10.0, -3000.0, 50.0))))
     at_once = reduced([whole])
     for n_parts in (2, 7, 50):
@@ -98,7 +98,7 @@ def test_windows_are_means_of_their_samples(rng):
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
 
 
-def test_positions_in_one_bag_are_told_apart(rng):
+def test_positions_in_one_bag_are_separated(rng):
     turn = np.linspace((0.0, 0.0, 3000.0), (3000.0, 0.0, 0.0), 3 * RATE_HZ)
     turn += 40.0 * rng.standard_normal(turn.shape)
     accel = np.vstack(
@@ -133,7 +133,7 @@ def test_a_knock_starts_a_new_position(rng):
     assert len(reduced([block(accel)]).intervals) == 2
 
 
-def test_a_drift_is_no_motion(rng):
+def test_a_thermal_drift_is_no_motion(rng):
     # A drift of 100 ppm/K at 3 K/min is 0.015 counts/s, or 0.02 sd of a cell mean per cell.
     accel = still(rng, 300.0, (0.0, 0.0, 3000.0))
     accel[:, 2] += 0.015 * np.arange(len(accel)) / RATE_HZ
@@ -150,8 +150,7 @@ def test_bad_samples_are_counted_and_left_out(rng):
 
 
 def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
-    # WHY: one -127 degC in 60 readings was learnt as a noise of 14 K, and the fit left 25 times
-    # the error.
+    # WHY: one reading of -127 degC in 60 counted as a noise of 14 K, and left 25 times the error.
     whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
@@ -174,7 +173,7 @@ def test_stamps_that_do_not_rise_are_left_out(rng):
     assert bag.intervals[0].count.sum() == 3000
 
 
-def test_time_origin_does_not_matter(rng):
+def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
     samples = still(rng, 30.0, (0.0, 0.0, 3000.0))
     results = []
     for origin in (0, 1_900_000_000_000_000_000):
@@ -190,7 +189,7 @@ def test_time_origin_does_not_matter(rng):
     # Cells of 0.5 s fill a window of 10 s; cells of 30 samples do not at 4 Hz and 1 Hz.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
-def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):
+def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng):
     n = round(150 * rate_hz)
     accel = np.array((0.0, 0.0, 3000.0)) + 0.3 * rng.standard_normal((n, 3))
     bag = reduced([ArrayBlock(stamps(n, rate_hz), accel)])
@@ -203,7 +202,7 @@ def test_windows_are_as_long_as_stated(rate_hz, cell_s, window_s, rng):
 
 
 @pytest.mark.parametrize(('seconds', 'left'), [(24.0, 0), (26.0, 600)])
-def test_what_is_left_over_is_kept_from_half_a_window_on(seconds, left, rng):
+def test_a_last_window_is_kept_if_it_is_at_least_half_full(seconds, left, rng):
     (interval,) = reduced([block(still(rng, seconds, (0.0, 0.0, 3000.0)))]).intervals
     assert interval.n_whole == 2
     assert interval.count.tolist() == [1000.0, 1000.0, *([float(left)] if left else [])]
@@ -226,7 +225,7 @@ def test_fast_readings_are_averaged(rng):
     # Expected: gravity by WGS 84 at the equator, the pole and 45 degrees, as published.
     [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
 )
-def test_normal_gravity_of_the_tables(latitude, height, expected):
+def test_normal_gravity_agrees_with_published_values(latitude, height, expected):
     assert normal_gravity(latitude, height) == pytest.approx(expected, abs=1e-8)
     assert normal_gravity(-latitude, height) == normal_gravity(latitude, height)
 
@@ -244,7 +243,7 @@ def test_impossible_places_are_refused(latitude, height):
 
 
 @pytest.mark.parametrize('gravity', [98.1, -1.0, np.nan])
-def test_gravity_is_that_of_the_earth(gravity):
+def test_a_gravity_not_found_on_earth_is_refused(gravity):
     with pytest.raises(FitError, match='not found on Earth'):
         FitOptions(gravity=gravity)
 
@@ -264,7 +263,7 @@ def course(quantum, noise, rng):
 
 
 @pytest.mark.parametrize(('quantum', 'noise'), [(0.0, 0.005), (0.0, 0.05), (0.0625, 0.005)])
-def test_a_thermometer_is_known_from_its_readings(quantum, noise, rng):
+def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([course(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
     # Noise below a tenth of the quantum is invisible; a tenth is assumed.
@@ -274,18 +273,18 @@ def test_a_thermometer_is_known_from_its_readings(quantum, noise, rng):
     assert learned.fastest_ramp_k_min >= 1.0
 
 
-def test_whole_degrees_are_seen():
+def test_a_quantum_of_a_degree_is_estimated():
     assert quantum_of(np.repeat([20.0, 21.0, 22.0, 24.0], 100)) == 1.0
     assert quantum_of(np.full(100, 20.0)) == 0.0
 
 
-def test_no_readings_keep_the_defaults():
+def test_without_readings_the_thermometer_settings_are_the_defaults():
     empty = Readings(np.zeros(0, dtype=np.int64), np.zeros(0))
     base = DetectorSettings()
     assert learn_thermometer([empty], base.board) == base.board
 
 
-def test_a_slow_ramp_is_not_to_be_missed(rng):
+def test_the_detector_settings_follow_the_slowest_ramp(rng):
     n = 9 * 3600
     time = np.arange(0.0, n)
     celsius = np.interp(time, [0.0, 7200.0, 25200.0], [10.0, 10.0, 55.0])
@@ -299,7 +298,7 @@ def test_a_slow_ramp_is_not_to_be_missed(rng):
 
 
 @pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
-def test_a_coarse_sensor_rests_too(step, rng):
+def test_an_axis_with_a_coarse_quantum_is_at_rest(step, rng):
     # An axis that is constant, or alternates between two values, is at rest at any quantum.
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))

@@ -154,7 +154,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
-def test_truth_comes_out_without_noise(rng):
+def test_without_noise_the_regression_gives_the_truth(rng):
     truth = Truth(sigma=np.full(3, 1e-9 * MICRO))
     windows, up = table_of(truth, 12, rng)
     regression, state = begin(windows, up)
@@ -174,7 +174,7 @@ def test_truth_comes_out_without_noise(rng):
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 
 
-def test_claimed_sd_is_the_scatter():
+def test_the_claimed_sd_of_the_regression_is_the_scatter_of_errors():
     # With true priors (the inverse Hessian is the Cramer-Rao bound) errors / sd have an RMS of 1,
     # determined by 36 units with 33 partly correlated numbers to 13 % or better.
     rng = np.random.default_rng(11)
@@ -223,7 +223,7 @@ def scored(groups, n, rng, *, n_windows, step_s, **changes):
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.2)])
-def test_leaving_a_position_out_is_a_fit_without_it(rng, groups, tolerance):
+def test_the_left_out_error_of_a_position_is_that_of_a_fit_without_it(rng, groups, tolerance):
     windows, _, regression, prior, whole, score = scored(
         groups, 14, rng, n_windows=20, step_s=240.0, offset_sd=3.0 * MICRO,
         noise=Noise(0.1, 1000.0),
@@ -243,7 +243,7 @@ def test_leaving_a_position_out_is_a_fit_without_it(rng, groups, tolerance):
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.05)])
-def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
+def test_the_left_out_error_of_a_section_is_that_of_a_fit_without_it(rng, groups, tolerance):
     windows, up, regression, prior, whole, score = scored(
         groups, 12, rng, n_windows=24, step_s=200.0
     )
@@ -265,7 +265,7 @@ def test_leaving_a_section_out_is_a_fit_without_it(rng, groups, tolerance):
     assert alone_score.rms == alone_score.sections.rms
 
 
-def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
+def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     # Five of the six faces do not separate bias and scale of the axis whose face is left out.
     truth = Truth(misalignment=np.zeros(3))
     windows, up = table_of(truth, 6, rng, up=np.vstack((np.eye(3), -np.eye(3))))
@@ -283,7 +283,7 @@ def test_a_position_that_tells_what_no_other_does_has_no_norm_left_out(rng):
 
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
-def test_no_step_goes_uphill(seed):
+def test_no_step_of_the_solver_increases_the_objective(seed):
     # Bags with few data start far from rest, so the product of initial state and weight matters.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
@@ -298,7 +298,7 @@ def test_no_step_goes_uphill(seed):
     assert np.diff(sizes).max() < 1e-9 * sizes[0]
 
 
-def test_what_takes_no_part_any_more_is_gone(solved):
+def test_excluded_columns_get_zero_weight(solved):
     regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
     # Excluded columns get zero weight even without a step of the solver.
@@ -310,8 +310,7 @@ def test_what_takes_no_part_any_more_is_gone(solved):
 def test_published_huygens_coefficients_come_back(rng):
     # Huygens HASI accelerometer: sf = 1.30675e-3 - 1.35046e-7 T + 4.02821e-10 T^2 [A/g] and
     # offset = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. The test samples the
-    # curves on a chamber's program, fits in our variables (t from 20 degC, counts of 1 pA) and
-    # converts back.
+    # curves on a chamber's program, fits t from 20 degC and counts of 1 pA, and converts back.
     sf, offset = (1.30675e-3, -1.35046e-7, 4.02821e-10), (-8.9642327e-4, 3.83652e-6, -7.61e-9)
     counts_per_ampere = 1e9
     windows, up = table_of(Truth(misalignment=np.zeros(3)), 12, rng)
@@ -353,7 +352,7 @@ def test_published_huygens_coefficients_come_back(rng):
 
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
-def test_inactive_columns_are_known_as_if_they_took_part(noise):
+def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
     # Linear problem: S is the inverse covariance of the columns, S^-1 Q the estimated weight.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
@@ -385,7 +384,7 @@ def test_inactive_columns_are_known_as_if_they_took_part(noise):
     assert not inactive.chosen(wide, asked, 1e9, 9).any()
 
 
-def test_only_the_matrix_that_rounding_made_indefinite_gets_more_jitter(rng):
+def test_only_a_matrix_made_indefinite_by_rounding_gets_more_jitter(rng):
     root = rng.standard_normal((3, 3))
     good, bad = root @ root.T, np.ones((3, 3)) - 1e-10 * np.eye(3)
     factor = factored(np.stack((good, bad)))
@@ -405,7 +404,7 @@ def test_tangent_basis_is_orthonormal(rng):
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-14)
 
 
-def test_a_dead_axis_is_refused():
+def test_an_axis_that_reads_one_value_is_refused():
     means = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     with pytest.raises(FitError, match='reads the same in all positions'):
         constant_calibration(means, GRAVITY, with_misalignment=False)

@@ -74,7 +74,7 @@ def calm():
     return *selected_of(truth, windows, up), truth
 
 
-def test_what_explains_nothing_is_not_chosen(calm):
+def test_columns_that_explain_nothing_are_not_chosen(calm):
     regression, chosen, _ = calm
     np.testing.assert_array_equal(chosen.posterior.prior.column_sd > 0.0, [~IDLE, ~IDLE])
     assert chosen_groups(chosen) == {'curve', 'board'}
@@ -85,7 +85,7 @@ def test_what_explains_nothing_is_not_chosen(calm):
     assert not chosen.posterior.state.weights[..., IDLE].any()
 
 
-def test_models_that_were_looked_at_show_their_left_out_errors(calm):
+def test_tried_models_show_their_left_out_errors(calm):
     _, selected, truth = calm
     rms = {trial.groups: trial.score.rms for trial in selected.trials}
     # Constants are tried before the curve; their error is the size of the missing effect.
@@ -98,7 +98,7 @@ def test_models_that_were_looked_at_show_their_left_out_errors(calm):
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
 
-def test_what_is_forced_stays(calm):
+def test_a_forced_group_stays_in_the_model(calm):
     regression, _, truth = calm
     _, chosen = selected_of(truth, regression.windows, calm[1].posterior.state.up, ('idle',))
     assert chosen_groups(chosen) == set(ALL)
@@ -108,8 +108,8 @@ def test_what_is_forced_stays(calm):
 @pytest.mark.parametrize(
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
-def test_a_group_must_explain_more_than_an_accident(where, is_chosen):
-    # The evidence favours the group in three cases; left-out data reject it in the last two.
+def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen):
+    # The evidence favours the group in all cases; left-out data reject it in one bag or section.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -137,7 +137,7 @@ def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, st
     assert chosen.score.rms < 1.2 * truth.sigma[0]
 
 
-def test_noises_come_out(noisy):
+def test_noise_parameters_are_estimated(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
@@ -157,9 +157,8 @@ def test_white_noise_is_not_taken_for_slow_noise(calm):
 
 
 def test_prior_sds_are_those_of_the_weights(calm):
-    # At the fixed point sd^2 = sum of squared weights / effective parameters, three per column if
-    # all are determined; the hyperprior (sd of a factor of ten) shifts log sd by 1 / (2 x 3 x 5.3)
-    # of the distance.
+    # At the fixed point sd^2 = sum of squared weights / effective parameters (here 3 per column);
+    # the hyperprior (sd of a factor of ten) shifts log sd by 1 / (2 x 3 x 5.3) of the distance.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -168,7 +167,7 @@ def test_prior_sds_are_those_of_the_weights(calm):
         assert len(group.prior_sd) == 2
 
 
-def test_no_weight_is_believed_steeper_than_a_data_sheet():
+def test_the_prior_sd_of_slopes_is_limited_by_data_sheets():
     # For a unit with ten times the steepest plausible slope the prior sd stays at its limit.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
@@ -181,7 +180,7 @@ def test_no_weight_is_believed_steeper_than_a_data_sheet():
     assert per_kelvin == pytest.approx(STEEPEST[0])
 
 
-def test_truth_lies_within_the_claimed_sd(noisy):
+def test_the_truth_of_a_table_is_within_the_claimed_sd(noisy):
     regression, chosen, truth = noisy
     errors = truth.errors(regression, chosen.posterior)
     # Pruned weights have no sd; the true weights of the idle columns are 0.
@@ -192,7 +191,7 @@ def test_truth_lies_within_the_claimed_sd(noisy):
     assert np.abs(every).max() < 4.0
 
 
-def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
+def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_without_it():
     # Savage-Dickey against a solution without the group: exact except for the directions.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
@@ -214,7 +213,7 @@ def test_bayes_factor_is_the_fall_of_the_evidence_without_it():
     assert falls['bias', 'idle'] < 0.5
 
 
-def test_what_a_group_explains_is_what_it_adds(calm):
+def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
     regression, chosen, truth = calm
     columns = regression.windows.columns[:, 2:4]
     evidence = group_evidence(regression, chosen.posterior)
@@ -224,7 +223,7 @@ def test_what_a_group_explains_is_what_it_adds(calm):
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
-def test_outliers_do_not_pull(calm):
+def test_outliers_do_not_shift_the_fit(calm):
     regression, one, truth = calm
     rng = np.random.default_rng(6)
     clean = regression.windows
@@ -242,7 +241,7 @@ def test_outliers_do_not_pull(calm):
     np.testing.assert_array_equal(used_with_outliers, used)
 
 
-def test_means_of_few_values_are_no_knocks():
+def test_means_that_take_few_values_are_no_outliers():
     # With a converter that carries its remainder most means are equal, some differ by a count.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
@@ -262,7 +261,7 @@ def test_means_of_few_values_are_no_knocks():
     np.testing.assert_array_equal(np.delete(changed, 100), 1.0)
 
 
-def test_of_two_columns_that_are_almost_one_the_better_stays():
+def test_of_two_almost_equal_columns_the_better_stays():
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(6), n_windows=50)
     columns = windows.columns.copy()
@@ -276,7 +275,7 @@ def test_of_two_columns_that_are_almost_one_the_better_stays():
 
 
 @pytest.mark.parametrize(('start_sd', 'lower', 'upper'), [(0.0, 0.0, 0.15), (1.0, 0.8, 1.0)])
-def test_how_bags_begin_is_learnt(start_sd, lower, upper):
+def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, upper):
     truth = Truth(start_sd=start_sd)
     windows, up = table_of(truth, 18, np.random.default_rng(9), n_windows=60)
     _, chosen = selected_of(truth, windows, up)
@@ -285,7 +284,7 @@ def test_how_bags_begin_is_learnt(start_sd, lower, upper):
 
 
 @pytest.mark.parametrize('away', [0.0, 30.0])
-def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
+def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, away):
     # Siblings may differ by less or more than their sd: the evidence selects the true prior.
     _, one, truth = calm
     state = one.posterior.state
@@ -309,7 +308,7 @@ def test_an_informative_prior_is_believed_as_far_as_the_data_do(calm, away):
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 
-def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
+def test_tilts_of_supports_are_estimated_apart_from_the_unit():
     truth = Truth(tilt_sd=5e-6)
     windows, up = table_of(truth, 12, np.random.default_rng(0), n_windows=60)
     stiff = replace(windows, tilt=windows.tilt[:, :0])
@@ -327,7 +326,7 @@ def test_tilts_of_supports_come_out_and_leave_the_unit_alone():
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
 
-def test_a_stiff_support_is_not_seen_tilting(calm):
+def test_a_stiff_support_gets_no_tilt(calm):
     # The estimated tilt is below the noise of the mean of 60 windows of 2 ug.
     _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
@@ -347,7 +346,7 @@ def claimed(n_positions, gravity_sd=0.0):
     return claim.covariance, selection.posterior.covariance
 
 
-def test_the_claim_is_wider_where_positions_do_not_determine_the_mounting():
+def test_the_claimed_sd_is_larger_if_positions_do_not_determine_the_mounting():
     ratios = []
     for n in (9, 24):
         claim, fitted = claimed(n)

@@ -56,7 +56,7 @@ def windows_of(bags):
     )
 
 
-def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng):
+def test_memory_on_a_grid_equals_memory_stepped_reading_by_reading(rng):
     spec = MemorySpec(
         ('case', 'tip'),
         (('board', 60.0), ('board', 900.0), ('case', 240.0), ('tip', 7680.0)),
@@ -78,8 +78,8 @@ def test_memory_on_a_grid_is_that_of_one_reading_after_the_other(rng):
             np.testing.assert_allclose(on_grid[k], row, atol=1e-9)
 
 
-def test_columns_are_those_of_the_tracker(bags):
-    # The expected columns come from a tracker that gets readings and samples as online.
+def test_columns_of_the_fit_are_those_of_the_tracker(bags):
+    # The expected columns come from a tracker that gets readings and samples one by one.
     windows = windows_of(bags)
     spec = memory_of(bank())
     table = ColumnTable(bank(), spec, 20.0)
@@ -111,7 +111,7 @@ def test_columns_are_those_of_the_tracker(bags):
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
-def test_sets_and_start_states_by_hand(bags):
+def test_columns_of_sets_and_start_states_by_hand(bags):
     windows = windows_of(bags)
     data = windows.data
     t, w = windows.temperature - 20.0, windows.weight
@@ -136,7 +136,7 @@ def test_sets_and_start_states_by_hand(bags):
 
 @pytest.mark.parametrize('name', ['board', 'case'])
 @pytest.mark.parametrize('is_stuck', [False, True])
-def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
+def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
     # The thermometer is silent or repeats a value from the first ramp until late in the second.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]
@@ -159,7 +159,7 @@ def test_where_a_thermometer_is_lost_nothing_is_known(bags, name, is_stuck):
     np.testing.assert_array_equal(windows.data.columns[both], whole.data.columns[kept])
 
 
-def test_the_lag_of_a_column_moves_it_as_its_slope_says():
+def test_the_derivative_of_a_column_by_its_lag_equals_differences():
     # The expected derivatives are differences of columns with lags shifted by a microkelvin.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
@@ -188,7 +188,7 @@ def test_the_lag_of_a_column_moves_it_as_its_slope_says():
         ({'static_curve': 'linear', 'dynamic_curve': 'linear'}, Polynomial, 1, False),
     ],
 )
-def test_curves(bags, options, static, dynamic, is_shared):
+def test_curves_of_the_fit_by_hand(bags, options, static, dynamic, is_shared):
     sets = sets_of(replace(OPTIONS, **options), bags)
     assert isinstance(sets.static, static)
     assert sets.is_shared == is_shared
@@ -243,7 +243,7 @@ def states_of(windows, calibration):
     return states.T
 
 
-def test_the_file_corrects_as_the_regression(fitted):
+def test_the_calibration_file_corrects_as_the_regression(fitted):
     # Powers of means over a minute differ from means of powers by some ppm at 1 K/min.
     result, _ = fitted
     windows, calibration = result.fit.windows, result.calibration
@@ -262,7 +262,7 @@ def test_the_file_corrects_as_the_regression(fitted):
     assert prior.sigma.min() > 0.0
 
 
-def test_covariance_of_the_file_is_that_of_the_claim(fitted):
+def test_the_covariance_of_the_file_is_that_of_the_regression(fitted):
     # The parameters of the file and of the regression give the same variance of levels.
     result, claim = fitted
     calibration = result.calibration
@@ -284,7 +284,7 @@ def test_covariance_of_the_file_is_that_of_the_claim(fitted):
     np.testing.assert_allclose(by_file[-3:][[0, 2]], sd[places], rtol=1e-4)
 
 
-def test_sections_and_kelvins_by_hand(bags):
+def test_sections_and_column_scales_in_kelvins_by_hand(bags):
     windows = windows_of(bags)
     data, t = windows.data, windows.temperature - 20.0
     for p in range(data.n_positions):

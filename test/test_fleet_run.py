@@ -57,7 +57,7 @@ def fleet(tmp_path_factory):
     return folder
 
 
-def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fleet, tmp_path):
+def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client, fleet, tmp_path):
     out = tmp_path / 'out'
     collected = []
 
@@ -107,7 +107,7 @@ def test_the_rest_finishes_whoever_dies_and_a_second_run_does_nothing(client, fl
     assert {name for name, known in seen.items() if known} == {'A/good'}
 
 
-def test_paths_that_climb_are_no_door(client, tmp_path):
+def test_paths_with_dots_never_lead_out_of_the_folder(client, tmp_path):
     fleet = tmp_path / 'fleet'
     for seed, name in enumerate(('one', '..two', 'three..')):
         write_unit(fleet / name, seed, 2)
@@ -118,7 +118,7 @@ def test_paths_that_climb_are_no_door(client, tmp_path):
     assert made == {('out', 'units')}
 
 
-def test_bags_that_cannot_be_read_any_more_take_no_result_away(client, tmp_path):
+def test_unreadable_bags_leave_earlier_results_in_place(client, tmp_path):
     # WHY: after a bad mount a second run deleted calibrations and certificates that were good.
     bags = write_unit(tmp_path / 'bags' / 'unit', 1)
     options = replace(OPTIONS, certificates=True)
@@ -144,7 +144,7 @@ def test_bags_that_cannot_be_read_any_more_take_no_result_away(client, tmp_path)
     assert third.rows == first.rows
 
 
-def test_an_interrupted_run_goes_on_where_it_was(client, tmp_path):
+def test_an_interrupted_fleet_run_continues(client, tmp_path):
     fleet, out = tmp_path / 'bags', tmp_path / 'out'
     for seed in range(3):
         write_unit(fleet / 'A' / f'u{seed}', seed, 1)
@@ -170,7 +170,7 @@ def children_of(pid):
     return [int(word) for word in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
-def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
+def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
     # WHY: on Ctrl-C each starting worker, and then Dask, printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
@@ -197,14 +197,14 @@ def test_ctrl_c_while_the_workers_start_is_no_traceback(tmp_path):
 
 
 class TestScheduler:
-    def test_nobody_answers(self, fleet, tmp_path, monkeypatch):
+    def test_a_scheduler_that_does_not_answer_is_named(self, fleet, tmp_path, monkeypatch):
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
         with pytest.raises(
             ThermoCompError, match=r'tcp://127\.0\.0\.1:9: no Dask scheduler answers'
         ):
             fit_fleet(str(fleet), tmp_path / 'out', OPTIONS, scheduler='tcp://127.0.0.1:9')
 
-    def test_it_has_no_worker(self, monkeypatch):
+    def test_a_scheduler_without_workers_is_refused(self, monkeypatch):
         monkeypatch.setattr('thermo_comp.fleet.work._WAIT_S', 0.2)
         with (
             distributed.LocalCluster(
@@ -215,7 +215,7 @@ class TestScheduler:
         ):
             pass
 
-    def test_it_is_used_as_it_is(self, client, fleet, tmp_path, monkeypatch):
+    def test_a_scheduler_of_equal_version_is_used(self, client, fleet, tmp_path, monkeypatch):
         address = client.cluster.scheduler_address
         refused = str(fleet / 'B')
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)
@@ -245,7 +245,7 @@ class _Future:
         (_Future('lost'), 'the scheduler was lost'),
     ],
 )
-def test_a_task_that_ends_badly_is_a_row_to_be_done_again(future, problem, fleet, tmp_path):
+def test_a_failed_task_is_a_row_that_the_next_run_repeats(future, problem, fleet, tmp_path):
     unit = find_units(Storage(str(fleet)))[0]
     outcome = outcome_of(future, unit)
     assert outcome is not None
@@ -268,7 +268,7 @@ def command(folder, out, *options):
     return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
 
 
-def test_the_command_s_mistakes(tmp_path, capsys):
+def test_mistakes_of_fleet_fit_end_in_one_line(tmp_path, capsys):
     assert command(tmp_path, tmp_path / 'out') == 2
     assert 'give --gravity, or --latitude and --height' in capsys.readouterr().err
     assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 1
@@ -279,7 +279,7 @@ def test_the_command_s_mistakes(tmp_path, capsys):
     assert len(printed.splitlines()) == 1
 
 
-def test_a_unit_without_a_calibration_leaves_exit_code_1(client, tmp_path, capsys):
+def test_a_unit_without_a_calibration_gives_exit_code_1(client, tmp_path, capsys):
     write_unit(tmp_path / 'bags' / 'u', 1, 3, is_exchanged=True)
     same = FleetOptions(FitOptions(gravity=9.81), Topics())
     fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', same, client=client)
@@ -298,14 +298,14 @@ def test_a_unit_without_a_calibration_leaves_exit_code_1(client, tmp_path, capsy
     assert (data['n_fitted'], data['n_done'], data['verdicts']) == (0, 0, {'refused': 1})
 
 
-def test_options_are_part_of_a_result(client, fleet, tmp_path):
+def test_other_options_fit_a_unit_again(client, fleet, tmp_path):
     refused = fleet / 'B'
     fit_fleet(str(refused), tmp_path / 'out', OPTIONS, client=client)
     other = replace(OPTIONS, fit=replace(OPTIONS.fit, min_rest_s=4.0))
     assert fit_fleet(str(refused), tmp_path / 'out', other, client=client).n_done == 1
 
 
-def test_siblings_help_a_unit_that_lacks_data(client, tmp_path):
+def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
     # WHY: one position in the chamber does not separate bias from scale.
     kind = unit_preset('mems', 1)
     siblings = [sibling(kind, number) for number in range(4)]

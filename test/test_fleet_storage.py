@@ -75,7 +75,7 @@ class TestElsewhere:
         assert other.hashes == {name: digest(unit.parent / name) for name in here.bags}
 
     @pytest.mark.parametrize('name', ['pos1', 'pos1.db3'])
-    def test_any_storage_is_read_from_elsewhere_and_leaves_no_copy(
+    def test_bags_of_any_storage_are_read_from_a_url_and_leave_no_copy(
         self, name, tmp_path, memory, monkeypatch
     ):
         fs, url = memory
@@ -94,7 +94,7 @@ class TestElsewhere:
         assert outcome.hashes == {f'unit/{name}': digest(path.with_name(name))}
         assert list((tmp_path / 'scratch').iterdir()) == []
 
-    def test_a_file_that_vanishes_may_come_back(self, memory):
+    def test_a_unit_whose_bag_vanished_is_not_final(self, memory):
         _, url = memory
         gone = {'unit/a.mcap': [StoredFile('unit/a.mcap', 5, '')]}
         outcome = process_unit(FoundUnit('unit', '', gone), url, OPTIONS)
@@ -102,7 +102,7 @@ class TestElsewhere:
         assert outcome.row['verdict'] == 'failed'
         assert str(outcome.row['left_out']).startswith('unit/a.mcap: ')
 
-    def test_a_protocol_that_nobody_knows(self):
+    def test_an_unknown_protocol_is_refused(self):
         with pytest.raises(ThermoCompError, match='nowhere://x: Protocol not known'):
             Storage('nowhere://x')
 
@@ -119,11 +119,11 @@ class TestDiscovery:
             (['top.bag', 'u/x.db3'], ['top.bag', 'u/x.db3']),
         ],
     )
-    def test_files_to_bags(self, files, bags):
+    def test_files_of_a_folder_are_grouped_into_bags(self, files, bags):
         stored = [StoredFile(name, 1, '') for name in files]
         assert list(group_files(stored)) == bags
 
-    def test_a_folder_per_unit_and_lot(self, tmp_path):
+    def test_folders_give_unit_and_lot(self, tmp_path):
         for name in ('lot-A/u1/1.mcap', 'lot-A/u1/2.mcap', 'lot-B/u2/1.mcap', 'u3/1.mcap'):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).touch()
@@ -157,7 +157,7 @@ class TestDiscovery:
             'f.mcap': ['f.mcap'],
         }
 
-    def test_names_that_somebody_chose_stand_on_one_line(self, tmp_path):
+    def test_names_from_files_are_printed_on_one_line(self, tmp_path):
         write_unit(tmp_path / 'lot\x1b[31m' / 'a\nb', 1, 1)
         write_unit(tmp_path, 1, 1, serial='S1\nCAL_ACC0_ID 7', names=['loose.mcap'])
         units = find_units(Storage(str(tmp_path)))
@@ -184,16 +184,15 @@ class TestDiscovery:
         assert Storage('bags').address == str(tmp_path / 'bags')
         assert Storage('memory://bags').address == 'memory://bags'
 
-    def test_nothing_there(self, tmp_path):
+    def test_a_folder_without_bags_is_refused(self, tmp_path):
         with pytest.raises(ThermoCompError, match='no bag in it; expected DIR/UNIT/BAG'):
             find_units(Storage(str(tmp_path)))
-        with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
-            find_units(Storage(str(tmp_path / 'gone')))
-        with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
-            find_units(Storage('memory://never-made'))
+        for url in (str(tmp_path / 'gone'), 'memory://never-made'):
+            with pytest.raises(ThermoCompError, match='cannot be listed: no such directory'):
+                find_units(Storage(url))
 
 
-def test_damage_is_the_bag_s_not_the_file_system_s(tmp_path):
+def test_a_damaged_bag_is_no_failure_of_the_file_system(tmp_path):
     (path,) = write_unit(tmp_path / 'u', 1, 1)
     damage(path)
     (units,) = find_units(Storage(str(tmp_path)))

@@ -52,7 +52,7 @@ def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
 
 
 class TestOutliers:
-    def test_one_unit_stands_out_in_one_thing(self, rng):
+    def test_one_outlier_in_one_quantity_is_reported(self, rng):
         rows = fleet_of(100, rng)
         rows[17] = {**rows[17], 'bias_y_ug': 50.0 * 12.0}
         (outliers,) = summarise(rows).outliers
@@ -60,14 +60,14 @@ class TestOutliers:
         assert outliers.value == 600.0
         assert outliers.z == pytest.approx(12.0, rel=0.3)
 
-    def test_a_twelfth_of_bad_units_does_not_hide_them(self, rng):
+    def test_a_twelfth_of_bad_units_is_reported(self, rng):
         rows = fleet_of(60, rng)
         for i in range(5):
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
         assert {one.serial for one in summarise(rows).outliers} == {f'S{i:03d}' for i in range(5)}
 
     @pytest.mark.parametrize('n', [10, 40])
-    def test_a_fleet_without_oddities_alarms_once_in_twenty(self, n, rng):
+    def test_fleets_without_outliers_have_a_false_alarm_in_one_of_twenty(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
         # 60 fleets with a false alarm rate of 0.05 give 3 alarms on average, and 12 once in 30000.
         assert n_alarms < 12
@@ -78,14 +78,14 @@ class TestOutliers:
         assert summarise(rows).outliers == ()
         assert outlier_limit(6, 20) == float('inf')
 
-    def test_alike_units_have_no_spread_to_stand_out_of(self, rng):
+    def test_equal_units_give_no_outliers(self, rng):
         rows = [{**row, 'm_10_urad': 0.0} for row in fleet_of(20, rng)]
         spread = next(one for one in summarise(rows).spreads if one.quantity.name == 'm_10_urad')
         assert (spread.sd, set(spread.z.tolist())) == (0.0, {0.0})
 
 
 class TestDrift:
-    def test_what_changed_between_two_tests(self, rng):
+    def test_a_change_between_two_tests_is_reported(self, rng):
         first = fleet_of(10, rng)
         second = fleet_of(10, rng, day=30.0, like=first)
         second[3] = {**second[3], 'bias_x_ug': float(first[3]['bias_x_ug']) + 40.0}
@@ -106,7 +106,7 @@ class TestDrift:
         assert (drift.worst.constant, drift.worst.unit) == ('scale factor z', 'ppm')
         assert drift.worst.change == pytest.approx(90.0)
 
-    def test_an_earlier_table_counts(self, rng, tmp_path):
+    def test_the_table_of_an_earlier_fleet_gives_drifts(self, rng, tmp_path):
         first = fleet_of(3, rng)
         table, _ = write_tables(first, tmp_path)
         before = read_parquet(table)
@@ -131,7 +131,7 @@ def hostile(rng):
 
 
 class TestPage:
-    def test_nothing_of_the_bags_is_markup_and_nothing_needs_a_network(self, rng):
+    def test_text_from_bags_is_no_markup_and_the_page_needs_no_network(self, rng):
         rows = hostile(rng)
         page = render_fleet(rows, summarise(rows), lambda row: f'units/{row["name"]}/c.html')
         assert '<script' not in page
@@ -145,7 +145,7 @@ class TestPage:
         assert "default-src 'none'" in page
         assert page.count('<figure') == 2
 
-    def test_a_fleet_without_a_calibration(self):
+    def test_the_page_of_a_fleet_without_a_calibration(self):
         rows = [row_of(name='u', serial='u', verdict='failed', problem='x: damaged')]
         page = render_fleet(rows, summarise(rows), lambda _: '')
         assert '0 of 1 test gave a calibration.' in page
@@ -153,7 +153,7 @@ class TestPage:
 
 
 class TestTable:
-    def test_a_spreadsheet_runs_nothing(self, tmp_path):
+    def test_cells_of_the_table_are_no_formulas(self, tmp_path):
         row = row_of(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)
         _, path = write_tables([row], tmp_path)
         heading, line = path.read_text().splitlines()
@@ -162,7 +162,7 @@ class TestTable:
         assert (cells['name'], cells['serial']) == ("'=cmd()", "'-1")
         assert (cells['n_bags'], cells['raw_ug'], cells['board_lag_s']) == ('3', '-1.5', '')
 
-    def test_what_is_no_fleet_table(self, tmp_path):
+    def test_a_file_that_is_no_fleet_table_is_refused(self, tmp_path):
         (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')
         with pytest.raises(ThermoCompError, match=r'x\.parquet: not a fleet table'):
             read_parquet(tmp_path / 'x.parquet')
@@ -172,14 +172,14 @@ class TestTable:
         with pytest.raises(ThermoCompError, match='lacks the columns serial and verdict'):
             read_parquet(tmp_path / 'y.parquet')
 
-    def test_the_page_of_the_docs_lists_every_column(self):
+    def test_the_page_on_fleets_lists_every_column(self):
         text = (ROOT / 'docs' / 'fleet.md').read_text()
         listed = re.findall(r'^\| `(\w+)` \| (\w+) \| (.*) \|$', text, re.MULTILINE)
         assert [(name, kind, meaning.replace('\\|', '|')) for name, kind, meaning in listed] == [
             (column.name, column.kind, column.meaning) for column in COLUMNS
         ]
 
-    def test_a_strange_column_is_a_mistake(self):
+    def test_a_row_with_an_unknown_column_is_refused(self):
         with pytest.raises(ValueError, match="no column 'colour'"):
             row_of(colour='red')
 
@@ -195,7 +195,7 @@ def test_no_name_leads_out_of_the_results(name, tmp_path):
     assert inside in folder.resolve().parents
 
 
-def test_results_need_a_folder(tmp_path):
+def test_results_are_not_written_into_a_file(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(ThermoCompError, match='file: cannot be created'):
         Results(tmp_path / 'file')

@@ -41,7 +41,7 @@ def brief(fleet):
     return processed(fleet)
 
 
-def test_the_fit_is_that_of_thermo_comp_fit(fleet, brief):
+def test_the_fit_of_a_fleet_equals_that_of_thermo_comp_fit(fleet, brief):
     sources, _ = fit_sources(sorted((fleet / 'lot-A' / 'unit1').iterdir()))
     ours = parse_calibration(brief.calibration.encode())
     theirs = fit(sources, replace(OPTIONS.fit, serial='mems-0001')).calibration
@@ -49,7 +49,7 @@ def test_the_fit_is_that_of_thermo_comp_fit(fleet, brief):
     assert ours == replace(theirs, provenance=ours.provenance)
 
 
-def test_the_verdict_is_that_of_evaluate(fleet, brief, cli, tmp_path):
+def test_the_verdict_of_a_fleet_is_that_of_evaluate(fleet, brief, cli, tmp_path):
     row, bags = brief.row, sorted((fleet / 'lot-A' / 'unit1').iterdir())
     calibration = tmp_path / 'unit.yaml'
     calibration.write_text(brief.calibration)
@@ -67,7 +67,7 @@ def test_the_verdict_is_that_of_evaluate(fleet, brief, cli, tmp_path):
 
 class TestRow:
     @pytest.mark.usefixtures('no_figures')
-    def test_a_good_unit(self, fleet, brief):
+    def test_the_row_of_a_good_unit(self, fleet, brief):
         outcome = processed(fleet, certificates=True)
         row = outcome.row
         assert (row['name'], row['serial'], row['lot']) == ('lot-A/unit1', 'mems-0001', 'lot-A')
@@ -96,7 +96,7 @@ class TestRow:
         )
         json.dumps(row, allow_nan=False)
 
-    def test_a_corrupt_bag_costs_itself_and_one_cut_off_is_read_up_to_there(self, tmp_path):
+    def test_a_corrupt_bag_is_left_out_and_a_torn_bag_is_read_up_to_the_cut(self, tmp_path):
         paths = write_unit(tmp_path / 'u', 2, 8)
         paths[2].write_bytes(paths[2].read_bytes()[:-300])
         damage(paths[3])
@@ -108,14 +108,14 @@ class TestRow:
         assert '03.mcap: the file is cut off at byte' in row['reservations']
         assert row['n_positions'] == 7
 
-    def test_bags_of_two_units_in_one_folder(self, tmp_path):
+    def test_bags_of_two_units_in_one_folder_are_refused(self, tmp_path):
         write_unit(tmp_path / 'u', 1, 1)
         write_unit(tmp_path / 'u', 2, 1, names=['x.mcap'])
         row = processed(tmp_path).row
         assert row['verdict'] == 'refused'
         assert row['problem'] == 'the bags are of different units: mems-0001, mems-0002'
 
-    def test_the_lot_of_the_metadata_wins_and_a_chosen_topic_is_told(self, tmp_path):
+    def test_the_row_has_the_lot_of_the_metadata_and_the_chosen_topic(self, tmp_path):
         lot = {'lot': 'L7'}
         write_unit(tmp_path / 'shelf' / 'u', 1, 2, serial='', metadata=lot, counts='/imu/raw')
         row = processed(tmp_path).row

@@ -48,14 +48,14 @@ def test_spline_equals_scipy():
     np.testing.assert_allclose(ours.slope(t), reference(t, 1), atol=1e-13)
 
 
-def test_spline_holds_its_ends():
+def test_a_spline_is_constant_beyond_its_ends():
     spline = CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9))
     assert spline.value(-100.0) == spline.value(-15.0)
     assert spline.value(100.0) == pytest.approx(0.9, abs=1e-15)
 
 
 @pytest.mark.parametrize('function', FUNCTIONS)
-def test_array_gives_the_bits_of_floats(function):
+def test_functions_of_arrays_have_the_bits_of_floats(function):
     t = np.concatenate((np.linspace(-16.0, 16.0, 1001), KNOTS))
     for method in (function.value, function.slope):
         assert method(t).tolist() == [method(x) for x in t.tolist()]
@@ -66,7 +66,7 @@ def test_array_gives_the_bits_of_floats(function):
 
 @pytest.mark.parametrize('function', FUNCTIONS)
 @given(t=temperatures)
-def test_slope_is_the_derivative(function, t):
+def test_the_slope_of_a_function_is_its_derivative(function, t):
     step = 1e-4
     t = min(max(t, -15.0 + step), 15.0 - step)
     # The error of a central difference, third derivative * step^2 / 6, is below 1e-8.
@@ -76,7 +76,7 @@ def test_slope_is_the_derivative(function, t):
 
 @pytest.mark.parametrize('function', FUNCTIONS)
 @given(t=temperatures, data=st.data())
-def test_value_is_linear_in_the_free_coefficients(function, t, data):
+def test_the_value_of_a_function_is_linear_in_its_free_coefficients(function, t, data):
     change = data.draw(st.tuples(*[st.floats(-1.0, 1.0)] * function.n_free))
     other = function.with_free(
         tuple(a + b for a, b in zip(function.free_coefficients, change, strict=True)),
@@ -103,18 +103,18 @@ def test_value_is_linear_in_the_free_coefficients(function, t, data):
         (lambda: Exponential(0.0, (1.0,), (0.0,)), 'at least 1 K'),
     ],
 )
-def test_refusals(build, message):
+def test_impossible_functions_are_refused(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 
 
-def test_hold():
+def test_hold_clips_values_to_a_range():
     assert [hold(x, -1.0, 2.0) for x in (-3.0, 0.5, 4.0)] == [-1.0, 0.5, 2.0]
     assert hold(np.array([-3.0, 0.5, 4.0]), -1.0, 2.0).tolist() == [-1.0, 0.5, 2.0]
 
 
 @pytest.mark.parametrize('bad', [float('nan'), float('inf')])
-def test_what_is_not_finite_is_no_curve_of_a_set(bad):
+def test_a_curve_that_is_not_finite_is_refused(bad):
     for function in (Polynomial((0.0, bad)), Exponential(bad, (1.0,), (9.0,))):
         with pytest.raises(ValueError, match='`bias_function` must be 0 at the reference'):
             check_reference('bias_function', function, 0.0)
@@ -133,7 +133,7 @@ def slope_and_lag(variances):
     return replace(unit, posterior=posterior_of(np.diag(rest)))
 
 
-def test_sd_by_hand():
+def test_the_predicted_sd_by_hand():
     # Parameters of x: level and slope of both biases, weight of the lag, two levels of scale.
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
@@ -149,7 +149,7 @@ def test_sd_by_hand():
     assert scale[0, 0] == pytest.approx(2e-6, rel=1e-6)
 
 
-def test_what_is_known_has_no_sd():
+def test_parameters_without_variance_give_no_sd():
     unit = replace(rich_calibration(), posterior=None)
     bias, scale = sd_of_states(unit, ramp_states(unit, np.array([20.0]), 0.0, np.inf))
     assert bias == pytest.approx(np.full((1, 3), 1e-5))
@@ -157,7 +157,7 @@ def test_what_is_known_has_no_sd():
 
 
 @pytest.mark.parametrize('rate', [0.01, -0.02])
-def test_ramp_is_what_the_memory_makes_of_one(rate):
+def test_ramp_states_equal_those_of_the_stepped_memory(rate):
     # The expected state comes from the memory of the fit, stepped through a ramp after a soak.
     unit = replace(rich_calibration(), board_lag_s=100.0)
     spec = Correction(unit).memory
@@ -172,7 +172,7 @@ def test_ramp_is_what_the_memory_makes_of_one(rate):
         if isinstance(quantity, Gradient):
             assert state[place] == pytest.approx(100.0 * rate)
         elif isinstance(quantity, Lag):
-            # Here the gradient rises within the first of 900 s, in `ramp_states` at once.
+            # In the memory the gradient rises within the first of 900 s, in `ramp_states` at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
             # A play on the lag would reach its end only after half an hour.
@@ -192,13 +192,13 @@ def test_values_that_are_not_finite_are_left_out(bad):
     assert residual_statistics(np.array([1.0, bad, 1.0])) == residual_statistics(np.ones(2))
 
 
-def test_nothing_to_count_gives_nan():
+def test_statistics_of_no_values_are_nan():
     statistics = residual_statistics(np.zeros(0))
     assert statistics.n == 0
     assert np.isnan([statistics.mean, statistics.rms, statistics.peak]).all()
 
 
-def test_norm_residual_does_not_see_a_rotation(rng):
+def test_the_residual_of_the_norm_does_not_depend_on_a_rotation(rng):
     force = rng.normal(size=(5, 3))
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     np.testing.assert_allclose(
@@ -207,7 +207,7 @@ def test_norm_residual_does_not_see_a_rotation(rng):
     assert norm_residual(np.array([0.0, 3.0, 4.0]), 4.5) == pytest.approx(0.5, abs=1e-15)
 
 
-def test_regimes_are_told_apart():
+def test_statistics_separate_the_regimes():
     summary = statistics_by_regime(np.array([1.0, 2.0, 5.0]), np.array([False, False, True]))
     assert (summary['static'].n, summary['dynamic'].n, summary['all'].n) == (2, 1, 3)
     assert summary['dynamic'].peak == 5.0

@@ -16,7 +16,7 @@ TARGETS = targets.targets()
 
 
 @pytest.mark.parametrize('name', TARGETS)
-def test_seeds_and_what_is_near_them(name, rng):
+def test_seeds_cut_off_or_changed_do_not_crash_the_targets(name, rng):
     target = TARGETS[name]
     for seed in target.seeds:
         assert len(seed) <= target.max_length
@@ -29,13 +29,13 @@ def test_seeds_and_what_is_near_them(name, rng):
             target.check(bytes(changed))
 
 
-def test_the_runner_lists_every_target():
+def test_fuzz_run_lists_every_target():
     import run
 
     assert set(run.NAMES) == set(TARGETS)
 
 
-def test_seeds_are_behind_the_first_checks():
+def test_seeds_of_the_fuzz_targets_pass_the_first_checks():
     assert parse_calibration(TARGETS['calibration'].seeds[0]).unit.serial == 'T'
     for seed in TARGETS['mcap'].seeds:
         targets.BAG.write_bytes(seed)

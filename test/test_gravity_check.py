@@ -37,17 +37,17 @@ def test_residual_of_a_good_calibration_is_within_its_sd(rng):
     assert result.is_still
 
 
-def test_aged_calibration_shows(rng):
+def test_an_aged_calibration_is_reported(rng):
     result = watch(rng, bias=3e-3)
     assert result.residual == pytest.approx(3e-3, abs=5 * NOISE_SD / math.sqrt(100 * 15))
     assert result.residual > 10 * result.residual_sd
 
 
-def test_motion_says_nothing(rng):
+def test_motion_gives_no_verdict(rng):
     assert watch(rng, motion=0.05) is None
 
 
-def test_time_that_jumps_starts_a_new_window(rng):
+def test_a_jump_of_time_starts_a_new_window(rng):
     monitor = GravityCheck(GRAVITY)
     watch(rng, seconds=10, monitor=monitor)
     result = watch(rng, seconds=10, monitor=monitor)
@@ -55,7 +55,7 @@ def test_time_that_jumps_starts_a_new_window(rng):
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
-    """Run a platform at rest that reads more from a given time; return when it was refused."""
+    """Run a platform at rest whose |f| rises at a given time; return when samples were refused."""
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     for k in range(round((at_s + 10.0) * rate_hz)):
@@ -71,7 +71,7 @@ def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
 
 @pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
 @pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
-def test_what_steps_away_at_rest_is_refuted_within_a_second(rng, rate_hz, offset):
+def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, offset):
     # WHY: the refusal took five seconds, and the message averaged over the time before the change.
     after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
     assert after_s < 1.0
@@ -79,13 +79,13 @@ def test_what_steps_away_at_rest_is_refuted_within_a_second(rng, rate_hz, offset
     assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)
 
 
-def test_what_moves_away_is_not_refuted_at_once(rng):
+def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
     # Not refused at once: a lift, accelerating over 0.8 s, and a car that starts and shakes.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 
 
-def test_the_message_gives_the_deviation_now(rng):
+def test_the_message_states_the_present_deviation(rng):
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)
     assert not monitor.is_refuted

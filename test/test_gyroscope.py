@@ -84,7 +84,7 @@ def held_out(unit):
     return arrays(unit, stations, 99, rate_hz=RATE_HZ)
 
 
-def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
+def test_the_residual_of_a_mems_gyroscope_is_its_noise(unit, fitted, held_out):
     calibration = fitted.calibration
     gyroscope = calibration.gyroscope
     for record in held_out:
@@ -108,14 +108,14 @@ def test_what_is_left_of_a_mems_unit_is_its_noise(unit, fitted, held_out):
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
-def test_the_fit_tells_what_other_positions_see(fitted):
+def test_left_out_residuals_of_the_fit_hold_for_new_positions(fitted):
     row = fitted.rates[-1]
     assert row.section == 'all'
     assert row.raw.rms > 100.0 * FLOOR
     assert row.fitted.rms <= row.left_out.rms < 1.05 * FLOOR
 
 
-def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
+def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
     program = parse_cyclogram('20 10min, 35@1.5 10min, 10@1.5 15min')
     stations = [replace(station, program=program) for station in plan('chamber-9', 2)[:2]]
     records = arrays(unit, stations, 2, rate_hz=RATE_HZ)
@@ -148,7 +148,7 @@ def test_the_gyroscope_leaves_the_accelerometer_alone(unit):
 
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
-def test_within_positions_is_blind_to_levels(places, seed):
+def test_residuals_within_positions_do_not_depend_on_levels(places, seed):
     position = np.sort(np.array(places))
     rng = np.random.default_rng(seed)
     rate, level = rng.standard_normal((len(places), 3)), rng.standard_normal((5, 3))
@@ -160,7 +160,7 @@ def test_within_positions_is_blind_to_levels(places, seed):
         np.testing.assert_allclose(within[position == p].sum(axis=0), 0.0, atol=1e-12)
 
 
-def test_file_and_triad_round_trip():
+def test_the_round_trip_of_a_gyroscope_is_exact():
     whole = rich_calibration()
     assert parse_calibration(dump_calibration(whole).encode()) == whole
     triad = rate_triad(whole)
@@ -181,7 +181,7 @@ def test_file_and_triad_round_trip():
         rate_triad(calibration())
 
 
-def test_a_file_is_refused_by_key():
+def test_a_bad_gyroscope_in_a_file_is_refused_by_key():
     text = dump_calibration(rich_calibration())
     for old, new, said in (
         ('bias_rad_s: [0.02', 'bias_rad_s: [.nan', r'gyroscope\.bias_rad_s\[0\]'),
@@ -232,7 +232,7 @@ def test_the_rate_is_corrected_by_hand_numbers():
     np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)
 
 
-def test_with_a_prior_the_gyroscope_is_the_priors(unit, fitted):
+def test_a_fit_with_a_prior_keeps_the_gyroscope_of_the_prior(unit, fitted):
     record = arrays(unit, plan('tumble', 2)[:1], 5, rate_hz=RATE_HZ)[0]
     again = fit([source_of(record, unit.scale_factor)], replace(OPTIONS, prior=fitted.calibration))
     assert again.calibration.gyroscope == fitted.calibration.gyroscope
@@ -244,7 +244,7 @@ def reduced(unit, records):
     return [reduce_source(source, full_scale=None) for source in sources]
 
 
-def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
+def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, held_out)
     # The first third of the bag has enough ramps and soaks to show an error.
     thirds = [replace(interval, n_whole=interval.n_whole // 3) for interval in bags[0].intervals]
@@ -277,7 +277,7 @@ def test_evaluation_judges_the_changes_by_their_claim(unit, fitted, held_out):
     assert unknown.exit_code == 0
 
 
-def test_where_no_temperature_changes_nothing_is_wrong(unit, fitted):
+def test_a_bag_without_temperature_change_gives_no_alarm(unit, fitted):
     bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3, rate_hz=RATE_HZ))
     rate = judge_bags(bags, fitted.calibration).rate
     section = rate.sections['all']

@@ -56,7 +56,7 @@ def test_the_sigma_is_that_of_white_noise(rng):
     assert 0.5 < np.sqrt(np.mean(free.position[-1] ** 2)) / expected < 1.5
 
 
-def test_updates_find_a_bias_that_levelling_has_not_seen():
+def test_zupt_removes_a_bias_that_appears_after_levelling():
     # A bias of 1e-3 m/s^2 appears after levelling; 25 minutes of ZUPT must remove most of it.
     dt, n_align = 0.5, 600
     force = np.tile(G * UP, (n_align + 3600 + 1, 1))

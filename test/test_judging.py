@@ -107,7 +107,7 @@ class TestWindows:
         assert len(windows) >= 28
         np.testing.assert_allclose(windows.residual, 0.0, atol=1e-9)
 
-    def test_residuals_are_those_of_the_hand(self, tmp_path):
+    def test_residuals_equal_those_computed_by_hand(self, tmp_path):
         # 10 K above the reference the z axis reads 20 counts more: 20 / 300 m/s^2.
         bag = resting(tmp_path / 'bag', 30.0)
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
@@ -138,14 +138,14 @@ class TestWindows:
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
-    def test_windows_are_as_long_as_stated(self, tmp_path, rate_hz, window_s):
+    def test_windows_at_rest_have_the_stated_length(self, tmp_path, rate_hz, window_s):
         # WHY: cells of 32 samples at 4 Hz are 8 s long, so windows of "ten seconds" had sixteen.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
         np.testing.assert_array_equal(windows.count, rate_hz * window_s)
         np.testing.assert_allclose(np.diff(windows.start_ns) * 1e-9, window_s, atol=1e-6)
-        # Every rest of this length is in a window, except for the time before the first reading.
+        # All of a rest is in windows, except for the time before the first reading.
         assert len(windows) >= int(20.5 * 60.0 / window_s) - 1
 
     def test_samples_too_slow_for_a_window_are_refused(self, tmp_path):
@@ -163,7 +163,7 @@ class TestWindows:
         # A noise of 0.3 counts, averaged over 100 samples, is 0.1 mm/s^2 per window.
         assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
 
-    def test_noise_is_claimed_as_it_is(self, tmp_path):
+    def test_the_claimed_sd_of_noise_is_its_sd(self, tmp_path):
         # The calibration states the bag's white noise: an sd of 0.3 counts at 10 Hz.
         density = 0.3 / K * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
@@ -184,7 +184,7 @@ class TestWindows:
         with pytest.raises(RecordingError, match='no window of 60 s at rest'):
             judged(bag, calibration())
 
-    def test_gravity_is_that_of_the_place(self, tmp_path):
+    def test_the_user_can_state_the_gravity_of_the_place(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0)
         judgement = judged(bag, calibration(), gravity=GRAVITY + 1e-3)
         np.testing.assert_allclose(judgement.windows.residual, -1e-3, atol=1e-9)
@@ -208,7 +208,7 @@ class TestWindows:
         (note,) = evaluate([good, short], [('it', CLAIMING)]).notes
         assert note.startswith(f'{short}: no window of 60 s at rest')
 
-    def test_refusals(self, tmp_path):
+    def test_another_unit_and_a_bag_shorter_than_a_window_are_refused(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0, minutes=1.0, serial='T-9')
         with pytest.raises(CalibrationError, match='is of unit T-1'):
             judged(bag, calibration())
@@ -230,7 +230,7 @@ class TestVerdict:
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
     )
-    def test_by_its_own_claim(self, residual, raw, claimed, verdict):
+    def test_the_verdict_compares_residual_and_claimed_sd(self, residual, raw, claimed, verdict):
         judgement = judge(made(residual, raw, claimed), CLAIMING)
         assert judgement.verdict == verdict
         assert judgement.is_valid == verdict.startswith('valid')
@@ -248,12 +248,12 @@ class TestVerdict:
             (90.0, 80.0, 60.0, 'no better than raw'),
         ],
     )
-    def test_the_users_limit_decides(self, residual, raw, claimed, verdict):
+    def test_the_users_tolerance_decides_the_verdict(self, residual, raw, claimed, verdict):
         judgement = judge(made(residual, raw, claimed), CLAIMING, 100.0 * MICRO_G)
         assert judgement.verdict == verdict
         assert '100 ug tolerated' in judgement.reason
 
-    def test_headline_of_seen_windows_is_what_was_left_out(self):
+    def test_the_headline_for_bags_of_the_fit_is_the_left_out_error(self):
         # WHY: a fit left 59 ug in sample, 61 ug held out in its attitudes, 1091 ug in a new one.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
@@ -281,7 +281,7 @@ class TestVerdict:
             judgement = judged(bag, dataclasses.replace(CLAIMING, provenance=provenance))
             assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
-    def test_no_uncertainty_makes_no_claim(self):
+    def test_a_calibration_without_covariance_gets_the_verdict_no_claim(self):
         # WHY: an import without covariance was compared with the noise alone and called wrong.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
@@ -294,7 +294,7 @@ class TestVerdict:
         assert judge(windows, imported, 40.0 * MICRO_G).verdict == 'recalibrate'
         assert judge(made(50.0, 40.0, 2.0), imported).verdict == 'no better than raw'
 
-    def test_the_worse_regime_counts(self):
+    def test_the_worse_regime_decides_the_verdict(self):
         windows = made(50.0, 1000.0, 60.0)
         worse = windows.force.copy()
         worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
@@ -305,7 +305,7 @@ class TestVerdict:
         assert judgement.verdict == 'recalibrate'
         assert judge(windows, CLAIMING, 100.0 * MICRO_G).verdict == 'recalibrate'
 
-    def test_what_is_outside_the_ranges_decides_nothing(self):
+    def test_windows_outside_the_ranges_do_not_change_the_verdict(self):
         windows = made(50.0, 1000.0, 60.0, outside=10)
         wild = windows.force.copy()
         wild[:10, 2] = GRAVITY + 5000.0 * MICRO_G
@@ -324,7 +324,7 @@ class TestVerdict:
             assert found.verdict == 'outside the calibrated range: not judged'
             assert not found.is_valid
 
-    def test_outside_is_told_from_a_bag(self, tmp_path):
+    def test_the_verdict_names_temperatures_and_rates_outside_the_range(self, tmp_path):
         _, upper = CLAIMING.static.temperature_range_c
         judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert judgement.kind is Verdict.OUTSIDE
@@ -350,7 +350,7 @@ def around(n, bias, scale, noise=0.0):
 
 class TestShifts:
     @pytest.mark.parametrize('n', [6, 18])
-    def test_what_moved_is_named(self, n):
+    def test_changed_parameters_are_named(self, n):
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
         # 12 windows per position with 0.5 ug of noise determine shifts far below 20 ug and 30 ppm.
         judgement = judge(moved, corrected_by(SLOPE, 1e-5), None)
@@ -368,13 +368,13 @@ class TestShifts:
         small = AxisShift(-1.234 * MICRO_G, 0.0567 * MICRO_G, 0.0, 1.0)
         assert what_moved((one, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')
 
-    def test_a_unit_as_it_was_has_not_moved(self):
+    def test_an_unchanged_unit_shows_no_shift(self):
         judgement = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)
         assert (len(judgement.shifts), judgement.moved, judgement.verdict) == (3, (), 'valid')
         judgement = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
         assert (judgement.shifts, judgement.n_positions) == ((), 5)
 
-    def test_rms_of_an_axis_is_about_the_mean_of_a_position(self):
+    def test_the_drift_of_an_axis_is_about_its_mean_in_a_position(self):
         windows = made(0.0, 1000.0, 60.0, n=40, dynamic=20)
         force = windows.force.copy()
         force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
@@ -382,7 +382,7 @@ class TestShifts:
         np.testing.assert_allclose(judgement.axis_rms, [[0, 0, 0], [3e-5, 0, 0]], atol=1e-12)
 
 
-def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
+def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(root, tmp_path):
     """Exchanged thermometers, or a temperature outside the calibrated range, give no verdict."""
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):
@@ -399,7 +399,7 @@ def test_thermometers_in_doubt_are_told_offline_too(root, tmp_path):
     assert note == f'board temperature +2.00 K {CONTINUED}'
 
 
-def test_windows_as_a_table(tmp_path):
+def test_windows_are_written_as_a_table(tmp_path):
     windows = made(50.0, 1000.0, 60.0, outside=3)
     with table_writer(tmp_path / 'rows', {}) as write:
         write(columns_of(windows, ['a,"b".mcap']))
@@ -422,7 +422,7 @@ def test_windows_as_a_table(tmp_path):
     ('text', 'micro_g'),
     [('100ug', 100.0), ('100 µg', 100.0), ('0.5mg', 500.0), ('9.80665e-4m/s^2', 100.0)],
 )
-def test_accelerations_are_read_with_their_unit(text, micro_g):
+def test_accelerations_of_an_option_are_read_with_their_unit(text, micro_g):
     assert parse_acceleration(text) / MICRO_G == pytest.approx(micro_g)
 
 

@@ -36,7 +36,7 @@ def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
     return dataclasses.replace(unit, provenance=provenance)
 
 
-def test_changes_and_their_sd_by_hand():
+def test_changes_between_calibrations_and_their_sd_by_hand():
     # The later calibration is given first, but dates decide. Sd of 3 and 4 ug combine to 5 ug.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     assert [drift.constant for drift in drifts] == [
@@ -53,7 +53,7 @@ def test_changes_and_their_sd_by_hand():
         assert not change.is_sure
 
 
-def test_what_is_no_history():
+def test_calibrations_that_are_no_history_give_no_drift():
     unit = dated('2026-01-01')
     # A single calibration, models of the same bags, and another unit are no history.
     other = dataclasses.replace(unit, unit=dataclasses.replace(unit.unit, serial='other'))
@@ -65,7 +65,7 @@ def test_what_is_no_history():
     assert not any(drift.is_sure for drift in silent)
 
 
-def test_commands_tell_the_history(cli, tmp_path, monkeypatch):
+def test_commands_print_the_history(cli, tmp_path, monkeypatch):
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(figure, '') for figure in figures])
     now = fitted().calibration
@@ -106,7 +106,7 @@ def folder(tmp_path_factory):
 
 @pytest.mark.usefixtures('no_figures')
 @pytest.mark.parametrize('options', [(), ('--tolerance', '1ug', '--window', '120')])
-def test_evaluate_and_report_agree(cli, folder, options):
+def test_evaluate_and_report_give_equal_verdicts(cli, folder, options):
     # WHY: for one bag and calibration one command said "re-calibrate", another "holds".
     page = folder / f'page{len(options)}.html'
     given = (folder / 'held_out.mcap', '-c', folder / 'unit.yaml', *options, '--json')

@@ -41,18 +41,18 @@ def declared(root):
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 class TestEveryFile:
-    def test_variables_are_the_declared_arguments(self, path):
+    def test_variables_of_a_launch_file_are_its_declared_arguments(self, path):
         root = parse(path)
         text = re.sub(r'<!--.*?-->', '', path.read_text(), flags=re.DOTALL)
         assert set(re.findall(r'\$\(var ([\w]+)\)', text)) == declared(root)
 
-    def test_files_of_the_package_exist(self, path):
+    def test_files_that_a_launch_file_names_exist(self, path):
         elements = re.findall(r'\$\(find-pkg-share thermo_comp\)/([^"]+)"', path.read_text())
         assert elements
         for name in elements:
             assert (ROOT / name.replace('$(var driver)', 'xsens')).is_file(), name
 
-    def test_the_example_in_its_head_gives_arguments_it_has(self, path):
+    def test_the_example_in_a_launch_file_gives_declared_arguments(self, path):
         lines = re.findall(r'ros2 launch thermo_comp (\S+) (.*)', path.read_text())
         assert lines
         for name, arguments in lines:
@@ -121,7 +121,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
         assert all(name.startswith(NOT_GIVEN) for name in strangers)
 
 
-def test_our_node_s_executable_parameters_and_topics():
+def test_executable_parameters_and_topics_of_a_launch_file_exist():
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from dataclasses import fields
 
@@ -149,20 +149,20 @@ def test_our_node_s_executable_parameters_and_topics():
         assert defaults[argument[1]] == topic
 
 
-def test_the_example_gives_the_included_file_arguments_it_has():
+def test_beside_ins_gives_declared_arguments_to_the_included_file():
     (include,) = parse(BESIDE).findall('include')
     assert include.get('file', '').endswith(OURS.name)
     assert {element.get('name') for element in include.findall('arg')} <= declared(parse(OURS))
 
 
-def test_the_example_speaks_to_others_in_their_words():
+def test_beside_ins_names_parameters_that_other_nodes_have():
     nodes = {(node.get('pkg'), node.get('exec')): node for node in parse(BESIDE).findall('node')}
     assert set(nodes) == set(OTHERS)
     for key, node in nodes.items():
         assert {element.get('name') for element in node.findall('param')} <= OTHERS[key]
 
 
-def test_the_example_takes_gravity_off_once_and_gives_each_frame_one_parent():
+def test_beside_ins_subtracts_gravity_once_and_gives_each_frame_one_parent():
     nodes = {element.get('exec'): element for element in parse(BESIDE).findall('node')}
     given = {
         name: {arg.get('name'): arg.get('value') for arg in nodes[name].findall('param')}

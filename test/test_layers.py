@@ -104,7 +104,7 @@ def own_unit(name):
 
 
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_go_down_only(path):
+def test_packages_import_from_lower_layers_only(path):
     unit, file = unit_of(path), path.relative_to(PACKAGE).as_posix()
     assert unit in LAYERS, f'{unit} has no layer: give it one in {Path(__file__).name}'
     wrong = []
@@ -143,19 +143,19 @@ def circle(uses):
         uses = {file: targets for file, targets in uses.items() if file not in leaves}
 
 
-@pytest.mark.parametrize('by', ['room', 'file'])
-def test_no_circle(by):
+@pytest.mark.parametrize('by', ['package', 'file'])
+def test_no_packages_or_files_import_each_other(by):
     # Neither two packages nor two files may import each other, except for type annotations.
     uses = {}
     for path in SOURCES:
         text = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
-        here = unit_of(path) if by == 'room' else text
+        here = unit_of(path) if by == 'package' else text
         imported = (name for _, name in imports_of(path, with_types=False))
         names = {name for name in imported if name.split('.')[0] == 'thermo_comp'}
-        targets = {own_unit(name) if by == 'room' else own_file(name) for name in names}
+        targets = {own_unit(name) if by == 'package' else own_file(name) for name in names}
         uses.setdefault(here, set()).update(target for target in targets if target != here)
     left = circle(uses)
-    assert not left, f'these import each other: {left}'
+    assert not left, f'import each other: {left}'
 
 
 def loaded_after(statement, *watched):
@@ -164,23 +164,23 @@ def loaded_after(statement, *watched):
     return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
 
-def test_node_starts_without_the_offline_libraries():
+def test_the_node_loads_none_of_the_offline_libraries():
     # Libraries for fits or plots would cost the node memory and start-up time.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     offline = ('rosbags', 'mcap', 'matplotlib', 'scipy', 'scipy.optimize', 'typer', 'rich')
     assert loaded_after('import thermo_comp.ros.node', *offline) == []
 
 
-def test_help_starts_without_the_heavy_libraries():
+def test_help_loads_none_of_the_heavy_libraries():
     heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
 
 
-def test_a_look_at_a_bag_starts_without_the_fit():
+def test_inspecting_a_bag_loads_no_fit():
     heavy = ('scipy', 'matplotlib', 'pydantic', 'rosbags', 'rclpy', 'thermo_comp.fitting')
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 
 
-def test_core_imports_no_files_and_no_ros():
+def test_the_compensator_imports_no_ros_and_no_bag_libraries():
     statement = 'import thermo_comp.online.compensator'
     assert loaded_after(statement, 'rclpy', 'rosbags', 'mcap', 'matplotlib', 'scipy') == []

@@ -138,7 +138,7 @@ def test_plotjuggler_curves_lead_to_numbers(topics):
         assert source_kind(topics, series) in ('float64', 'bool')
 
 
-def test_plotjuggler_splitters_count_what_they_hold():
+def test_plotjuggler_splitters_have_the_right_number_of_panels():
     for splitter in plotjuggler().iter('DockSplitter'):
         assert int(splitter.get('count')) == len(splitter)
         assert len(splitter.get('sizes').split(';')) == len(splitter)

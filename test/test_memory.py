@@ -55,7 +55,7 @@ def test_a_value_at_the_same_stamp_replaces_the_last_one():
     assert bank.at(0, 3.0)[0] == [2.0]
 
 
-def test_what_is_not_known_of_a_lag():
+def test_the_variance_of_a_lag_by_hand():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
     # A gap of 50 s is more than a tenth of the time constant 100 s, but not of 1000 s.
@@ -68,7 +68,7 @@ def test_what_is_not_known_of_a_lag():
     assert bank.extra == pytest.approx([lost**2 + 9.0, 9.0])
 
 
-def test_a_guess_that_stays_wrong_adds_up_to_its_own_error():
+def test_a_constant_error_of_readings_becomes_the_error_of_a_lag():
     bank = LagBank((100.0,))
     for second in range(2000):
         bank.step(second * SECOND_NS, 0.0, 0.5 if second else 0.0)
@@ -116,7 +116,7 @@ def test_a_lag_of_two_stages_is_that_of_two_parts_in_series(rng):
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
 
 
-def test_a_part_between_board_and_sensor(rng):
+def test_the_lag_of_a_part_between_board_and_sensor(rng):
     times = np.arange(0.0, 7200.0, 30.0)
     board, case = 20.0 + np.cumsum(0.2 * rng.standard_normal((2, len(times))), axis=1)
     lag = Lag('board', 900.0, 150.0, 'case', 0.4)
@@ -165,7 +165,7 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
         assert b < 0.0 < share < 1.0
 
 
-def test_a_second_stage_adds_the_errors_of_both():
+def test_the_error_of_a_second_stage_adds_the_errors_of_two_stages():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
@@ -177,7 +177,7 @@ def plays(*widths):
     return ThermalMemory(MemorySpec(plays=tuple((0.0, width) for width in widths)))
 
 
-def test_the_loop_of_a_play():
+def test_the_hysteresis_loop_of_a_play():
     # A play of half-width 1 is v - 1 if v rises, v + 1 if v falls, constant for 2 K in between.
     memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
@@ -206,7 +206,7 @@ def test_a_play_on_a_lag_follows_the_lag():
     assert state[2] == pytest.approx(-0.4)
 
 
-def test_start_prior():
+def test_the_prior_of_initial_lag_states_by_hand():
     lags = (('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0))
     P = start_covariance(lags)
     assert math.sqrt(P[1, 1]) == pytest.approx(3.0, rel=START_JITTER)
@@ -234,7 +234,7 @@ def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 
-def test_the_start_fades_with_each_time_constant():
+def test_initial_lag_states_decay_with_their_time_constants():
     memory = ThermalMemory(MemorySpec(lags=(('board', 60.0), ('board', 600.0), ('case', 600.0))))
     assert memory.start_shares(5) == [1.0, 1.0, 1.0]
     memory.board_step(0, 20.0)

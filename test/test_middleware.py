@@ -121,12 +121,12 @@ def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, mo
     monkeypatch.setenv(VARIABLE, str(other))
     drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's profile timed events are due 50 times, samples 700 times a second.
+    # With the node's profile events are due 50 times a second, samples 700 times.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 
 
-def test_what_is_lost_on_the_way_is_repeated(peer, node_arguments, monkeypatch):
+def test_samples_lost_by_dds_are_repeated(peer, node_arguments, monkeypatch):
     # The receiver is stopped during twice as many samples as its shared memory holds (512).
     monkeypatch.delenv(VARIABLE, raising=False)
     command = [sys.executable, '-c', RECEIVER]
@@ -154,7 +154,7 @@ def test_what_is_lost_on_the_way_is_repeated(peer, node_arguments, monkeypatch):
     assert len(set(best_effort) & set(reliable[-1000:])) < 1000
 
 
-def test_where_the_profile_comes_from(tmp_path, monkeypatch):
+def test_the_users_profile_replaces_that_of_the_node(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # A profile that the user has set stays.
     monkeypatch.setenv(VARIABLE, 'mine.xml')

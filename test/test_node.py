@@ -64,8 +64,7 @@ def diagnosis(peer):
                 values = {value.key: value.value for value in array.status[0].values}
                 if condition(array.status[0], values):
                     collected.append((array, array.status[0], values))
-                    return True
-            return False
+            return bool(collected)
 
         peer.wait_for(look, f'the diagnosis among {[a.status[0].message for a in heard][-3:]}')
         heard.clear()
@@ -74,7 +73,7 @@ def diagnosis(peer):
     return wait
 
 
-def test_imu_input_with_frame_and_switch_of_the_input(peer, saved):
+def test_the_node_takes_imu_input_and_can_switch_to_counts(peer, saved):
     unit = replace(calibration(), unit=IMU_UNIT)
     with node_in_thread(*saved(unit, 'input:=imu', 'frame_id:=body')) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -107,7 +106,7 @@ def test_imu_input_with_frame_and_switch_of_the_input(peer, saved):
         assert heard[1].linear_acceleration.x == pytest.approx(0.5, rel=1e-12)
 
 
-def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
+def test_the_regime_flag_is_latched_and_absent_while_unknown(peer, saved):
     with node_in_thread(*saved(calibration()), *lossless()) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         flags = peer.listen(Bool, 'regime/dynamic')
@@ -152,7 +151,7 @@ def test_flag_is_latched_and_not_there_while_unknown(peer, saved):
         assert stamps[-1] <= START_NS + n * SECOND_NS
 
 
-def test_diagnostics_name_what_is_wrong(peer, saved):
+def test_diagnostics_name_faults_of_samples(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(thermal_calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -189,7 +188,7 @@ def test_diagnostics_name_what_is_wrong(peer, saved):
         wait(lambda s, _: '1 jumps of time backwards' in s.message)
 
 
-def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
+def test_diagnostics_have_noise_density_and_bias_sd(peer, saved):
     wait, unit = diagnosis(peer), rich_calibration()
     with node_in_thread(*saved(unit)) as node:
         driver = drive(peer, node)
@@ -218,7 +217,7 @@ def test_diagnostics_tell_noise_and_bias_apart(peer, saved):
 
 
 @pytest.mark.parametrize('was_fitted_with_case', [False, True])
-def test_a_case_is_missed_only_by_a_calibration_that_knew_one(peer, saved, was_fitted_with_case):
+def test_a_missing_case_is_reported_only_if_it_was_calibrated(peer, saved, was_fitted_with_case):
     seen = DetectorSettings(case=ThermometerSettings(noise_sd_c=0.05))
     unit = thermal_calibration()
     unit = replace(unit, detector=seen) if was_fitted_with_case else unit
@@ -232,7 +231,7 @@ def test_a_case_is_missed_only_by_a_calibration_that_knew_one(peer, saved, was_f
         assert values['case age [s]'] == 'inf'
 
 
-def test_diagnostics_of_temperatures(peer, saved):
+def test_diagnostics_name_faults_of_temperatures(peer, saved):
     wait = diagnosis(peer)
     # The nonlinear terms of this unit were fitted to forces below 1 g.
     unit = replace(thermal_calibration(), nonlinearity=Nonlinearity((1.0, 5.0), 1e-4))
@@ -261,7 +260,7 @@ def test_diagnostics_of_temperatures(peer, saved):
         assert values['stale'] == '1'
 
 
-def test_constants_need_no_thermometer(peer, saved):
+def test_a_node_with_constants_needs_no_thermometer(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -277,7 +276,7 @@ def test_constants_need_no_thermometer(peer, saved):
     assert (values['board age [s]'], values['board temperature sd [K]']) == ('inf', '10.0000')
 
 
-def test_sample_rate_is_held_against_the_calibrated_one(peer, saved):
+def test_the_sample_rate_is_compared_with_the_calibrated_rate(peer, saved):
     wait = diagnosis(peer)
     with node_in_thread(*saved(calibration())) as node:
         driver = drive(peer, node)
@@ -293,7 +292,7 @@ def test_sample_rate_is_held_against_the_calibrated_one(peer, saved):
 
 
 @pytest.mark.parametrize('qos', [DEEP, BEST_EFFORT], ids=['reliable', 'best effort'])
-def test_any_reader_and_any_driver_match(peer, saved, qos):
+def test_subscribers_and_drivers_of_any_reliability_match(peer, saved, qos):
     with node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw', qos)
         driver = drive(peer, node, qos=qos)
@@ -302,7 +301,7 @@ def test_any_reader_and_any_driver_match(peer, saved, qos):
         peer.wait_for(lambda: heard, 'the sample')
 
 
-def test_namespace_and_remapping(peer, saved):
+def test_the_node_follows_namespace_and_remapping(peer, saved):
     args = ['-r', '__ns:=/imu0', '-r', 'accel/counts:=/adc/raw', '-r', 'imu/data_raw:=imu/clean']
     with node_in_thread(*saved(calibration()), *args) as node:
         topics = dict(node.node.get_topic_names_and_types())

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from node_process import NodeProcess
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
@@ -74,7 +74,6 @@ STRANGE = [
 def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
-        samples.go_on()
         kind = SetParametersAtomically if together else SetParameters
         name = f'thermo_comp/{"set_parameters_atomically" if together else "set_parameters"}'
         for message in STRANGE:
@@ -107,7 +106,7 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
         (ListParameters, 'prefixes'),
     ],
 )
-def test_questions_of_any_length_are_answered(peer, unit, kind, field):
+def test_parameter_requests_of_any_length_are_answered(peer, unit, kind, field):
     # WHY: a request with 100 000 names delayed the samples by more than a second.
     name = 'thermo_comp/' + re.sub('(?<!^)(?=[A-Z])', '_', kind.__name__).lower()
     with node_in_thread(*node_arguments(unit)) as node:
@@ -130,15 +129,13 @@ def test_questions_of_any_length_are_answered(peer, unit, kind, field):
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer, unit):
     # WHY: an unexpected exception in a service, a timer or the relay must not end the node.
     with node_in_thread(*node_arguments(unit)) as node:
-        heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
-        samples.go_on()
 
         def fail(*_):
             raise ZeroDivisionError('nobody foresaw this')
 
         node._loop.call_soon(fail)
-        status = status_with(peer, heard, 'callbacks failed')
+        status = status_with(peer, samples.reports, 'callbacks failed')
         assert status.level == DiagnosticStatus.ERROR
         samples.go_on()
         keep, node._requests._apply = node._requests._apply, fail
@@ -166,7 +163,7 @@ NOT_CALIBRATIONS = {
 }
 
 
-def test_nothing_of_a_file_that_is_no_calibration_is_told(peer, unit, tmp_path):
+def test_no_content_of_a_file_that_is_no_calibration_is_quoted(peer, unit, tmp_path):
     other = tmp_path / 'other'
     with node_in_thread(*node_arguments(unit)):
         for content, rule in NOT_CALIBRATIONS.items():
@@ -201,7 +198,7 @@ def test_calibrations_are_taken_from_one_folder_only(peer, unit, tmp_path):
         assert peer.describe('calibration_directory')[0].read_only
 
 
-def test_a_reader_that_ends_is_begun_anew(unit):
+def test_a_calibration_reader_that_ends_is_restarted(unit):
     # WHY: a file may crash or hang the process that reads it, but not the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
@@ -216,7 +213,7 @@ def test_a_reader_that_ends_is_begun_anew(unit):
     reader.close()
 
 
-def test_a_reader_that_hangs_is_given_up(unit):
+def test_a_calibration_reader_that_hangs_is_ended(unit):
     # WHY: a lost network drive blocked every request, and also the end of the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
@@ -232,7 +229,7 @@ def test_a_reader_that_hangs_is_given_up(unit):
         reader.read(str(unit), '')
 
 
-def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch):
+def test_a_calibration_file_that_hangs_at_the_start_is_refused(monkeypatch):
     forever = threading.Event()
     monkeypatch.setattr('thermo_comp.ros.reader.read', lambda *_: forever.wait())
     with pytest.raises(CalibrationError, match=r'^a\.yaml: cannot be read: no answer within 0\.2'):
@@ -240,7 +237,7 @@ def test_at_the_start_a_file_that_hangs_is_given_up(monkeypatch):
     forever.set()
 
 
-def test_while_a_file_hangs_the_other_parameters_go_on(peer, unit):
+def test_while_a_calibration_file_hangs_other_parameters_can_be_set(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
@@ -263,7 +260,7 @@ def test_while_a_file_hangs_the_other_parameters_go_on(peer, unit):
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
-def test_while_a_file_hangs_the_node_ends_and_nothing_stays(peer, unit, number):
+def test_while_a_calibration_file_hangs_the_node_can_be_ended(peer, unit, number):
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
         children = Path(f'/proc/{node.process.pid}/task').glob('*/children')
@@ -296,7 +293,7 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 """
 
 
-def test_a_start_that_hangs_ends_with_one_signal():
+def test_a_node_that_hangs_at_the_start_ends_with_one_signal():
     # WHY: SIGTERM was stored but not handled; a second SIGTERM was needed.
     with subprocess.Popen(
         [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True

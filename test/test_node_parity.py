@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag played over DDS into the node and its offline replay give the same, bit for bit."""
+"""A bag played over DDS into the node and its offline replay give the same bits."""
 
 import csv
 import gc
@@ -115,14 +115,14 @@ def run(calibration, bag, folder, *node_args, **keys):
     return result.counters.n_out
 
 
-def test_counts(tmp_path):
+def test_the_node_equals_the_replay_for_counts(tmp_path):
     n = thermal_test(tmp_path / 'bag')
     unit = replace(rich_calibration(), unit=UNIT)
     # The first board temperature arrives in time, so every sample is corrected.
     assert run(unit, tmp_path / 'bag', tmp_path) == n
 
 
-def test_the_board_says_the_regime_where_there_is_no_case(tmp_path):
+def test_the_board_decides_the_regime_of_a_unit_without_a_case_sensor(tmp_path):
     # WHY: nobody published `regime/dynamic`, and the table of a replay always said `unknown`.
     n = thermal_test(tmp_path / 'bag', has_case=False)
     unit = replace(rich_calibration(), unit=UNIT)
@@ -133,7 +133,7 @@ def test_the_board_says_the_regime_where_there_is_no_case(tmp_path):
     assert regimes == {'unknown', 'static', 'dynamic'}
 
 
-def test_imu_in_another_frame(tmp_path):
+def test_the_node_equals_the_replay_for_imu_messages(tmp_path):
     thermal_test(tmp_path / 'bag.mcap', imu=True)
     unit = replace(rich_calibration(), unit=replace(UNIT, input='m/s^2', full_scale=160.0))
     axes = {axis: replace(getattr(unit.axes, axis), scale_factor=1.0, bias=0.0) for axis in 'xyz'}

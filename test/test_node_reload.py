@@ -72,7 +72,7 @@ class Flow:
         self._peer.wait_for(lambda: stamp_of(self.heard[-1]) == last, 'the last sample')
 
 
-def test_reload_while_samples_flow(peer, tmp_path):
+def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
     first, second, third = (tmp_path / f'{name}.yaml' for name in ('first', 'second', 'third'))
     save_calibration(of_bias(1.0), first)
     save_calibration(of_bias(2.0), second)
@@ -175,7 +175,7 @@ def raising_at(number, call):
     return False
 
 
-def test_whatever_line_fails_a_refused_change_is_not_applied(tmp_path):
+def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
     # WHY: a calibration was refused, and its bias was applied all the same.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)

@@ -38,24 +38,15 @@ from thermo_comp.unit.calibration_file import save_calibration
 def contested(peer, heard, topic, send):
     """Let both publishers send until the node reports two, however slowly."""
     text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
-    collected = []
-
-    def look():
-        send()
-        collected.extend(a.status[0] for a in list(heard) if text in a.status[0].message)
-        return bool(collected)
-
-    peer.poll(look, text)
-    assert collected[0].level == DiagnosticStatus.ERROR
-    return collected[0]
+    status = status_with(peer, heard, text, send)
+    assert status.level == DiagnosticStatus.ERROR
+    return status
 
 
-def test_samples_of_a_second_publisher_never_go_out(peer, unit):
+def test_samples_of_a_second_publisher_are_never_published(peer, unit):
     # WHY: samples of a second driver in another attitude were published as the unit's.
     with node_in_thread(*node_arguments(unit)) as node:
-        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
-        samples.go_on()
         other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
 
@@ -65,7 +56,7 @@ def test_samples_of_a_second_publisher_never_go_out(peer, unit):
             strange.vector.x, strange.vector.y = 2000.0 + samples.n_sent % 3, -2000.0
             other.publish(strange)
 
-        status = contested(peer, diagnostics, '/accel/counts', both)
+        status = contested(peer, samples.reports, '/accel/counts', both)
         values = {value.key: value.value for value in status.values}
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
@@ -122,7 +113,7 @@ def driver_process(name):
         process.stdout.close()
 
 
-def test_a_driver_that_was_killed_blinds_for_less_than_two_seconds(peer, unit):
+def test_after_a_driver_was_killed_output_continues_within_two_seconds(peer, unit):
     # WHY: after a driver was killed the node was silent for 20 s, until the DDS lease ended.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
@@ -159,7 +150,7 @@ def numbered(begin, period_s, until_s, start_s=0.0):
 
 @pytest.mark.parametrize('offset', [-7, -1, 0, 1, 2, 1000])
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
-def test_two_that_send_are_never_mixed(offset, period_s):
+def test_two_publishers_that_send_are_never_mixed(offset, period_s):
     first = [(*message, 'own') for message in numbered(500, 0.01, 12.0)]
     begins = 500 + 200 + offset  # numbers near those of the first driver
     other = [(*message, 'other') for message in numbered(begins, period_s, 8.0, start_s=2.003)]
@@ -174,7 +165,7 @@ def test_two_that_send_are_never_mixed(offset, period_s):
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 
 
-def test_without_numbers_two_publishers_are_two():
+def test_without_sequence_numbers_no_publisher_is_taken_as_ended():
     sources = Sources()
     assert sources.of_one(1, [None] * 3, [0, 1, 2]) == 0
     for k in range(5):
@@ -185,9 +176,7 @@ def test_without_numbers_two_publishers_are_two():
 
 def test_readings_of_a_second_publisher_are_not_used(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
-        diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
-        samples.go_on()
         other = peer.node.create_publisher(Temperature, 'temperature/board', DEEP)
         peer.poll(other.get_subscription_count, 'the second publisher')
 
@@ -196,13 +185,13 @@ def test_readings_of_a_second_publisher_are_not_used(peer, unit):
             other.publish(stamped(reading, START_NS + samples.n_sent * CYCLE_NS))
             samples.send(10)
 
-        contested(peer, diagnostics, '/temperature/board', both)
+        contested(peer, samples.reports, '/temperature/board', both)
         board = node._compensator.thermal.tracker.board
         assert board.temperature == pytest.approx(20.0, abs=1e-6)
         assert board.stamp_ns < START_NS + 20 * CYCLE_NS
 
 
-def test_a_driver_that_cannot_be_heard_is_named(peer, unit):
+def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
     reliable = 'qos_overrides./accel/counts.subscription.reliability:=reliable'
     with node_in_thread(*node_arguments(unit, reliable)):
         heard = peer.listen(DiagnosticArray, '/diagnostics')
@@ -216,7 +205,7 @@ def test_a_driver_that_cannot_be_heard_is_named(peer, unit):
         status_with(peer, heard, text)
 
 
-def test_reports_more_often_than_samples_are_no_silence(peer, tmp_path):
+def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path):
     # WHY: with diagnostics_period below the sample interval each empty report was an ERROR.
     from thermo_comp.unit.calibration import Unit
 
@@ -244,14 +233,12 @@ def test_reports_more_often_than_samples_are_no_silence(peer, tmp_path):
 def test_a_reading_far_ahead_is_forgotten(peer, unit):
     # WHY: a reading one day ahead kept WARN until a sample of that day came.
     with node_in_thread(*node_arguments(unit)) as node:
-        heard = peer.listen(DiagnosticArray, '/diagnostics')
         samples = Samples(peer, node)
-        samples.go_on()
         samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)
         samples.n_sent += 1  # samples alone, without temperature readings
         samples.send(5)
-        status_with(peer, heard, 's ahead of the samples')
+        status_with(peer, samples.reports, 's ahead of the samples')
         samples.go_on()
         peer.wait_for(
-            lambda: heard and 'ahead' not in heard[-1].status[0].message, 'the end of the warning'
+            lambda: 'ahead' not in samples.reports[-1].status[0].message, 'the end of the warning'
         )

@@ -52,7 +52,7 @@ def arguments(*overrides):
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
     ],
 )  # fmt: skip
-def test_bad_start(overrides, text, unit, tmp_path, capfd):
+def test_a_bad_start_ends_with_one_line(overrides, text, unit, tmp_path, capfd):
     (tmp_path / 'text.yaml').write_text('just words')
     nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)
     (tmp_path / 'nan.yaml').write_text(nan)
@@ -66,7 +66,7 @@ def test_bad_start(overrides, text, unit, tmp_path, capfd):
     assert text in line
 
 
-def test_one_topic_for_two_thermometers(unit, capfd):
+def test_one_topic_for_two_thermometers_ends_the_start(unit, capfd):
     remaps = [f'temperature/{name}:=/imu/temperature' for name in ('board', 'case')]
     words = [word for remap in remaps for word in ('-r', remap)]
     assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
@@ -83,7 +83,7 @@ def test_one_topic_for_two_thermometers(unit, capfd):
         ('ROS_LOG_DIR', '/proc/none', "Failed to create log directory '/proc/none'"),
     ],
 )
-def test_an_environment_that_ros_cannot_use(name, value, text, unit, monkeypatch, capfd):
+def test_an_unusable_ros_environment_is_one_line(name, value, text, unit, monkeypatch, capfd):
     monkeypatch.setenv(name, value)
     assert main(arguments(f'calibration_file:={unit}')) == 1
     printed = capfd.readouterr().err.splitlines()[-1]
@@ -91,7 +91,7 @@ def test_an_environment_that_ros_cannot_use(name, value, text, unit, monkeypatch
     assert text in printed
 
 
-def test_closed_streams_are_no_signal(unit):
+def test_a_node_with_closed_streams_runs(unit):
     # WHY: if stderr was closed, the signal pipe got its descriptor, and log text was a signal.
     peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
@@ -104,7 +104,7 @@ def test_closed_streams_are_no_signal(unit):
 
 
 @pytest.mark.parametrize(('sink', 'code'), [('> /dev/full', 1), ('| true', 0)])
-def test_help_that_cannot_be_written(sink, code):
+def test_help_that_cannot_be_written_prints_no_traceback(sink, code):
     words = f'set -o pipefail; "{sys.executable}" -m thermo_comp.ros.node --help {sink}'
     finished = ran('bash', '-c', words)
     assert finished.returncode == code
@@ -115,7 +115,7 @@ def test_help_that_cannot_be_written(sink, code):
 ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
-def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path, monkeypatch):
+def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
     # Python imports sitecustomize first, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
@@ -157,21 +157,21 @@ def test_the_node_runs_where_ros_numpy_and_yaml_are_all_there_is(unit, tmp_path,
     assert (finished.stdout, finished.stderr) == ('', text)
 
 
-def test_usage(capfd):
+def test_help_and_unknown_arguments_of_the_node(capfd):
     assert main(['thermo_comp_node', '--help']) == 0
     assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
     assert main(['thermo_comp_node', 'unit.yaml']) == 2
     assert "unknown argument 'unit.yaml'" in capfd.readouterr().err
 
 
-def test_unreadable_ros_arguments(capfd):
+def test_unreadable_ros_arguments_are_one_line(capfd):
     assert main(['thermo_comp_node', '--ros-args', '--params-file', '/none.yaml']) == 2
     printed = capfd.readouterr().err
     assert 'thermo_comp_node: ' in printed
     assert 'Traceback' not in printed
 
 
-def test_misspelt_parameters_are_said(unit, capfd):
+def test_misspelt_parameters_are_named(unit, capfd):
     overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import calibration, columns_from_events, rich_calibration, stream
-from field_helpers import any_way, rests
+from field_helpers import in_any_attitude, rests
 from test_correction import UNCHECKED, assert_same, run_of
 
 from thermo_comp.errors import CalibrationError
@@ -62,7 +62,7 @@ def test_the_inverse_of_a_cube_is_the_real_root():
         assert linearised(x, 1e-5, 0.0, 1e-6) == pytest.approx(real, abs=1e-11)
 
 
-def test_a_correction_undoes_the_terms_at_their_temperature():
+def test_a_correction_inverts_the_terms_at_their_temperature():
     unit = calibration(nonlinearity=BENT)
     f = np.array([5.0, -3.0, 2.0])
     t = 6.0
@@ -76,7 +76,7 @@ def test_a_correction_undoes_the_terms_at_their_temperature():
     assert np.array(corrected[:3]) / G == pytest.approx(f, abs=1e-11)
 
 
-def test_stream_and_batch_have_the_same_bits(rng):
+def test_nonlinear_corrections_of_stream_and_batch_have_the_same_bits(rng):
     bent = replace(rich_calibration(), posterior=None, nonlinearity=BENT)
     unit = with_covariance(bent, rng)
     # The forces are up to 10 g on an axis, beyond the 6 g of the fit.
@@ -100,7 +100,7 @@ def test_without_terms_every_bit_is_that_of_a_file_without_a_nonlinearity(rng):
     assert 'nonlinearity: null' in dump_calibration(plain)
 
 
-def test_the_variance_is_that_of_all_parameters_together(rng):
+def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
     # The term |f| f is absent, as the correction overstates its variance.
     unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
     unit = with_covariance(unit, rng)
@@ -122,7 +122,7 @@ def test_the_variance_is_that_of_all_parameters_together(rng):
             assert extended == pytest.approx(along @ whole @ along, rel=1e-5)
 
 
-def test_beyond_the_largest_force_an_unknown_square_begins():
+def test_beyond_the_largest_force_the_variance_includes_an_unknown_square():
     unit = calibration(nonlinearity=Nonlinearity((9.0, 60.0), 1e-4))
     compensator = Compensator(unit, UNCHECKED)
     variances = []
@@ -136,7 +136,7 @@ def test_beyond_the_largest_force_an_unknown_square_begins():
         assert variance - variances[0] == pytest.approx(grown, rel=0.01)
 
 
-def test_a_file_keeps_the_terms_and_refuses_those_that_no_axis_has():
+def test_a_file_keeps_nonlinear_terms_and_refuses_impossible_terms():
     unit = calibration(nonlinearity=BENT)
     text = dump_calibration(unit)
     assert parse_calibration(text.encode()) == unit
@@ -153,10 +153,10 @@ def test_a_file_keeps_the_terms_and_refuses_those_that_no_axis_has():
         replace(BENT, terms=(CUBE, SQUARE))
 
 
-def test_rests_in_the_field_feel_every_coefficient():
+def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
     # The expected derivatives are differences of two evaluations.
     unit = with_covariance(calibration(nonlinearity=BENT), np.random.default_rng(1))
-    logged = rests(unit, any_way, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
+    logged = rests(unit, in_any_attitude, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
     values, scale, step = parameters_of(unit), np.full(3, 300.0), 1e-7
     layout, covariance = parameter_layout(unit), unit.posterior.covariance()

@@ -55,7 +55,7 @@ def plain(words):
 @pytest.mark.parametrize(
     ('offset', 'declared'), [(32768.0, False), (32768.0, True), (8192.0, False), (20000.0, False)]
 )
-def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declared):
+def test_constants_of_unsigned_words_equal_those_of_signed_words(words, plain, offset, declared):
     result = fit([source(words + offset)], replace(OPTIONS, offset=offset if declared else None))
     bias, scale = constants(result)
     np.testing.assert_allclose(bias - offset, constants(plain)[0], atol=0.02)
@@ -69,7 +69,7 @@ def test_the_nine_numbers_are_those_of_signed_words(words, plain, offset, declar
     assert not any(finding.name == 'offset' for finding in plain.findings)
 
 
-def test_a_bag_for_each_position_needs_none_of_the_others(rng):
+def test_a_bag_per_position_needs_no_other_bag_for_the_offset(rng):
     # Bags differ in the signs of their axes: only some show that 16-bit words are unsigned.
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
@@ -90,21 +90,21 @@ def test_one_attitude_of_16_bits_has_the_right_scale(rng):
     assert result.calibration.unit.full_scale == 65535.0
 
 
-def test_rails_of_words_without_a_sign_are_saturated(rng):
+def test_unsigned_words_at_their_limits_are_saturated(rng):
     words = words_of([np.array((0.0, 0.0, 1.0))], rng) + 32768.0
     words[500, 0], words[600, 2] = 65535.0, 0.0
     (bag,) = fit([source(words)], OPTIONS).bags
     assert bag.n_saturated == 2
 
 
-def test_a_prior_knows_the_offset(rng, plain):
+def test_the_offset_of_a_prior_is_used(rng, plain):
     known = about(plain.calibration, np.full(3, 32768.0))
     up = np.array((0.6, 0.0, 0.8))
     result = fit([source(words_of([up], rng) + 32768.0)], replace(OPTIONS, prior=known))
     np.testing.assert_allclose(constants(result)[0], 32768.0 + BIAS, atol=2.0)
 
 
-def test_a_centre_is_found_only_where_there_is_one(rng):
+def test_an_offset_is_found_only_if_positions_determine_it(rng):
     ups = positions(12, 5)
     assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()
     np.testing.assert_allclose(rough_centre(100.0 * ups + 338.0), 338.0, atol=1e-6)

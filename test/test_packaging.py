@@ -38,7 +38,7 @@ def setup_literals():
     return literals
 
 
-def test_one_version():
+def test_the_version_is_equal_wherever_it_is_stated():
     assert MANIFEST.findtext('version') == thermo_comp.__version__
     assert re.fullmatch(r'\d+\.\d+\.\d+', thermo_comp.__version__)
     finished = ran(sys.executable, 'setup.py', '--version', check=True)
@@ -79,12 +79,12 @@ def test_every_source_carries_its_licence():
         assert lines[:2] == [f'# {first}', f'# {second}'], path
 
 
-def test_no_source_is_too_long_to_read():
+def test_no_source_file_is_too_long():
     lengths = {path: len(path.read_text().splitlines()) for path in tracked('*.py')}
     assert {path.name: n for path, n in lengths.items() if n > 500} == {}
 
 
-def test_the_manifest_asks_for_the_node_alone():
+def test_the_manifest_lists_dependencies_of_the_node_alone():
     # Other dependencies of the commands come from PyPI; the node needs none of them.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
@@ -96,7 +96,7 @@ def test_the_manifest_asks_for_the_node_alone():
     assert all('>=' in requirement for requirement in install), 'no floor'
 
 
-def test_hosted_ci_does_what_the_readme_says():
+def test_hosted_ci_installs_as_the_readme_describes():
     jobs = yaml.safe_load((ROOT / '.github/workflows/ci.yaml').read_text())['jobs']
     lowest = re.search(r"python_requires='>=([\d.]+)'", (ROOT / 'setup.py').read_text())
     assert jobs['wheels']['strategy']['matrix']['python'][0] == lowest[1]
@@ -107,7 +107,7 @@ def test_hosted_ci_does_what_the_readme_says():
     assert jobs['ros']['container'] == 'ros:jazzy'
 
 
-def test_share_holds_what_ros_looks_for(tmp_path):
+def test_the_installed_share_folder_holds_the_files_of_ros(tmp_path):
     # As by colcon: setup.py's install command into a prefix; only data files are tested.
     words = (*('build', '--build-base', tmp_path / 'build'), 'install_data', '--install-dir')
     environment = {**os.environ, 'PYTHONWARNINGS': 'ignore'}

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One table gives the parameters their types, ranges, checks and documentation."""
 
-from contextlib import contextmanager
 from dataclasses import fields
 
 import pytest
@@ -10,29 +9,16 @@ import yaml
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-import rclpy
 from make_reference import parameters_table
-from rclpy.context import Context
 from rclpy.parameter import Parameter
+from ros_helpers import bare_node, node_in_thread
 
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.ros import parameters
-from thermo_comp.ros.node import CompensationNode
 from thermo_comp.ros.parameters import NodeConfig, ParameterError
 
 
-@contextmanager
-def bare_node(*overrides):
-    args = [word for override in overrides for word in ('-p', override)]
-    context = Context()
-    rclpy.init(args=['--ros-args', *args], context=context)
-    node = rclpy.create_node('thermo_comp', context=context)
-    yield node
-    node.destroy_node()
-    context.try_shutdown()
-
-
-def test_defaults_are_the_compensators():
+def test_defaults_of_parameters_are_those_of_the_compensator():
     with bare_node() as node:
         config = parameters.declare(node)
     assert config == NodeConfig()
@@ -54,7 +40,7 @@ def test_every_parameter_is_described():
     assert parameters.descriptor('input').additional_constraints == 'one of: counts, imu'
 
 
-def test_overrides_arrive_and_whole_numbers_are_numbers():
+def test_overrides_are_applied_and_integers_are_accepted_for_floats():
     # WHY: rclpy refuses `-p transition_time:=5` for a float parameter, with a traceback.
     with bare_node('transition_time:=5', 'serial:=unit42', 'case_timeout:=2.5') as node:
         config = parameters.declare(node)
@@ -94,18 +80,18 @@ def test_a_bad_override_is_refused_with_its_name_rule_and_value(override, text):
         ('serial', 'a\nb', "must be one printable line of at most 64 characters, got 3: 'a"),
     ],
 )
-def test_an_update_is_refused_as_a_whole(name, value, text):
+def test_an_update_of_parameters_is_refused_as_a_whole(name, value, text):
     changes = [Parameter('serial', value='other'), Parameter(name, value=value)]
     with pytest.raises(ParameterError, match=text):
         parameters.updated(NodeConfig(), changes)
 
 
-def test_an_update_passes_over_parameters_of_others():
+def test_an_update_ignores_parameters_of_other_nodes():
     changes = [Parameter('use_sim_time', value=True), Parameter('frame_id', value='imu_link')]
     assert parameters.updated(NodeConfig(), changes) == NodeConfig(frame_id='imu_link')
 
 
-def test_only_whole_numbers_for_float_parameters_are_turned_into_floats():
+def test_only_integers_for_float_parameters_become_floats():
     changes = [
         Parameter('transition_time', value=5),
         Parameter('serial', value=5),
@@ -147,13 +133,9 @@ def test_the_parameter_file_states_the_defaults(root):
     assert stated == expected
     overrides = yaml.safe_load(overrides_text.replace('    # ', ''))['qos_overrides']
     calibration = root / 'config' / 'calibration.example.yaml'
-    context = Context()
-    rclpy.init(args=['--ros-args', '-p', f'calibration_file:={calibration}'], context=context)
-    node = CompensationNode(context)
-    for topic, sides in overrides.items():
-        for side, policies in sides.items():
-            for policy, value in policies.items():
-                name = f'qos_overrides.{topic}.{side}.{policy}'
-                assert node.node.get_parameter(name).value == value, name
-    node.close()
-    context.try_shutdown()
+    with node_in_thread('-p', f'calibration_file:={calibration}') as node:
+        for topic, sides in overrides.items():
+            for side, policies in sides.items():
+                for policy, value in policies.items():
+                    name = f'qos_overrides.{topic}.{side}.{policy}'
+                    assert node.node.get_parameter(name).value == value, name

@@ -41,7 +41,7 @@ def part_of(path, begin=None, end=None, **options):
 
 @pytest.mark.parametrize('n_messages', [8192, 100])
 @pytest.mark.parametrize(('begin', 'end'), [(20.0, 50.0), (20.0, None), (None, 50.0)])
-def test_what_is_inside_is_there_and_nothing_else(bag, begin, end, n_messages, monkeypatch):
+def test_a_part_contains_exactly_the_messages_inside(bag, begin, end, n_messages, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', n_messages)
     blocks, since = part_of(bag, begin, end, raw=True)
     whole = read_recording(bag, require=()).columns
@@ -64,7 +64,7 @@ def test_what_is_inside_is_there_and_nothing_else(bag, begin, end, n_messages, m
         assert all(len(raw.data) == raw.size.sum() for raw in block.raw.values())
 
 
-def test_stamps_say_the_same_as_seconds(bag):
+def test_a_part_by_stamps_equals_a_part_by_seconds(bag):
     start = START_NS * 1e-9
     (by_stamp, since), (by_time, _) = (
         part_of(bag, start + 20.0, start + 50.0),
@@ -75,7 +75,7 @@ def test_stamps_say_the_same_as_seconds(bag):
         np.testing.assert_array_equal(stamped.accel, other.accel)
 
 
-def test_nothing_inside_is_said(bag):
+def test_a_part_without_samples_is_refused(bag):
     with pytest.raises(RecordingError, match=re.escape('no sample is in [500:]')) as refused:
         part_of(bag, 500.0)
     assert str(bag) in str(refused.value)
@@ -91,7 +91,7 @@ def test_nothing_inside_is_said(bag):
         (5.0, 1.7e9, 'or both as stamps'),
     ],
 )
-def test_no_part_is_refused(begin, end, reason):
+def test_bounds_that_are_no_part_are_refused(begin, end, reason):
     with pytest.raises(ValueError, match=reason):
         Part(begin, end)
 
@@ -111,7 +111,7 @@ def test_the_part_before_a_jump_is_fitted(rng, tmp_path):
     assert result.calibration.provenance.sources[0].name == 'bag.mcap[100:299]'
 
 
-def test_a_clock_that_was_set_does_not_count(rng, tmp_path):
+def test_a_jump_of_the_clock_does_not_change_a_part(rng, tmp_path):
     rest = Rest(rng, duration_s=120.0)
     path = bag_of(tmp_path / 'bag.mcap', rest)
     block = read_recording(path, require=()).columns

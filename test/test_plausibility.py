@@ -35,7 +35,7 @@ def tracker_of(sensor='continuous', memory=None, board_lag_s=900.0, **config):
 
 
 def soak(tracker, celsius=20.0, seconds=60, start_s=0):
-    """Feed both sensors once a second with the flicker of working sensors; return the end."""
+    """Feed both sensors once a second with the flicker of working sensors; return the end time."""
     for second in range(start_s, start_s + seconds):
         flicker = 0.004 * (-1) ** second
         tracker.read('board', second * SECOND_NS, celsius + flicker)
@@ -43,7 +43,7 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
     return start_s + seconds
 
 
-def test_what_a_sensor_says_first_may_be_wrong():
+def test_the_first_reading_of_a_sensor_may_be_wrong():
     """After the 85 degC of a DS18B20 without a conversion correct readings are accepted."""
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
@@ -55,7 +55,7 @@ def test_what_a_sensor_says_first_may_be_wrong():
 
 @pytest.mark.parametrize('sensor', SENSORS)
 @pytest.mark.parametrize('frozen', ['board', 'case'])
-def test_a_frozen_sensor_is_found_by_the_movement_of_the_other(sensor, frozen):
+def test_a_frozen_sensor_is_found_by_changes_of_the_second_sensor(sensor, frozen):
     tracker = tracker_of(sensor, board_lag_s=300.0)
     quantum = SENSORS[sensor].quantum_c
     rng = np.random.default_rng(5)
@@ -113,7 +113,7 @@ def test_a_standstill_within_the_quantum_is_no_fault():
     assert tracker.checks['board'].fault == tracker.checks['case'].fault == Fault.NONE
 
 
-def test_readings_that_chance_may_repeat():
+def test_readings_that_may_repeat_by_chance_are_no_fault():
     # With noise of half a quantum a reading repeats with p = 0.68, 54 times with p = 1e-9.
     assert still_readings(ThermometerSettings(0.005, 0.01)) == 54
     assert still_readings(ThermometerSettings(0.005, 0.0)) == STILL_READINGS
@@ -139,7 +139,7 @@ def in_its_chamber(preset, sensor):
         *((preset, 'sixteenths') for preset in ('bare-quartz', 'mems')),
     ],
 )
-def test_a_unit_in_its_chamber_is_never_doubted(preset, sensor):
+def test_a_working_unit_in_its_chamber_is_never_reported(preset, sensor):
     tracker = tracker_of(sensor)
     for stamp_ns, is_case, celsius in in_its_chamber(preset, sensor):
         tracker.read('case' if is_case else 'board', stamp_ns, celsius)
@@ -156,7 +156,7 @@ def test_a_unit_in_its_chamber_is_never_doubted(preset, sensor):
         *(('bare-quartz', sensor) for sensor in list(SENSORS)[:2]),
     ],
 )
-def test_swapped_topics_are_doubted(preset, sensor):
+def test_swapped_topics_are_reported(preset, sensor):
     tracker = tracker_of(sensor)
     for stamp_ns, is_case, celsius in in_its_chamber(preset, sensor):
         tracker.read('board' if is_case else 'case', stamp_ns, celsius)

@@ -126,7 +126,7 @@ def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng
     assert printed.strip() == expected
 
 
-def test_says_who_does_not_listen_and_who_may_lose(peer, tmp_path, rng):
+def test_play_names_topics_without_subscriber_and_best_effort_subscribers(peer, tmp_path, rng):
     bag = bag_of(tmp_path / 'bag', 20, rng)
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
     peer.listen(Temperature, 'temperature/case', best_effort)
@@ -136,7 +136,7 @@ def test_says_who_does_not_listen_and_who_may_lose(peer, tmp_path, rng):
     assert report.n_messages['/accel/counts'] == 20
 
 
-def test_imu_and_the_bags_own_names(peer, tmp_path, rng):
+def test_imu_messages_are_played_under_the_names_of_the_bag(peer, tmp_path, rng):
     stamps = START_NS + np.arange(300) * CYCLE_NS
     rest = ImuColumns(*(rng.standard_normal((300, k)) for k in (4, 9, 3, 9, 9)))
     with BagWriter(tmp_path / 'bag') as writer:
@@ -167,7 +167,7 @@ def test_ros1_bags_are_played_in_cdr(peer, tmp_path):
     assert [message.temperature for message in board_heard] == [20.0 + k for k in range(20)]
 
 
-def test_refusals(tmp_path, rng):
+def test_play_refuses_a_negative_rate_and_an_absent_bag(tmp_path, rng):
     bag = bag_of(tmp_path / 'bag', 20, rng)
     with pytest.raises(ValueError, match='`rate` must be zero or positive, got -1'):
         play(bag, rate=-1.0)

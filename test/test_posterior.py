@@ -44,14 +44,14 @@ def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, toleranc
     assert posterior.matrix.shape == (n, posterior.rank)
 
 
-def test_a_tolerance_makes_it_smaller():
+def test_a_tolerance_makes_the_factor_smaller():
     covariance = random_covariance(1, 30)
     ranks = [posterior_of(covariance, share).rank for share in (0.1, 1e-3, 1e-5)]
     assert ranks == sorted(ranks)
     assert ranks[0] < ranks[-1] <= 30
 
 
-def test_what_is_exactly_known_has_no_variance():
+def test_exactly_known_parameters_have_no_variance():
     covariance = np.zeros((4, 4))
     assert posterior_of(covariance) == Posterior.of(np.empty((4, 0)), np.zeros(4))
     covariance[2, 2] = 9.0
@@ -86,13 +86,13 @@ def test_negative_rest_is_refused():
         Posterior.of(np.ones((1, 1)), np.array([-1.0]))
 
 
-def test_views_are_read_only():
+def test_arrays_of_a_posterior_are_read_only():
     posterior = posterior_of(np.eye(2))
     with pytest.raises(ValueError, match='read-only'):
         posterior.matrix[0, 0] = 1.0
 
 
-def test_layout_by_hand():
+def test_the_order_of_parameters_by_hand():
     spline = CubicSpline((-5.0, 0.0, 5.0, 9.0), (0.1, 0.0, 0.2, 0.3))
     value = calibration(
         static=regime_set(axis_set((0.0, 1.0, 2.0)), axis_set(), axis_set(scale=(1.0, 1e-4))),
@@ -130,7 +130,7 @@ def test_the_whole_bank_of_two_thermometers_fits_into_a_file():
     assert parse_calibration(content) == value
 
 
-def test_what_no_reader_would_read_is_not_written():
+def test_a_file_above_the_size_limit_is_not_written():
     with pytest.raises(CalibrationError, match=rf'takes \d+ bytes, at most {SIZE_LIMIT} are'):
         dump_calibration(whole_bank(('case', 'frame', 'window')))
 
@@ -160,7 +160,7 @@ def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
 
 
-def test_a_side_that_was_never_up_is_named(rng):
+def test_the_attitude_of_a_side_that_was_never_up_is_named(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
     # The attitude may be the grid point beside -z.
@@ -169,7 +169,7 @@ def test_a_side_that_was_never_up_is_named(rng):
     assert said(result) in ' '.join(result.calibration.provenance.notes)
 
 
-def test_spread_positions_leave_nothing_unseen(rng):
+def test_no_undetermined_attitude_is_named_for_spread_positions(rng):
     result = fitted(rng, positions(18, 4))
     assert result.least_known.sd_m_s2 < 2.0 * result.least_known.seen_sd_m_s2
     assert not said(result)

@@ -89,7 +89,7 @@ def test_population_is_the_mean_unit_and_its_scatter():
     assert sd == pytest.approx(expected, rel=1e-3)
 
 
-def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
+def test_a_fit_starts_with_the_widest_prior(monkeypatch):
     # WHY: a fit started with the narrow prior of three units attributed 190 ug of their
     # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: in
     # no direction is another prior wider than the prior of the start.
@@ -113,7 +113,7 @@ def test_a_fit_begins_with_the_widest_of_what_may_be_known(monkeypatch):
         assert np.linalg.eigvalsh(narrower).min() > -1e-6
 
 
-def test_siblings_make_one_position_worth_more():
+def test_siblings_improve_the_fit_of_one_position():
     # One position does not determine the scale over temperature, but the siblings' prior does.
     few = [source(record) for record in test_of(9, 0, 1)]
     options = replace(OPTIONS, serial='unit-9')
@@ -133,7 +133,7 @@ def fitted_curve(number):
     return fitted(number).calibration.static.z.scale_function
 
 
-def test_new_rests_make_an_old_calibration_better():
+def test_new_rests_improve_an_old_calibration():
     old = fitted(9).calibration
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
@@ -145,7 +145,7 @@ def test_new_rests_make_an_old_calibration_better():
     assert np.all(np.abs(bias) < 4.0 * np.hypot(sd_of_levels(new), sd_of_levels(old)))
 
 
-def test_rests_at_one_temperature_mend_what_has_aged_and_forget_nothing():
+def test_rests_at_one_temperature_correct_ageing_and_keep_the_response():
     # An hour at one temperature shows a change of the biases by 200 ug, without a data sheet.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
     old = fitted(9).calibration
@@ -190,7 +190,7 @@ def left_by(calibration, record):
     return float(np.sqrt(np.nanmean(left**2)))
 
 
-def test_population_refuses_what_is_not_alike():
+def test_population_refuses_too_few_equal_or_different_units():
     first, second, third = siblings()
     with pytest.raises(FitError, match='need 3 for a population'):
         population([first, second])
@@ -219,14 +219,14 @@ def test_the_command_names_the_nonlinear_terms_that_a_prior_leaves_out(cli, tmp_
     assert load_calibration(tmp_path / 'type.yaml').nonlinearity is None
 
 
-def test_prior_without_claim_is_refused():
+def test_a_prior_without_covariance_is_refused():
     prior = replace(fitted(1).calibration, posterior=None)
     few = [source(record) for record in test_of(9, 0, 6)]
     with pytest.raises(FitError, match='no covariance'):
         fit(few, replace(OPTIONS, serial='unit-1', prior=prior))
 
 
-def test_another_units_calibration_is_no_prior():
+def test_the_calibration_of_another_unit_is_no_prior():
     # WHY: the nine constants of a sibling have small sd, and were taken for this unit's.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)

@@ -72,7 +72,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place, value):
 
 EXAMPLE = Path(__file__).parents[1] / 'config' / 'calibration.example.yaml'
 TREES = (TREE, yaml.safe_load(dump_calibration(unit())), yaml.safe_load(EXAMPLE.read_text()))
-#: Every number, text and list of numbers of the three calibrations.
+#: Every number, text and list of numbers of the calibrations in TREES.
 EDITS = [(k, place) for k, tree in enumerate(TREES) for place in leaves(tree)]
 magnitudes = st.builds(
     lambda sign, digits, power: sign * digits * 10.0**power,

@@ -14,7 +14,7 @@ from thermo_comp.cli.app import app
 pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
-def test_the_shown_commands_give_the_shown_output(tmp_path, cli, once):
+def test_commands_of_the_page_give_the_output_shown(tmp_path, cli, once):
     # The demo is tested in test_cli_demo.
     commands = shown()
     assert list(commands) == ['demo', 'fit', 'evaluate', 'replay', 'info']
@@ -28,7 +28,7 @@ def test_the_shown_commands_give_the_shown_output(tmp_path, cli, once):
         assert is_alike(got, expected), f'{" ".join(words)}\n{got}'
 
 
-def test_commands_that_are_not_run_here_exist():
+def test_commands_that_no_test_runs_exist():
     known = {c.name or c.callback.__name__ for c in app.registered_commands if c.callback}
     known |= {group.typer_instance.info.name for group in app.registered_groups}
     named = set(re.findall(r'(?:^|^\$ |`)thermo_comp (\w+)', README, re.MULTILINE))
@@ -42,7 +42,7 @@ def test_commands_that_are_not_run_here_exist():
         assert (ROOT / script).is_file(), script
 
 
-def test_links_lead_somewhere():
+def test_links_of_the_readme_lead_somewhere():
     for target in re.findall(r'\]\(([^)#]+)\)', README):
         assert (ROOT / target).exists(), target
 
@@ -62,7 +62,7 @@ def test_the_calibration_s_keys_are_those_of_the_example():
     assert holds(excerpt, example)
 
 
-def test_it_fits_the_page():
+def test_the_readme_is_short_enough():
     lines = README.splitlines()
     assert len(lines) <= 150
     assert [line for line in lines if len(line) > 100 and '|' not in line] == []

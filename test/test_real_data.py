@@ -38,7 +38,7 @@ def means_of(result):
     return np.array([data.mean[data.position == p].mean(axis=0) for p in range(data.n_positions)])
 
 
-def test_handheld_units_leave_what_their_noise_is(unit):
+def test_the_residual_of_handheld_units_is_their_noise(unit):
     assert 21 <= len(unit.positions) <= 23
     # The noise is 0.48 to 0.57 mg in windows of 1 s, and higher in these windows of 0.5 s.
     assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9

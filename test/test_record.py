@@ -143,14 +143,14 @@ class TestGrowing:
         assert collected.pop('accel') == sent.pop('/accel/counts')
         assert {f'/temperature/{name}': own for name, own in collected.items()} == sent
 
-    def test_what_is_no_bag_is_said(self, tmp_path):
+    def test_a_file_that_is_no_bag_is_refused(self, tmp_path):
         with pytest.raises(RecordingError, match='no such file'):
             next(growing_blocks(tmp_path / 'no.mcap', Topics(), lambda _: True))
         (tmp_path / 'text.mcap').write_text('hello, this is no bag')
         with pytest.raises(RecordingError, match=r'text\.mcap'):
             list(growing_blocks(tmp_path / 'text.mcap', Topics(), lambda _: False))
 
-    def test_a_whole_bag_becomes_one_for_each_position(self, session, cli, tmp_path):
+    def test_a_whole_bag_is_split_into_a_bag_per_position(self, session, cli, tmp_path):
         options = ('--positions', f'{N_POSITIONS}', '--soak', '80s', '-o', tmp_path / 'bags')
         finished = cli('record', session, *options, '--json')
         result = json.loads(finished.stdout)
@@ -161,7 +161,7 @@ class TestGrowing:
         assert contents(bags) == contents([session])
         assert f'position {N_POSITIONS}: good' in finished.stderr
 
-    def test_a_folder_is_gone_on_with(self, cli, tmp_path):
+    def test_a_second_run_continues_the_folder(self, cli, tmp_path):
         bags = tmp_path / 'bags'
         for number, part in enumerate((UPS[:2], UPS[2:3]), 1):
             bag = write_session(tmp_path / f'part{number}.mcap', part)
@@ -175,7 +175,7 @@ class TestGrowing:
         other = ('record', bag, '-o', bags, '--serial', 'lab-8')
         assert '01.mcap is of unit lab-7, not lab-8' in cli(*other, code=1).stderr
 
-    def test_usage(self, session, cli, tmp_path):
+    def test_wrong_options_of_record_are_refused(self, session, cli, tmp_path):
         out = ('-o', tmp_path / 'bags')
         printed = cli('record', session, '--soak', '45', *out, code=2).stderr
         assert "--soak: expected a duration like 45min, 1.5h or 30s, got '45'" in printed
@@ -185,7 +185,7 @@ class TestGrowing:
         )
 
 
-def test_what_a_crash_has_left_is_told_and_finished(session, cli, tmp_path):
+def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path):
     # WHY: the hours that a killed run had recorded were left in a hidden file without any message.
     bags = tmp_path / 'bags'
     killed = subprocess.run(
@@ -264,7 +264,7 @@ class TestLive:
             assert len(messages) > 0.95 * len(sent[topic])
         check_fit({**result, 'command': result['command'].replace(str(bags), '.')}, cli, bags)
 
-    def test_imu_messages_under_other_names_until_a_signal(self, play, tmp_path):
+    def test_imu_messages_under_other_names_are_recorded_until_a_signal(self, play, tmp_path):
         n, force = 2000, 9.81 * UPS[0]
         stamps = START_NS + np.arange(n) * 20_000_000
         bag, bags = tmp_path / 'imu.mcap', tmp_path / 'bags'

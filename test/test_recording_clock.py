@@ -57,14 +57,14 @@ def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path, jump_ns):
         assert np.abs(moved - hour[::100]).max() <= STEP_NS
 
 
-def test_without_a_jump_nothing_is_touched(tmp_path):
+def test_a_recording_without_a_jump_is_unchanged(tmp_path):
     stamp_ns = START_NS + np.cumsum(np.tile([STEP_NS, 10**9, LONGEST_PAUSE_NS, -(10**9)], 50))
     blocks = blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
     assert joined(blocks, 'accel').tolist() == stamp_ns.tolist()
     assert joined(blocks, 'board').tolist() == stamp_ns[::10].tolist()
 
 
-def test_what_jumps_all_the_time_is_no_clock(tmp_path):
+def test_a_clock_that_jumps_repeatedly_is_refused(tmp_path):
     stamp_ns = START_NS + YEAR_NS * (np.arange(400) % 2)
     with pytest.raises(RecordingError, match=r'bag\.mcap: .* jumps by more than an hour'):
         blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])

@@ -65,7 +65,7 @@ def every_cut(content, position, length):
 def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
-    # `last`: the end of each message of the last chunk, by hand from the layout of a chunk.
+    # `last`: the end of each message of the last chunk, from the layout of a chunk.
     at = position + 9 + 40
     last = []
     while at < position + length:
@@ -109,7 +109,7 @@ def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data(), compression=st.sampled_from(['none', 'lz4', 'zstd', 'unchunked']))
-def test_cut_anywhere(data, compression):
+def test_a_bag_cut_anywhere_is_read_or_refused(data, compression):
     is_chunked = compression != 'unchunked'
     content, _, _ = small_bag(compression if is_chunked else 'none', is_chunked)
     cut = data.draw(st.integers(0, len(content) - 1))
@@ -139,7 +139,7 @@ def test_zeros_at_the_end_are_no_messages(tmp_path):
                 assert_columns(result.columns, messages[:n])
 
 
-def test_a_torn_directory_says_which_file(tmp_path):
+def test_the_torn_file_of_a_directory_is_named(tmp_path):
     messages = regular_messages(40)
     write_rosbag2(tmp_path / 'bag', messages[:20])
     write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[20:])
@@ -237,7 +237,7 @@ HUGE = 1 << 60
         (struct.pack('<BQ', 0, 3) + bytes(3), 'not whole'),
     ],
 )  # fmt: skip
-def test_claims_are_not_believed(tmp_path, record, reason):
+def test_false_lengths_in_a_file_need_little_memory(tmp_path, record, reason):
     path = tmp_path / 'bag.mcap'
     path.write_bytes(whole_file(record))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -261,7 +261,7 @@ def test_a_damaged_compressed_end_is_left_out(tmp_path):
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 
 
-def test_a_summary_that_is_nonsense(tmp_path):
+def test_a_nonsensical_summary_is_ignored_or_refused(tmp_path):
     content = bytearray(small_bag('none')[0])
     path = tmp_path / 'bag.mcap'
     footer = len(content) - 37
@@ -278,7 +278,7 @@ def test_a_summary_that_is_nonsense(tmp_path):
             read(path)
 
 
-def test_small_records_are_small(tmp_path):
+def test_large_metadata_are_skipped_and_large_schemas_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     large = bytes((1 << 22) + 1)
     path.write_bytes(whole_file(struct.pack('<BQ', Opcode.METADATA, len(large)) + large))

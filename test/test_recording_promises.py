@@ -31,7 +31,7 @@ def whole(folder, storage='mcap', compression=''):
     return folder / 'bag'
 
 
-def test_rows_deleted_from_a_database_are_missed(tmp_path, cli):
+def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
     bag = whole(tmp_path, 'sqlite3')
     with sqlite3.connect(bag / 'bag.db3') as database:
         (topic,) = database.execute('select id from topics where name = ?', (ACCEL,)).fetchone()
@@ -60,7 +60,7 @@ def test_a_conversion_tells_what_the_bag_lacks(tmp_path, cli):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path, storage):
+def test_a_topic_in_the_metadata_alone_is_reported(tmp_path, storage):
     bag = whole(tmp_path, storage)
     path = bag / 'metadata.yaml'
     content = yaml.safe_load(path.read_text())
@@ -73,7 +73,7 @@ def test_a_topic_that_metadata_promise_and_nobody_has(tmp_path, storage):
     assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages listed are there'
 
 
-def test_messages_that_do_not_come_are_missed_at_the_end(tmp_path):
+def test_missing_messages_are_reported_at_the_end(tmp_path):
     write_mcap(tmp_path / 'bag.mcap', regular_messages(40))
     with open_recording(tmp_path / 'bag.mcap') as reader:
         kind = reader.info.topics[ACCEL][0]

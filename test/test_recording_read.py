@@ -130,7 +130,7 @@ def test_every_number_of_an_imu_message_arrives(messages, chunk_size):
     storage=st.sampled_from(['mcap', 'sqlite3']),
     compression=st.sampled_from(['', 'FILE', 'MESSAGE', 'STORAGE']),
 )
-def test_directories_written_by_rosbags(messages, storage, compression):
+def test_directories_written_by_rosbags_are_read(messages, storage, compression):
     compression = '' if storage == 'sqlite3' and compression == 'STORAGE' else compression
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag')
@@ -143,7 +143,7 @@ def test_directories_written_by_rosbags(messages, storage, compression):
 
 @settings(max_examples=10, deadline=None)
 @given(messages=bags(lowest=1))
-def test_ros_1_bags(messages):
+def test_bags_of_ros_1_are_read(messages):
     # Log times differ, because a ROS 1 bag has no order between topics for equal times.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.bag')
@@ -267,7 +267,7 @@ def test_a_folder_of_bags_is_no_bag(tmp_path):
         read(tmp_path)
 
 
-def test_a_bare_database_and_one_without_metadata(tmp_path):
+def test_databases_without_metadata_are_read(tmp_path):
     messages = regular_messages()
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
@@ -304,7 +304,7 @@ def test_further_thermometers_are_found_beside_the_board(tmp_path):
     assert temperatures['lid'].after.tolist() == [2]
 
 
-def test_topics_by_the_names_of_their_inputs(tmp_path):
+def test_topics_can_be_named_by_input(tmp_path):
     path = written(tmp_path / 'bag', 't1', 't2', 't3', 'temperature/lid', counts='raw')
     names = {'counts': '/raw', 'board': 't1', 'temperature/case': 't2', 'temperature/magnet': 't3'}
     found = read_recording(path, Topics.named(names))
@@ -333,7 +333,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # No board topic is chosen if the user names one, among two topics, or from a case topic.
+    # No board topic is taken by type beside a named topic, among two topics, or from a case topic.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):
@@ -354,7 +354,7 @@ def test_two_thermometers_of_other_names_are_offered(tmp_path):
         assert reader.info.chosen is None
 
 
-def test_reading_twice_gives_the_same(tmp_path, monkeypatch):
+def test_two_passes_over_a_recording_are_equal(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 100)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
@@ -365,7 +365,7 @@ def test_reading_twice_gives_the_same(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize('n_messages', [100, 500])
-def test_blocks_have_about_one_size(tmp_path, monkeypatch, n_messages):
+def test_blocks_of_a_recording_have_similar_sizes(tmp_path, monkeypatch, n_messages):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', n_messages)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
@@ -377,7 +377,7 @@ def test_blocks_have_about_one_size(tmp_path, monkeypatch, n_messages):
     assert np.concatenate([block.accel for block in blocks]).tobytes() == whole.tobytes()
 
 
-def test_a_closed_recording_gives_nothing(tmp_path):
+def test_a_closed_recording_refuses_to_read(tmp_path):
     write_mcap(tmp_path / 'bag.mcap', regular_messages())
     write_rosbag1(tmp_path / 'bag.bag', regular_messages())
     for name in ('bag.mcap', 'bag.bag'):

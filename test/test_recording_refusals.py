@@ -65,7 +65,7 @@ def test_messages_of_another_layout_are_named(tmp_path, data, reason):
         read(path)
 
 
-def test_ros_1_messages_in_an_mcap_file(tmp_path):
+def test_ros_1_messages_in_an_mcap_file_are_read(tmp_path):
     path = tmp_path / 'bag.mcap'
     numbers = struct.pack('<3d', 1.5, -2.5, 3.5)
     data = struct.pack('<IIII', 9, 12, 34, 4) + b'link' + numbers
@@ -100,7 +100,7 @@ def refused(path, reason, *given):
         open_recording(path, *given)
 
 
-def test_what_is_no_bag(tmp_path):
+def test_paths_that_are_no_bag_are_refused(tmp_path):
     refused(tmp_path / 'nowhere', 'nowhere: no such file or directory')
     refused(tmp_path / ('x' * 300), 'cannot be opened: File name too long')
     os.mkfifo(tmp_path / 'pipe.mcap')
@@ -137,7 +137,7 @@ def test_what_is_no_bag(tmp_path):
         refused(tmp_path / 'folder', reason)
 
 
-def test_topics_that_are_not_there_or_are_something_else(tmp_path):
+def test_absent_topics_and_topics_of_other_types_are_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     messages = regular_messages(8)
     write_mcap(path, messages)
@@ -158,7 +158,7 @@ def test_topics_that_are_not_there_or_are_something_else(tmp_path):
     assert len(read(path).columns) == 0
 
 
-def test_a_required_topic_without_messages(tmp_path):
+def test_a_required_topic_without_messages_is_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         bag.write_counts('accel/counts', [1, 2], np.zeros((2, 3)))
@@ -254,7 +254,7 @@ def test_the_input_that_the_user_names_is_compensated(tmp_path):
             assert reader.topics['accel'] == taken
 
 
-def test_what_is_corrected_already_is_explained(tmp_path):
+def test_a_topic_corrected_already_is_refused_with_the_reason(tmp_path):
     path = driver_bag(
         tmp_path / 'bag', ('imu/data_raw', 'imu'), metadata={'corrected_by': 'thermo_comp 0.1'}
     )

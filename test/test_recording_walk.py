@@ -78,7 +78,7 @@ def index_of(entries):
 
 @settings(max_examples=120, deadline=None)
 @given(data=records(), cut=st.integers(0, 200), tail=st.binary(max_size=30), drawn=st.data())
-def test_a_walk_equals_the_plain_loop_and_a_false_index_changes_nothing(data, cut, tail, drawn):
+def test_a_scan_equals_the_plain_loop_and_a_false_index_changes_nothing(data, cut, tail, drawn):
     """WHY: offsets into payloads that look like records could give false samples."""
     torn = data[: len(data) - cut] + tail
     wanted, wanted_others, wanted_end = one_by_one(torn)

@@ -130,7 +130,7 @@ def small(path, value=1.0, **options):
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_metadata_comes_back(tmp_path, name):
+def test_metadata_of_a_written_bag_are_read_back(tmp_path, name):
     pairs = {'serial': 'Ünit 7', 'git': 'a: b\n- c'}
     small(tmp_path / name, metadata=pairs)
     assert read_recording(tmp_path / name, require=()).info.metadata == pairs
@@ -171,7 +171,7 @@ def test_the_directory_is_what_rosbag2_writes(tmp_path):
     assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
 
 
-def test_a_bare_file_names_itself(tmp_path):
+def test_metadata_of_a_bare_file_have_its_final_name(tmp_path):
     """WHY: a bag is written under a temporary name, which must not be in its metadata."""
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:
@@ -180,7 +180,7 @@ def test_a_bare_file_names_itself(tmp_path):
     assert content['relative_file_paths'] == [content['files'][0]['path']] == ['bag.mcap']
 
 
-def test_own_definition_of_a_raw_message(tmp_path):
+def test_a_raw_message_needs_a_definition(tmp_path):
     with BagWriter(tmp_path / 'bag.mcap') as bag:
         with pytest.raises(RecordingError, match='/x: the definition of message type a/msg/B is'):
             bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
@@ -244,7 +244,7 @@ def test_an_output_may_be_a_link(tmp_path):
         assert float(columns.accel[0, 0]) == 2.0
 
 
-def test_a_target_that_cannot_be_made(tmp_path):
+def test_an_output_that_cannot_be_created_is_refused(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match=r'cannot be written: .*file is no directory'):
         BagWriter(tmp_path / 'file' / 'bag.mcap')
@@ -257,7 +257,7 @@ def test_a_target_that_cannot_be_made(tmp_path):
             BagWriter(tmp_path / 'locked' / 'bag.mcap')
 
 
-def test_arguments_that_do_not_fit(tmp_path):
+def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
     xyz = [[1, 2, 3]]
     with BagWriter(tmp_path / 'bag') as bag:
         for write, given, reason in (

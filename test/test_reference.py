@@ -17,7 +17,7 @@ def test_generated_pages_are_up_to_date():
     assert not stale, 'run: python docs/make_reference.py'
 
 
-def test_json_schema_says_the_same():
+def test_json_schema_agrees_with_the_dataclasses():
     schema = make_reference.json_schema(Drawing)
     assert schema['required'] == ['name']
     assert schema['additionalProperties'] is False

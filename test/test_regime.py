@@ -83,7 +83,7 @@ def headline():
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
 )
-def test_onset_is_early(headline, sensor, median_s, late_s):
+def test_the_onset_of_a_ramp_is_detected_early(headline, sensor, median_s, late_s):
     switched, n_static = headline[sensor]
     assert n_static == len(switched)
     assert all(len(each) == 1 and each[0][1] == DYNAMIC for each in switched)
@@ -134,7 +134,7 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
-def test_soaks_stay_static(sensor):
+def test_soaks_have_no_false_switches(sensor):
     # At the required 0.05 switches an hour more than 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
@@ -156,7 +156,7 @@ def test_soaks_stay_static(sensor):
     assert n_openings <= 2
 
 
-def test_false_alarms_keep_to_the_setting():
+def test_the_rate_of_false_alarms_is_that_of_the_setting():
     # The signal is noise without ripple, and 20 alarms an hour are permitted. Rice's formula
     # counts crossings, which come in groups and coincide between the filters, so it is an upper
     # bound of separate alarms: 2000 in 100 h. The lower limit checks that the detector is active.
@@ -181,8 +181,7 @@ def test_false_alarms_keep_to_the_setting():
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
     # Expected: filter gain by the Riccati equation, noise and correlation by the impulse response,
-    # alarms by Rice's formula. The detector's closed forms are first order in its pace: within 4
-    # %.
+    # alarms by Rice's formula. The detector's closed forms are first order in its pace: to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -207,7 +206,7 @@ def test_threshold_is_that_of_the_filters_noise(dt):
         assert threshold * covariance[1, 1] == pytest.approx(squared * noise, rel=0.04)
 
 
-def test_unknown_until_the_windows_are_filled():
+def test_the_regime_is_unknown_until_there_are_enough_readings():
     settings = detector_settings(0.001)
     detector = RegimeDetector(settings)
     case, board = Thermometer(settings.case), Thermometer(settings.board)
@@ -238,7 +237,7 @@ def gone(t, readings):
 RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
-def test_dynamic_ends_when_the_lag_has_died():
+def test_the_dynamic_regime_ends_when_the_lag_has_died_away():
     # The board relaxes to 0.05 K/min 50 min after the stop; dwell adds 60 s, noise 10 %.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -248,7 +247,7 @@ def test_dynamic_ends_when_the_lag_has_died():
     assert relaxed_at + 60.0 - 60.0 < changes[2][0] < relaxed_at + 60.0 + 120.0
 
 
-def test_the_relaxed_rate_moves_the_end():
+def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
     rng = np.random.default_rng(8)
     t = np.arange(-1800.0, 9000.0)
     case, board = (read(each, 0.001, 0.0, rng) for each in case_and_board(t, RAMP))
@@ -262,7 +261,7 @@ def test_the_relaxed_rate_moves_the_end():
 
 
 @pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
-def test_it_closes_with_the_case_or_the_board(sensor):
+def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     # The case lags by 3 min, the board by another 15 min. After the ramp the case's rate falls as
     # exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): they reach the relaxed rate, a
     # tenth of the ramp's, after 7 and 38 min. Steps of 62.5 mK hide the last 5 min of the case.
@@ -361,7 +360,7 @@ def test_a_board_that_died_does_not_hold_the_dynamic_state():
 
 
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
-def test_cooling_is_heating_upside_down(quantum):
+def test_cooling_mirrors_heating(quantum):
     rng = np.random.default_rng(8)
     t = np.arange(-1800.0, 7500.0)
     settings = detector_settings(0.001, quantum)

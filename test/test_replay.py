@@ -113,7 +113,7 @@ def output_of(path):
     return read_recording(path, topics, require=('accel',)).columns, flags
 
 
-def test_equals_the_stream_bit_for_bit(tmp_path):
+def test_replay_equals_the_stream_bit_for_bit(tmp_path):
     bag = thermal_test(tmp_path / 'bag', rate_hz=3.0)
     calibration = rich_calibration()
     result = replay(bag, calibration, tmp_path / 'out')
@@ -137,7 +137,7 @@ def test_equals_the_stream_bit_for_bit(tmp_path):
     assert result.counters.n_out == len(block)
 
 
-def test_constants_need_no_thermometer(tmp_path):
+def test_replay_of_constants_needs_no_thermometer(tmp_path):
     bag = tmp_path / 'bag'
     rng = np.random.default_rng(3)
     n = 3000
@@ -297,7 +297,7 @@ def test_topics_that_cannot_be_copied_leave_nothing_behind(tmp_path):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_every_topic_is_copied(tmp_path, storage):
+def test_all_topics_copies_every_topic(tmp_path, storage):
     inputs = thermal_test(tmp_path / 'inputs', minutes=2.0)
     mcap = tmp_path / 'bag'
     stamps = START_NS + np.arange(-3, 150) * 10**9

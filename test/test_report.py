@@ -88,7 +88,7 @@ def page():
     return Page(certificate())
 
 
-def test_certificate_of_a_fit_says_what_an_engineer_asks(page):
+def test_certificate_of_a_fit_states_the_expected_facts(page):
     assert not page.open  # the page closes every tag
     for fact in (
         'Unit thermostatted-0001',
@@ -133,7 +133,7 @@ def test_page_has_each_id_once_and_refers_to_ids_it_has(page):
     assert set(re.findall(r'(?:url\(|href=")#([^)"]*)', page.source)) <= set(ids)
 
 
-def test_bag_says_whether_its_fit_has_seen_it(opened):
+def test_the_page_states_whether_a_bag_is_of_the_fit(opened):
     calibration = fitted().calibration
     assert 'positions in bags of the fit' in Page(certificate()).text
     unseen = evidence_of_bags(opened, calibration)
@@ -144,7 +144,7 @@ def test_bag_says_whether_its_fit_has_seen_it(opened):
     assert '1 position in bags of the fit' in words_of(seen).text
 
 
-def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
+def test_a_page_of_a_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
     seen = evidence_of_bags(opened)
     shown = seen.shown
     truth = run(0).truth
@@ -167,7 +167,7 @@ def test_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
     assert all(figure.question in page.text for figure in figures_of(seen))
 
 
-def test_nothing_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
+def test_no_text_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
     # A browser shows names, serials, notes and hashes of a certificate as text, not as HTML.
     evil = '<script>alert("x")</script>'
     bag = write_bag(
@@ -240,7 +240,7 @@ def test_calibration_alone_makes_a_page_and_its_figures_as_png(tmp_path):
     assert all(path.read_bytes().startswith(b'\x89PNG') for path in files)
 
 
-def test_page_is_written_atomically(tmp_path):
+def test_the_page_is_written_atomically(tmp_path):
     target = tmp_path / 'page.html'
     target.write_text('<!doctype html>old')
     folder = tmp_path / 'figures'
@@ -252,7 +252,7 @@ def test_page_is_written_atomically(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']
 
 
-def test_verdict_and_its_colour(opened):
+def test_the_verdict_has_a_colour(opened):
     assert evidence().level in ('good', 'reserved')
     calibration = fitted().calibration
     narrow = {

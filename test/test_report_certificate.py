@@ -70,7 +70,7 @@ def test_rounding_moves_neither_by_more_than_half_a_digit(value, expanded):
     assert abs(float(text.replace('−', '-')) - value) <= 0.0501 * expanded + 1e-9 * abs(value)
 
 
-def test_what_a_laboratory_states_is_printed_and_the_rest_is_blank(tmp_path):
+def test_statements_of_a_laboratory_are_printed_and_other_fields_blank(tmp_path):
     info = load_certificate_info(lab(tmp_path), 'thermostatted-0001')
     page = render_report(evidence(), figures=[], info=info)
     for text in (
@@ -192,7 +192,7 @@ def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
     assert {one.name: one.standard for one in budget(stated, info)}['gravity'] == 0.0
 
 
-def test_table_over_temperature(tmp_path):
+def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
     info = load_certificate_info(lab(tmp_path))
     tables = over_temperature(evidence(), info)
     assert [table.axis for table in tables] == ['x', 'y', 'z']
@@ -228,7 +228,7 @@ def test_temperatures_of_the_table_are_round(ends, expected):
     assert table_temperatures(*ends).tolist() == expected
 
 
-def test_gravity_in_doubt_is_the_scale_factors_doubt(tmp_path):
+def test_the_uncertainty_of_gravity_is_that_of_the_scale_factors(tmp_path):
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
@@ -254,7 +254,7 @@ def test_conformity_is_stated_to_a_limit_alone():
 
 
 @pytest.mark.usefixtures('no_figures')
-def test_command_takes_the_statements(cli, tmp_path):
+def test_fit_and_report_take_the_statements_of_a_laboratory(cli, tmp_path):
     save_calibration(fitted().calibration, tmp_path / 'unit.yaml')
     given = ('-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'page.html', '--certificate-info')
     cli('report', *given, lab(tmp_path))

@@ -100,19 +100,17 @@ def test_windows_are_means_of_ten_seconds_at_rest():
 
 
 @pytest.mark.parametrize('fault', ['moves', 'shakes', 'stuck', 'tilts', 'saturated', 'gap'])
-def test_what_is_no_rest_is_not_kept(fault):
+def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
     samples = standing(12 * RATE_HZ)
     stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
     if fault == 'moves':
         samples[300:] += 30.0  # step of 0.1 m/s^2
-
     elif fault == 'shakes':
         samples += 60.0 * np.sin(np.arange(len(samples)))[:, None]
     elif fault == 'stuck':
         samples[:] = samples[0]
     elif fault == 'tilts':
         samples[:, 0] += np.linspace(0.0, 100.0, len(samples))  # tilt by 3 mrad/s
-
     elif fault == 'saturated':
         samples[:, 0] = 32767.0
     else:
@@ -120,7 +118,7 @@ def test_what_is_no_rest_is_not_kept(fault):
     assert finder().add(stamps, samples) == []
 
 
-def test_a_rest_that_lasts_a_day_is_kept_ever_more_rarely():
+def test_windows_of_a_rest_of_a_day_are_kept_ever_more_rarely():
     # Of a rest are kept: 60 windows in 10 min, one a minute up to 1 h, then one in 5 min.
     kept, one = 0, finder()
     samples = standing(6 * 60)
@@ -197,7 +195,7 @@ def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
 
 
-def test_a_full_disk_loses_nothing_silently(small_disk):
+def test_rests_lost_on_a_full_disk_are_counted(small_disk):
     log = RestLog(str(small_disk))
     for k in range(100):
         log.put(rest(k).stamp_ns, encode(START), encode(rest(k)))
@@ -208,7 +206,7 @@ def test_a_full_disk_loses_nothing_silently(small_disk):
     assert log.reason == 'No space left on device'
 
 
-def test_the_node_gathers_rests_and_a_kill_tears_at_most_one(tmp_path, unit, peer):
+def test_the_node_logs_rests_and_a_kill_tears_at_most_one_line(tmp_path, unit, peer):
     folder = tmp_path / 'rests'
     samples = standing(200 * RATE_HZ)
     words = node_arguments(unit, f'rest_log:={folder}')

@@ -99,7 +99,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
     np.testing.assert_array_equal(many.run, one.run)  # NaN, before the first sample, equals NaN
 
 
-def test_a_user_may_believe_any_sample():
+def test_a_user_may_switch_checks_of_samples_off():
     compensator = Compensator(
         calibration(), CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     )
@@ -141,7 +141,7 @@ def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
 
 
-def test_every_reason_is_counted_once():
+def test_the_total_counts_every_reason_once():
     counters = Counters(**{name: 2**k for k, name in enumerate(DROPPED)})
     assert counters.n_in == 2 ** len(DROPPED) - 1
 
@@ -178,7 +178,7 @@ def stretches(draw):
 
 @given(stretches(), st.sampled_from([7, 64, 500]), st.sampled_from([0.0, 0.05, 1.0]))
 @settings(max_examples=60, deadline=None)
-def test_the_batch_refuses_what_the_stream_refuses(events, chunk, stuck_s):
+def test_the_batch_drops_the_samples_that_the_stream_drops(events, chunk, stuck_s):
     config = CompensatorConfig(stuck_timeout_s=stuck_s, gravity_tolerance_m_s2=0.1)
     unit = calibration(axes=Axes(*[AxisReference(K, 60.0)] * 3))
     streamed, whole, cut = (Compensator(unit, config) for _ in range(3))

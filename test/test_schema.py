@@ -58,7 +58,7 @@ drawings = st.builds(
 
 
 @given(drawings)
-def test_plain_values_build_the_same_again(drawing):
+def test_a_dataclass_is_unchanged_by_a_round_trip_of_plain_values(drawing):
     assert build(Drawing, plain(drawing)) == drawing
 
 
@@ -98,7 +98,7 @@ def test_nothing_is_converted_but_integers_to_floats():
         ({'name': 'ab', 'frame': {'radius': '1'}}, 'frame.radius', "valid number, got '1'"),
     ],
 )
-def test_what_does_not_fit_is_refused(data, key, message):
+def test_values_of_wrong_type_are_refused_by_key(data, key, message):
     with pytest.raises(SchemaError, match=message) as caught:
         build(Drawing, data)
     assert caught.value.key == key

@@ -83,8 +83,8 @@ def test_plans_are_what_their_names_say():
         plan('oven')
 
 
-def test_a_joint_that_slips_goes_round_a_loop():
-    """Hysteresis is independent of the rate: the way back differs from the way there."""
+def test_a_slipping_joint_has_a_closed_hysteresis_loop():
+    """Hysteresis is independent of the rate: a bias differs between warming and cooling."""
     there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
     for is_gradual in (False, True):
         effect = SlipEffect('a', 1.0, is_gradual, bias=(2.0, 0.0, 0.0))
@@ -99,7 +99,7 @@ def test_a_joint_that_slips_goes_round_a_loop():
         assert twice[-1, 0] == pytest.approx(quick[-1, 0], rel=0.02)
 
 
-def test_a_flow_is_even_and_zero_at_rest():
+def test_the_effect_of_heat_flow_is_even_and_zero_at_rest():
     up = np.stack([np.linspace(0, 3, 50), np.zeros(50)], axis=1)
     effect = FlowEffect('a', 'b', 1.25, bias=(1.0, 0.0, 0.0))
     warm, cold = (effect.change(_history(sign * up))[0] for sign in (1.0, -1.0))
@@ -108,7 +108,7 @@ def test_a_flow_is_even_and_zero_at_rest():
     assert warm[0, 0] == 0.0
 
 
-def test_a_limited_flow_is_a_matter_of_on_and_off():
+def test_a_saturated_effect_of_heat_flow_is_on_or_off():
     up = np.stack([np.array([0.0, 0.5, 50.0]), np.full(3, 2.0)], axis=1)
     up[:, 0] += 2.0
     effect = FlowEffect('a', 'b', 2.0, 0.5, True, 1, bias=(1.0, 0.0, 0.0))
@@ -209,7 +209,7 @@ def test_mems_bias_moves_by_hundreds_of_micro_g(seed):
     assert np.all((slope > 90.0) & (slope < 550.0))
 
 
-def test_specimens_differ_and_return():
+def test_specimens_differ_by_seed_and_are_reproducible():
     for name in NAMES:
         assert unit_of(name, 1) == unit_of(name, 1)
         assert unit_of(name, 1) != unit_of(name, 2)

@@ -73,7 +73,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
     )
 
 
-def test_an_error_source_more_leaves_the_others_numbers(unit):
+def test_a_further_error_source_changes_no_other_numbers(unit):
     """Thermometer noise changes nothing else; a drifting bias is added to the same noise."""
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)
@@ -146,7 +146,7 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
 @pytest.mark.parametrize(
     ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
 )
-def test_positions_tell_the_nine_terms_apart(n, least):
+def test_positions_determine_the_nine_terms(n, least):
     """Nine or more positions determine all terms of a quadric: bias, scale, misalignment."""
     up = positions(n, 5)
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)
@@ -158,7 +158,7 @@ def test_positions_tell_the_nine_terms_apart(n, least):
     assert np.abs(up.sum(axis=0)).max() < 0.1 * n
 
 
-def test_run_refuses_what_cannot_be(unit):
+def test_a_run_refuses_impossible_arguments(unit):
     with pytest.raises(ValueError, match='`rate_hz` must be positive, got 0'):
         simulate(unit, SHORT, UP, rate_hz=0.0)
     with pytest.raises(ValueError, match='`temperature_rate_hz` must be positive, got 0'):

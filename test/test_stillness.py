@@ -62,7 +62,7 @@ def test_a_smooth_flight_is_told_by_its_gyroscope(rng):
         reduce_bag(source(accel, gyro), OPTIONS)
 
 
-def test_of_a_log_only_the_ground_is_a_rest(rng):
+def test_only_the_time_on_the_ground_of_a_flight_is_a_rest(rng):
     parts = [ground(rng, 12.0), hover(rng, 240.0, 15.0 * MG), ground(rng, 12.0)]
     accel, gyro = (np.concatenate(each) for each in zip(*parts, strict=True))
     bag = reduce_bag(source(accel, gyro), OPTIONS)
@@ -72,7 +72,7 @@ def test_of_a_log_only_the_ground_is_a_rest(rng):
     assert ends[1][0] > 252.0
 
 
-def test_what_the_user_says_of_the_noise_decides(rng):
+def test_the_user_s_noise_decides_what_is_a_rest(rng):
     accel, _ = hover(rng, 120.0, vibration=15.0 * MG)
     quiet, _ = ground(rng, 30.0)
     options = FitOptions(gravity=GRAVITY, input='m/s^2', still_sd=10.0 * MG)
@@ -130,7 +130,7 @@ def test_motion_does_not_pass_for_a_rest_in_the_scan(rng):
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
-def test_the_shortest_rest_is_yours_to_say(rng):
+def test_the_user_sets_the_shortest_rest(rng):
     accel = by_hand(rng, 10, 3.5, ())
     bag = reduce_bag(source(accel), FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=2.0))
     assert len(bag.intervals) == 10
@@ -141,8 +141,7 @@ def test_the_shortest_rest_is_yours_to_say(rng):
 
 
 def test_a_ramp_moves_no_unit_at_rest(rng):
-    # A drift of 60 ug per cell, 60 times the noise, is one position; a knock of 0.1 mrad makes
-    # two.
+    # A drift of 60 ug per cell, 60 times the noise, is no motion; a knock of 0.1 mrad is a motion.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG

@@ -64,7 +64,7 @@ def test_the_integration_is_exact_on_the_way():
     assert behind == pytest.approx(3.0 * (1.0 - np.exp(-at / 300.0)), abs=1e-12)
 
 
-def test_still_air_is_another_law_of_the_hidden_node():
+def test_still_air_changes_the_temperature_of_the_hidden_node():
     # In still air the hidden node has another temperature than chamber data predict.
     shares = []
     for environment in (units.CHAMBER, units.STILL_AIR):
@@ -112,7 +112,7 @@ def test_cold_start_is_as_cold_as_the_air_and_then_warms_up():
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
-def test_a_carry_on_loses_no_part_of_a_count():
+def test_a_carried_remainder_loses_no_part_of_a_count():
     words = np.full((1000, 3), 0.3)
     kept, lost = (units.quantised(words, carries) for carries in (True, False))
     assert np.abs(np.cumsum(kept, axis=0) - np.cumsum(words, axis=0)).max() <= 0.5
@@ -217,7 +217,7 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
     assert constants.vector > 50.0
 
 
-def test_constants_by_hand_keep_the_scale_of_few_attitudes():
+def test_constants_by_hand_bound_the_scale_of_few_attitudes():
     # Without a bound on the scale, a fit to one noisy attitude makes all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
@@ -301,7 +301,7 @@ def test_minutes_that_are_not_published_may_be_few():
         assert scores.ratio == pytest.approx(expected)
 
 
-def test_a_row_says_what_it_misses_and_nothing_else():
+def test_a_row_names_exactly_the_limits_it_misses():
     baselines = {'cubic': Score(50.0, 100.0), 'constants': Score(40.0, 200.0)}
 
     def missed(fit, title='ageing'):
@@ -316,7 +316,7 @@ def test_a_row_says_what_it_misses_and_nothing_else():
     assert missed(Score(13.0, 90.0, 1.0, 1.0, 90.0), 'kink') == ['norm 13 > 12']
 
 
-def test_more_data_is_held_against_the_row_without_it():
+def test_a_row_with_more_data_is_compared_with_the_row_without():
     alone, joint = Score(20.0, 40.0, 1.0, 1.0, 40.0), Score(9.0, 30.0, 1.0, 1.0, 40.0)
     rows = rows_of([Result('third-node alone: its attitude', 1, {'fit': alone}),
                     Result('third-node joint: its attitude', 1, {'fit': joint})])  # fmt: skip

@@ -37,7 +37,7 @@ def up_and_down(low, high):
     return np.interp(seconds, [0, 600, 1800, 2400, 3600], [low, low, high, high, low])
 
 
-def test_a_good_recording(tmp_path):
+def test_a_good_recording_has_no_findings(tmp_path):
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0))
     assert result.findings == []
     assert result.n == 18000
@@ -67,7 +67,7 @@ def test_a_good_recording(tmp_path):
          ['1 gaps, the longest 30.2 s', '1 stamps do not rise: those samples are left out']),
     ],
 )  # fmt: skip
-def test_what_a_fit_would_miss_is_named(tmp_path, temperature, options, text):
+def test_faults_of_a_recording_are_named(tmp_path, temperature, options, text):
     findings = survey(tmp_path / 'bag', temperature, **options).findings
     assert [one for one in text if not any(one in found for found in findings)] == []
 
@@ -79,13 +79,13 @@ def test_what_a_fit_would_miss_is_named(tmp_path, temperature, options, text):
         (7200.0, 'than an hour (1 times): a fit takes it'),
     ],
 )
-def test_a_clock_that_is_set_back(tmp_path, back_s, text):
+def test_samples_after_a_clock_was_set_back_are_counted(tmp_path, back_s, text):
     # WHY: if a clock was set back by 10 min, a fit left out 10 min; the survey named one stamp.
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=-back_s)
     assert any(text in finding for finding in result.findings)
 
 
-def test_one_direction_only(tmp_path):
+def test_a_missing_cooling_ramp_is_reported(tmp_path):
     heating = np.interp(np.arange(3600.0), [0, 600, 3000, 3600], [5.0, 5.0, 35.0, 35.0])
     findings = survey(tmp_path / 'bag', heating).findings
     assert findings == ['no cooling ramp: the dynamic set would be extrapolated to cooling']
@@ -100,7 +100,7 @@ def test_a_quantum_is_no_ramp(tmp_path):
     assert board.steepest_heating_k_min < 0.1
 
 
-def test_no_samples(tmp_path):
+def test_a_recording_without_samples_is_surveyed(tmp_path):
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_temperature(TOPICS.board, [START_NS], [20.0])
     result = survey_recording(tmp_path / 'bag')

@@ -59,7 +59,7 @@ def test_an_error_is_one_harmless_line():
 
 
 @pytest.mark.parametrize('serial', BAD_SERIALS)
-def test_what_is_no_serial(serial):
+def test_impossible_serials_are_refused(serial):
     for take in (valid_serial, lambda text: Unit(text, 'counts', 1.0, 0.01)):
         with pytest.raises(ValueError, match='`serial` must be one printable line of 1 to 64'):
             take(serial)
@@ -70,7 +70,7 @@ def test_what_is_no_serial(serial):
 
 
 @pytest.mark.parametrize('serial', ['42', 'Блок 7', 'x' * LONGEST_SERIAL])
-def test_what_is_a_serial(serial):
+def test_possible_serials_are_accepted(serial):
     assert valid_serial(serial) == serial
 
 
@@ -84,7 +84,7 @@ def test_what_is_a_serial(serial):
     ],
     ids=lambda command: command[0],
 )
-def test_a_command_line_with_another_serial(command, capsys):
+def test_an_impossible_serial_as_an_option_is_refused(command, capsys):
     assert run([*command, '--serial', FORGED]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('thermo_comp: error: ')
@@ -125,7 +125,7 @@ def test_a_recording_forges_no_line(forged, tmp_path, capfd):
 
 
 @pytest.mark.parametrize('encoding', ['latin-1', 'ascii', 'utf-8'])
-def test_any_terminal_can_show_it(tmp_path, cli, monkeypatch, encoding):
+def test_any_terminal_can_show_names_and_serials(tmp_path, cli, monkeypatch, encoding):
     calibration = rich_calibration()
     unit = replace(calibration.unit, serial='Блок')
     save_calibration(replace(calibration, unit=unit), tmp_path / 'unit.yaml')
@@ -140,13 +140,13 @@ def test_any_terminal_can_show_it(tmp_path, cli, monkeypatch, encoding):
         content = terminal.read()
         assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in content
         assert r'not \udcff utf-8.yaml' in content
-    if encoding == 'latin-1':  # the name as the user wrote it
+    if encoding == 'latin-1':  # the file's name as the user wrote it
         assert r'\u0411' in cli('info', name, PYTHONIOENCODING=encoding).stdout
     absent = cli('info', tmp_path / os.fsdecode(b'no\xff.mcap'), code=1)
     assert r'no\udcff.mcap: ' in absent.stderr
 
 
-def test_what_nobody_has_foreseen(tmp_path, monkeypatch, capsys):
+def test_an_unexpected_exception_is_one_line_and_a_log(tmp_path, monkeypatch, capsys):
     def fail(*_):
         raise RuntimeError('boom\nand more')
 

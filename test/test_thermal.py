@@ -52,7 +52,7 @@ def test_memory_start_is_unknown_and_settles():
     assert tracker.is_settled(round((settled_s + 10.0) * 1e9))
 
 
-def test_state_does_not_depend_on_when_it_is_asked_for():
+def test_the_thermal_state_does_not_depend_on_earlier_queries():
     one = ThermalTracker(DetectorSettings(), LAG)
     other = ThermalTracker(DetectorSettings(), LAG)
     t = np.arange(0, 3000)
@@ -67,7 +67,7 @@ def test_state_does_not_depend_on_when_it_is_asked_for():
     assert one.sample(at) == other.sample(at)
 
 
-def test_results_do_not_depend_on_the_origin_of_time():
+def test_the_thermal_state_does_not_depend_on_the_origin_of_time():
     epoch_ns = 1_790_000_000 * SECOND_NS
     one = ThermalTracker(DetectorSettings(), LAG)
     other = ThermalTracker(DetectorSettings(), LAG)
@@ -107,7 +107,7 @@ def test_no_transition_time_is_the_hard_switch_of_the_paper():
     assert set(ramp(tracker).tolist()) == {0.0, 1.0}
 
 
-def test_lost_case_is_replaced_by_the_boards_rate():
+def test_the_rate_of_a_lost_case_is_replaced_by_the_board_s():
     tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(case_timeout_s=10.0), 600.0)
     t = np.arange(0, 1000)
     board = 20.0 + 0.01 * t

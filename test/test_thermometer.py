@@ -77,11 +77,10 @@ PARTS = {
 
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
-def test_variances_are_honest(errors, sensor, part):
-    # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claim
-    # includes changes that might have begun, and is up to a few times too large; at the onset and
-    # the end the change is real and not yet detected. The mean of the few independent errors of a
-    # coarse sensor scatters by a factor of 2.
+def test_claimed_variances_match_squared_errors(errors, sensor, part):
+    # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claimed
+    # variance allows for changes that have not begun, and is a few times too large; at an onset or
+    # an end a change begins. The few errors of a coarse sensor scatter by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -100,7 +99,7 @@ def test_variances_are_honest(errors, sensor, part):
         ('10 mK, 1 K steps', 0.1, 0.06),
     ],
 )  # fmt: skip
-def test_errors_in_a_ramp(errors, sensor, temperature_k, rate_k_min):
+def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min):
     # Limits: 1.5 times the errors found (averaged noise); steps of 1 K give the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
@@ -120,7 +119,7 @@ def test_a_crossed_edge_locates_the_temperature():
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
-def test_an_unchanged_coarse_reading_is_not_an_ever_better_one():
+def test_equal_coarse_readings_keep_the_sd_of_their_quantum():
     # A thousand equal readings leave the sd of a uniform distribution, 1 / sqrt(12) quantum.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
@@ -202,7 +201,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
     ('stamp_s', 'reading'),
     [(700, math.nan), (700, math.inf), (700, -math.inf), (599, 20.0), (300, 20.0), (-5, 20.0)],
 )
-def test_what_is_no_number_or_not_newer_changes_nothing(stamp_s, reading):
+def test_readings_not_finite_or_not_newer_change_nothing(stamp_s, reading):
     thermometer = settled()
     before = state(thermometer)
     assert not thermometer.update(stamp_s * SECOND_NS, reading)
@@ -217,7 +216,7 @@ def test_a_small_jump_counts_less_than_a_reading():
     assert abs(thermometer.temperature - 20.0) < 0.004
 
 
-def test_a_step_that_stays_is_believed_after_four_readings():
+def test_a_lasting_step_is_accepted_after_four_readings():
     thermometer = settled()
     used = [thermometer.update((600 + k) * SECOND_NS, 60.0) for k in range(6)]
     assert used == [False, False, False, True, True, True]
@@ -256,7 +255,7 @@ def test_noise_declared_too_small_is_learnt():
     assert np.mean((out[1000:, 0] - 20.0) ** 2 / out[1000:, 2]) < 2.0
 
 
-def test_a_frozen_sensor_shows_by_its_last_change():
+def test_a_frozen_sensor_is_known_by_the_time_of_its_last_change():
     thermometer = settled()
     for k in range(600, 700):
         thermometer.update(k * SECOND_NS, 20.0)

@@ -9,13 +9,11 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-import rclpy
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_helpers import DEEP, TIMEOUT
+from ros_helpers import DEEP, TIMEOUT, bare_node
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
@@ -27,12 +25,8 @@ BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 @pytest.fixture
 def node():
-    context = Context()
-    rclpy.init(args=['--ros-args', '-p', 'mispelt:=1', '-p', 'known:=2'], context=context)
-    node = rclpy.create_node('looped', context=context)
-    yield node
-    node.destroy_node()
-    context.try_shutdown()
+    with bare_node('mispelt:=1', 'known:=2') as node:
+        yield node
 
 
 class Running:
@@ -65,7 +59,7 @@ class Running:
         assert not self.thread.is_alive()
 
 
-def test_rclpy_still_has_what_is_used_beyond_its_documented_api():
+def test_rclpy_still_has_its_undocumented_attributes_in_use():
     methods = {
         'WaitSet': (
             *('clear_entities', 'add_subscription', 'add_guard_condition', 'add_service'),
@@ -82,7 +76,7 @@ def test_rclpy_still_has_what_is_used_beyond_its_documented_api():
     assert issubclass(RCLError, Exception)
 
 
-def test_what_the_user_set_is_known_by_name(node):
+def test_parameters_set_by_the_user_are_known_by_name(node):
     node.declare_parameter('known', 1)
     assert overrides(node) == {'mispelt': 1, 'known': 2}
 
@@ -102,7 +96,7 @@ def test_messages_come_serialized_in_order_with_their_time(node, peer):
     assert running.received_ns[0] > 0
 
 
-def test_what_a_full_queue_loses_is_counted(node, peer):
+def test_messages_lost_by_a_full_queue_are_counted(node, peer):
     loop = WaitLoop(node)
     raw = loop.subscribe(Vector3Stamped, 'samples', QoSProfile(depth=10))
     publisher = peer.publisher(Vector3Stamped, 'samples')
@@ -122,7 +116,7 @@ def test_what_a_full_queue_loses_is_counted(node, peer):
     assert raw.n_lost == 51 - len(taken)
 
 
-def test_the_rest_of_the_node_is_served_while_samples_flow(node, peer):
+def test_services_and_timers_are_served_while_samples_flow(node, peer):
     ticks = []
     heard = []
     running = Running(node)
@@ -154,7 +148,7 @@ def test_the_rest_of_the_node_is_served_while_samples_flow(node, peer):
     assert OTHERS_PERIOD_NS <= 20_000_000
 
 
-def test_a_regular_call_goes_on_with_and_without_samples(node, peer):
+def test_a_periodic_call_goes_on_with_and_without_samples(node, peer):
     called = []
     running = Running(node)
 
@@ -191,7 +185,7 @@ def test_a_regular_call_goes_on_with_and_without_samples(node, peer):
     assert len(called) <= n_called + 1
 
 
-def test_stops_when_the_context_is_shut_down(node):
+def test_the_loop_stops_when_the_context_is_shut_down(node):
     with Running(node) as running:
         node.context.shutdown()
         running.thread.join(TIMEOUT)
