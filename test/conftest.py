@@ -57,8 +57,6 @@ _LONG = (
     *('node_parity', 'fitting_windows', 'api', 'fitting_change', 'judging', 'fitting_selection'),
     *('judging_history', 'node_defence', 'node_startup', 'fitting_regression'),
     *('third_thermometer', 'replay', 'allow', 'drivers', 'node_sources', 'player'),
-    *('fitting_nonlinear', 'middleware', 'recording_write', 'compensator', 'ins', 'properties'),
-    *('node_reload', 'field', 'plausibility', 'recording_damage', 'thermometer'),
 )
 
 

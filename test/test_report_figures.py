@@ -133,13 +133,12 @@ def test_figures_are_legible_in_black_and_white(draw):
 
 
 def test_the_area_of_a_ring_is_proportional_to_the_residual_of_its_position():
-    shown = evidence()
     with drawing():
-        lines = [line for axes in of_bags.draw_positions(shown).axes for line in axes.lines]
+        lines = [line for axes in of_bags.draw_positions(evidence()).axes for line in axes.lines]
     rings = [line for line in lines if line.get_marker() == 'o' and line.get_mfc() == 'none']
     areas = np.sort([ring.get_markersize() ** 2 for ring in rings])
     # A position without a left-out residual has a ring without area.
-    rms = np.sort([position.residual_rms.get(LEFT_OUT, 0.0) for position in shown.positions])
+    rms = np.sort([place.residual_rms.get(LEFT_OUT, 0.0) for place in evidence().positions])
     assert areas / areas[-1] == pytest.approx(rms / rms[-1])
 
 
