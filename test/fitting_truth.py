@@ -147,7 +147,7 @@ def column_sd(names, bias_sd, scale_sd):
 
 def prior_of(truth, names=('curve', 'board'), **changes):
     known = {
-        'bias_mean': np.zeros(3), 'bias_sd': np.full(3, 1.0), 'scale_sd': 0.05,
+        'bias_sd': np.full(3, 1.0), 'scale_sd': 0.05,
         'misalignment_sd': 1e-2, 'column_sd': column_sd(names, 1e-2, 1e-3),
         'offset_sd': max(truth.offset_sd, 1e-9), 'tilt_sd': max(truth.tilt_sd, 1e-9),
         'sigma': truth.sigma, 'noise': truth.noise,

@@ -160,6 +160,24 @@ def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 2.0
 
 
+def test_six_attitudes_that_hardly_determine_the_scale_factors_leave_them_near_each_other(rng):
+    # The squares of these attitudes are almost linearly dependent.
+    up = [
+        [-7, 88, 48],
+        [14, -89, -44],
+        [87, -16, 47],
+        [-32, 39, -86],
+        [-56, -45, 70],
+        [78, 22, -58],
+    ]
+    up /= np.linalg.norm(up, axis=1)[:, None]
+    sensed = np.linalg.inv([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.02, 0.0, 1.0]])
+    axes = fit([turned(rng, up @ sensed.T)], OPTIONS).calibration.axes
+    # The prior sd of a scale factor is 5 %, that of a bias 1 m/s^2.
+    np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.05)
+    np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.5)
+
+
 def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
     source = turned(rng, positions(12, 3))
     findings = {finding.name: finding for finding in fit([source], OPTIONS).findings}

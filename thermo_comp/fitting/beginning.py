@@ -127,16 +127,18 @@ def _initial_prior(
     # Initial sd of mounting offsets, and smallest initial noise [m/s^2]: 1 ug.
     least = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), least)
-    noise = _noise_in_1_hz(windows, start)
+    noise = _noise_in_1_hz(windows, start.scale)
     misalignment_sd = misalignment_scale(noise)
     prior = Prior(
-        bias_mean=start.bias / start.scale,
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
         misalignment_sd=misalignment_sd,
         column_sd=np.zeros((2, len(data.groups))),
         offset_sd=least,
         sigma=np.full(3, sigma),
+        # The three axes of a sensor have similar scale factors: the mean of the prior is their
+        # geometric mean.
+        scale_mean=np.exp(np.mean(np.log(start.scale))) / start.scale,
         offset_scale=_mounting_scale(noise),
         misalignment_scale=misalignment_sd,
     )
@@ -180,12 +182,12 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     return np.asarray(np.append(taus, of_part) > longest_s / np.log(10.0))
 
 
-def _noise_in_1_hz(windows: ThermalWindows, start: ConstantCalibration) -> float:
+def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
     """Return the noise of the samples in 1 Hz [m/s^2], the median of the axes; 0 if unknown."""
     data = windows.data
     if not len(data.inner):
         return 0.0
-    sigma = float(np.median(white_noise_of(data, start.scale)))
+    sigma = float(np.median(white_noise_of(data, scale)))
     return float(sigma * np.sqrt(np.median(np.diff(data.time)[data.inner])))
 
 
@@ -284,10 +286,11 @@ def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibra
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
         raise FitError('an axis is exactly zero at rest: is the axis dead, or the topic wrong?')
+    scale = float(np.median(norms / gravity))
     if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
         known = options.gravity if windows.data.forces is None else gravity
-        return constant_calibration(means, known, with_misalignment=False)
-    scale = float(np.median(norms / gravity))
+        noise = _noise_in_1_hz(windows, np.full(3, scale))
+        return constant_calibration(means, known, misalignment_scale(noise))
     if options.input == 'm/s^2':
         if abs(scale - 1.0) > 0.2:
             raise FitError(

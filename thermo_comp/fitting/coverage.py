@@ -178,7 +178,7 @@ def _cost(means: Floats, with_misalignment: bool) -> float:
     if n_free < 0:
         return np.inf
     try:
-        force = constant_calibration(means, 1.0, with_misalignment).force(means)
+        force = constant_calibration(means, 1.0, MISALIGNMENT_SD * with_misalignment).force(means)
     except FitError:
         return np.inf
     norms = np.linalg.norm(force, axis=1)

@@ -91,7 +91,6 @@ def bags_contradicting_prior(
     window_s = windows.typical_count * known.unit.cycle_time_s
     sigma = np.array(known.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)
     prior = Prior(
-        bias_mean=state.bias,
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,

@@ -296,8 +296,7 @@ class Equations(Series):
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean
         else:
-            result[layout.kappa] -= 1.0
-            result[layout.bias] -= prior.bias_mean
+            result[layout.kappa] -= prior.scale_mean
         return result
 
 

@@ -17,7 +17,8 @@ from scipy.optimize import least_squares
 
 from ..errors import FitError
 from ..typing import Floats, Ints
-from .unknowns import Windows
+from ..unit.gravity import STANDARD_GRAVITY
+from .unknowns import BIAS_SD, SCALE_SD, Windows
 
 
 @dataclass(frozen=True)
@@ -39,19 +40,20 @@ class ConstantCalibration:
 
 
 def constant_calibration(
-    means: Floats, gravity: float | Floats, with_misalignment: bool
+    means: Floats, gravity: float | Floats, misalignment_sd: float
 ) -> ConstantCalibration:
     """
     Fit the triad to position means, shape (n, 3); FitError if they do not lie on an ellipsoid.
 
-    `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2]
+    `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2];
+    `misalignment_sd`: prior sd of the elements of M [rad]; 0 for axes at right angles
     """
     # Largest RMS distance from the ellipsoid [m/s^2]: 5 % of |f|, more than the drift of a cheap
     # sensor over 60 K, and less than the error of a moving unit.
     largest_rms = 0.05 * float(np.median(gravity))
     if isinstance(gravity, np.ndarray):
         scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
-        calibration, rms = _refine(means, gravity, np.zeros(3), scale, with_misalignment)
+        calibration, rms = _refine(means, gravity, np.zeros(3), scale, misalignment_sd)
         if not np.all(calibration.scale > 0.0) or not rms < largest_rms:
             raise FitError('the readings contradict the stated |f|: are its values right?')
         return calibration
@@ -63,7 +65,7 @@ def constant_calibration(
     for spread in (1.0, 1.3):
         scale = np.full(3, float(np.max(half)) * spread / gravity)
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
-        tried.append(_refine(means, gravity, bias, scale, with_misalignment))
+        tried.append(_refine(means, gravity, bias, scale, misalignment_sd))
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
     # The best ellipsoid of scattered points can be very large, with a remote centre: it is
     # rejected.
@@ -77,30 +79,42 @@ def constant_calibration(
 
 
 def _refine(
-    means: Floats, gravity: float | Floats, bias: Floats, scale: Floats, with_misalignment: bool
+    means: Floats, gravity: float | Floats, bias: Floats, scale: Floats, misalignment_sd: float
 ) -> tuple[ConstantCalibration, float]:
-    unit = scale * float(np.median(gravity))
+    """
+    Fit the triad from initial values; return also the RMS error of the norms [m/s^2].
+
+    The norms of few positions hardly determine some constants. Therefore the built-in prior of the
+    constants is added, with the weight of norms that are known to 0.1 %.
+    """
+    one_g = float(np.median(gravity))
 
     def unpack(parameters: Floats) -> ConstantCalibration:
         matrix = np.eye(3)
-        if with_misalignment:
-            matrix[1, 0], matrix[2, 0], matrix[2, 1] = parameters[6:]
+        matrix[[1, 2, 2], [0, 0, 1]] = misalignment_sd * parameters[6:]
         return ConstantCalibration(
-            bias + parameters[:3] * unit, scale * np.exp(parameters[3:6]), matrix
+            bias + parameters[:3] * scale * one_g, scale * np.exp(parameters[3:6]), matrix
         )
 
+    def errors(calibration: ConstantCalibration) -> Floats:
+        return np.asarray(np.linalg.norm(calibration.force(means), axis=1) / gravity - 1.0)
+
     def residual(parameters: Floats) -> Floats:
-        return np.asarray(np.linalg.norm(unpack(parameters).force(means), axis=1) / gravity - 1.0)
+        calibration = unpack(parameters)
+        bias_sd = BIAS_SD / STANDARD_GRAVITY * one_g
+        log_scale = np.log(np.abs(calibration.scale))
+        of_prior = (
+            calibration.bias / calibration.scale / bias_sd,
+            (log_scale - log_scale.mean()) / SCALE_SD,
+            parameters[6:],
+        )
+        return np.concatenate((errors(calibration), 1e-3 * np.concatenate(of_prior)))
 
     solution = least_squares(
-        residual,
-        np.zeros(9 if with_misalignment else 6),
-        loss='soft_l1',
-        f_scale=0.01,
-        x_scale=0.1,
+        residual, np.zeros(9), loss='soft_l1', f_scale=0.01, x_scale=[0.1] * 6 + [1.0] * 3
     )
-    rms = float(np.sqrt(np.mean(residual(solution.x) ** 2)))
-    return unpack(solution.x), float(np.median(gravity)) * rms
+    calibration = unpack(solution.x)
+    return calibration, one_g * float(np.sqrt(np.mean(errors(calibration) ** 2)))
 
 
 def position_means(windows: Windows) -> Floats:

@@ -176,8 +176,8 @@ class Prior:
     """
     Standard deviations of the prior, and the noises.
 
-    bias_mean, bias_sd: mean and sd of the bias [m/s^2], shape (3,)
-    scale_sd: sd of the scale ratio kappa about 1
+    bias_sd: sd of the bias [m/s^2], shape (3,); its mean is 0
+    scale_mean, scale_sd: mean of the scale ratio kappa of each axis, shape (3,), and its sd
     misalignment_sd: sd of the elements of M [rad]
     column_sd: sd of the weights of each column in units of its RMS, in the bias [m/s^2] and in the
         scale (relative); 0 for an inactive column, shape (2, m)
@@ -194,7 +194,6 @@ class Prior:
         active columns
     """
 
-    bias_mean: Floats
     bias_sd: Floats
     scale_sd: float
     misalignment_sd: float
@@ -202,6 +201,7 @@ class Prior:
     offset_sd: float
     sigma: Floats
     noise: Noise = field(default_factory=Noise)
+    scale_mean: Floats = field(default_factory=lambda: np.ones(3))
     offset_scale: float = 0.0
     misalignment_scale: float = MISALIGNMENT_SD
     tilt_sd: float = 1e-7
