@@ -165,6 +165,20 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
 
 
+def test_glitches_are_counted_and_end_no_rest(rng):
+    # WHY: each wrong sample ended a rest, and a fit with 1 % of them took minutes instead of 2 s.
+    whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
+    whole.accel[50::100, 1] += 1500.0
+    # A tap of ten samples is a motion.
+    whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
+    bag = reduced([whole])
+    assert bag.n_glitches == len(whole.accel) // 100
+    assert len(bag.intervals) == 2
+    assert abs(bag.intervals[0].mean[:, 1].mean()) < 1.0
+    (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'glitches')
+    assert '2000 samples' in finding.message
+
+
 def test_stamps_that_do_not_rise_are_left_out(rng):
     whole = block(still(rng, 30.0, (0.0, 0.0, 3000.0)))
     again = split(whole, 3)

@@ -53,6 +53,11 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             f'{100.0 * part:.0f} % of the samples are not finite, or have a stamp that does not '
             'rise, and are left out: was a clock set back?',
         )
+    if n := sum(bag.n_glitches for bag in bags):
+        yield advice(
+            'glitches',
+            f'{counted(n, "sample")} far from both neighbours, left out: does the bus lose bits?',
+        )
     still = sum(bag.n_still_cells for bag in bags) / max(sum(bag.n_cells for bag in bags), 1)
     if still < 0.5:
         yield advice(

@@ -77,6 +77,7 @@ class ReducedBag:
     restless: reason why the bag has no rests
     angular_rate: part of the bag that has finite angular rates
     n_spikes: number of readings of each thermometer that are spikes, see `readings`
+    n_glitches: number of single samples far from their neighbours, which are left out
     """
 
     source: FitSource
@@ -99,6 +100,7 @@ class ReducedBag:
     restless: str = ''
     angular_rate: Literal['none', 'part', 'whole'] = 'none'
     n_spikes: Mapping[str, int] = field(default_factory=dict)
+    n_glitches: int = 0
 
     @property
     def board(self) -> Readings:
@@ -227,6 +229,7 @@ def _bag(
         n_samples=reading.n_samples,
         n_dropped=cells.n_dropped,
         n_saturated=cells.n_saturated,
+        n_glitches=cells.n_glitches,
         n_cells=len(cells.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
         # A bag without a usable sample has no cells; the length of its windows is that of the

@@ -21,6 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
 from .colour import roughest_at_rest, spread_of_variances
+from .glitches import is_glitch
 
 #: Largest ratio of a cell's variance (n >= 30 samples) at rest to the quiet level: noise exceeds 4
 #: with a probability below 1e-11, and vibration that must be cut out is far above.
@@ -54,16 +55,18 @@ class Cells:
     """
     Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
-    Samples that are not finite or whose stamp does not rise are dropped. `quantum` is the samples'
-    step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in rad/s.
-    `roughness` is half the mean square change from sample to sample: the variance of white noise;
-    `seam` the change to a cell's first sample from the last sample of the cell right before it.
+    Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
+    `is_glitch`. `quantum` is the samples' step or 0; `middle` is 32768 for unsigned 16-bit words,
+    else 0; rates are in rad/s. `roughness` is half the mean square change from sample to sample:
+    the variance of white noise; `seam` the change to a cell's first sample from the last sample of
+    the cell right before it.
     """
 
     start_ns: int
     cell_s: float
     n_dropped: int
     n_saturated: int
+    n_glitches: int
     is_integer: bool
     quantum: Floats
     middle: float
@@ -106,7 +109,7 @@ class CellAccumulator:
         # squares; change from the cell before; sum of squared changes. The last cell may get
         # further samples.
         self._sums: list[Floats] = [np.empty((0, 15))]
-        self._n_dropped = self._n_saturated = self._n_looked_at = 0
+        self._n_dropped = self._n_saturated = self._n_glitches = self._n_looked_at = 0
         self._is_integer, self._is_negative = True, False
         self._middle, self._quantum = 0.0, np.zeros(3)
 
@@ -138,7 +141,10 @@ class CellAccumulator:
             self._n_looked_at += len(samples)
         if self._is_integer:
             self._is_integer = bool((samples == np.rint(samples)).all())
-        self._accumulate(stamp_ns, samples, None if rate is None else rate[use])
+        kept = ~is_glitch(samples, self._quantum)
+        self._n_glitches += int((~kept).sum())
+        rate = None if rate is None else rate[use][kept]
+        self._accumulate(stamp_ns[kept], samples[kept], rate)
 
     def forget(self, stamp_ns: int) -> None:
         """Drop the cells before a stamp."""
@@ -161,7 +167,7 @@ class CellAccumulator:
         )
         cell_s = self._cell_ns * 1e-9
         return Cells(
-            *(self._start_ns, cell_s, self._n_dropped, self._n_saturated),
+            *(self._start_ns, cell_s, self._n_dropped, self._n_saturated, self._n_glitches),
             *(self._is_integer, self._quantum, self._middle),
             *(sums[:, 2] / count + index * cell_s, count.astype(np.int64), index),
             *(mean[:, :3] + self._shift, variance[:, :3], sums[:, -3:] / pairs),

@@ -1,0 +1,37 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the detection of glitches: single samples with wrong bits, as after an error of a transfer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..typing import Bools, Floats
+
+# Distance of a glitch from its neighbours, in sd of the noise; noise alone does not reach it.
+_SDS = 25.0
+# Smallest number of samples that determine the noise.
+_FEWEST = 30
+
+
+def is_glitch(samples: Floats, quantum: Floats) -> Bools:
+    """
+    Return which samples, shape (n, 3), are single errors of a transfer: far from both neighbours,
+    which agree. A glitch would end a rest, as a knock does.
+    """
+    result = np.zeros(len(samples), dtype=bool)
+    if len(samples) < _FEWEST:
+        return result
+    bend = np.abs(samples[1:-1] - 0.5 * (samples[2:] + samples[:-2]))
+    # About 2000 samples are sufficient for the noise.
+    some = bend[:: max(len(bend) // 2000, 1)]
+    noise = np.maximum(np.median(some, axis=0) / 0.6745, quantum)
+    is_far = (bend > _SDS * noise) & (noise > 0.0)
+    is_far &= np.abs(samples[2:] - samples[:-2]) < 0.5 * bend
+    # Several glitches within a few samples are a motion or a vibration.
+    at = 1 + np.flatnonzero(is_far.any(axis=1))
+    gap = np.diff(at, prepend=-4, append=len(samples) + 4)
+    result[at[(gap[1:] > 3) & (gap[:-1] > 3)]] = True
+    return result
