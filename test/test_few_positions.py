@@ -144,6 +144,16 @@ def test_the_assumed_repeatability_of_the_bias_is_said(rng):
     assert 'mountings' not in names(12, OPTIONS)
 
 
+def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
+    # WHY: knocks cut each position into rests that agree, and the claimed offset was a twentieth.
+    whole, cut = (
+        fit([turned(rng, np.repeat(positions(9, 3), n, axis=0))], OPTIONS) for n in (1, 5)
+    )
+    sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, cut))
+    assert sd_cut == pytest.approx(sd, rel=0.5)
+    assert {'mountings'} <= {finding.name for finding in cut.findings}
+
+
 def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):
     # Cross-axis sensitivities of 0.8, -0.6 and 0.5 %, which six faces do not show.
     M = np.array([[1.0, 0.0, 0.0], [8e-3, 1.0, 0.0], [-6e-3, 5e-3, 1.0]])

@@ -67,11 +67,15 @@ def claim_of(
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2]
     """
-    prior = chosen.prior
+    # The rests of one mounting have one offset, but the regression has an offset for each rest: the
+    # mean of k offsets with k times the variance has the variance of one.
+    mounting = regression.windows.mounting_of(chosen.state.up)
+    n_rests = len(mounting) / (mounting[-1] + 1)
+    prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
-    layout, covariance, offset_sd = posterior.layout, posterior.covariance, prior.offset_sd
+    layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
     if prior.offset_scale > 0.0:
-        covariance, offset_sd = _over_mountings(regression, posterior)
+        covariance, offset_sd = _over_mountings(regression, posterior, mounting)
     if candidates is not None:
         wider = _with_unseen(regression, posterior, candidates)
         with_unseen = regression.solve(posterior.state, wider, n_steps=0)
@@ -149,17 +153,27 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
 
-def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Floats, float]:
-    """Return covariance and offset sd of the mixture of fits over the mounting's sd."""
-    prior = posterior.prior
+def _over_mountings(
+    regression: Regression, posterior: Posterior, mounting: Ints
+) -> tuple[Floats, float]:
+    """
+    Return covariance and offset sd of the mixture of fits over the mounting's sd.
+
+    `mounting`: number of the mounting of each position, see `Windows.mounting_of`
+    """
+    prior, n_rests = posterior.prior, len(mounting) / (mounting[-1] + 1)
     # Grid of the mounting's standard deviation, relative to the scale of its prior: steps of a
     # quarter decade, over which the log evidence is smooth.
     grid = 10.0 ** np.arange(-3.0, 1.51, 0.25)
     tried = prior.offset_scale * grid
-    fits = [
-        regression.solve(posterior.state, replace(prior, offset_sd=float(sd)), n_steps=1)
-        for sd in tried
-    ]
+
+    def solved(offset_sd: Floats) -> list[Posterior]:
+        return [
+            regression.solve(posterior.state, replace(prior, offset_sd=float(sd)), n_steps=1)
+            for sd in offset_sd
+        ]
+
+    fits = solved(tried)
     # Prior density per step of the logarithm: flat below the scale, a Student's tail above the
     # scale, and falling to 0 below a hundredth of the scale, which few mountings reach.
     density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
@@ -169,12 +183,15 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     # `TRIAL_GAIN`.
     evidence = np.array([
         [fit.log_evidence for fit in fits],
-        _norm_evidence(regression, posterior, tried, fits[-1].root),
+        _norm_evidence(regression, posterior, mounting, tried, fits[-1].root),
     ])  # fmt: skip
-    nearest = int(np.argmin(np.abs(np.log(tried / prior.offset_sd))))
+    nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
     of_data, of_norms = evidence - evidence[:, [nearest]]
-    weight = np.minimum(of_data, of_norms + TRIAL_GAIN) + density
-    weight = np.exp(weight - weight.max())
+    weight = np.minimum(of_data, of_norms + TRIAL_GAIN)
+    if n_rests > 1.0:
+        # All rests of a mounting agree: only the mountings show how well they repeat.
+        fits, weight = solved(n_rests**0.5 * tried), of_norms
+    weight = np.exp(weight + density - (weight + density).max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
     mode = as_vector(posterior.state, posterior.layout)[:n]
@@ -186,10 +203,14 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
 
 
 def _norm_evidence(
-    regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
+    regression: Regression,
+    posterior: Posterior,
+    mounting: Ints,
+    offset_sd: Floats,
+    by_drifts: Floats,
 ) -> Floats:
     """
-    Return the log evidence of the mean norms of the positions, for each sd of mountings, (k,).
+    Return the log evidence of the mean norms of the mountings, for each sd of mountings, (k,).
 
     `by_drifts`: root of the unit's covariance without information from the norms; the covariance
         of the thermal weights is taken from it
@@ -202,6 +223,11 @@ def _norm_evidence(
     residual = np.add.reduceat(residual, first) / weight[:, None]
     # Errors of the norms without offsets.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
+    first = np.flatnonzero(np.diff(mounting, prepend=-1))
+    rows = np.column_stack((along, errors, np.ones(len(along)))) * weight[:, None]
+    rows = np.add.reduceat(rows, first, axis=0)
+    weight = rows[:, -1]
+    along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
     if prior.informative is None:
         # The prior of the constants is almost flat, so it is centred on the state.
         weights = layout.axis[:, 2:].ravel()

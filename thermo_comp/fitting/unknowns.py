@@ -119,6 +119,17 @@ class Windows:
         """First window of each position, then the number of windows, shape (n_positions + 1,)."""
         return np.searchsorted(self.position, np.arange(self.n_positions + 1))
 
+    def mounting_of(self, up: Floats) -> Ints:
+        """
+        Return the number of the mounting of each position, given the attitudes (n_positions, 3).
+
+        Successive positions of a bag whose attitudes differ by less than 2 degrees are rests of one
+        mounting, which a knock or a gap interrupted.
+        """
+        bag, cosine = self.bag_of_position, np.sum(up[1:] * up[:-1], axis=1)
+        is_new = (bag[1:] != bag[:-1]) | (cosine < math.cos(math.radians(2.0)))
+        return np.concatenate(([0], np.cumsum(is_new)))
+
     @property
     def bag_of_position(self) -> Ints:
         """Bag of each position."""
