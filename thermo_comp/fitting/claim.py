@@ -67,8 +67,8 @@ def claim_of(
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2]
     """
-    # The rests of one mounting have one offset, but the regression has an offset for each rest: the
-    # mean of k offsets with k times the variance has the variance of one.
+    # The rests of one mounting have one offset, but the regression has one for each rest. The mean
+    # of k offsets with k times the variance has the variance of one.
     mounting = regression.windows.mounting_of(chosen.state.up)
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)

@@ -123,8 +123,8 @@ class Windows:
         """
         Return the number of the mounting of each position, given the attitudes (n_positions, 3).
 
-        Successive positions of a bag whose attitudes differ by less than 2 degrees are rests of one
-        mounting, which a knock or a gap interrupted.
+        Successive positions of a bag whose attitudes differ by less than 2 degrees are rests of
+        one mounting, which a knock or a gap interrupted.
         """
         bag, cosine = self.bag_of_position, np.sum(up[1:] * up[:-1], axis=1)
         is_new = (bag[1:] != bag[:-1]) | (cosine < math.cos(math.radians(2.0)))

@@ -12,6 +12,9 @@ from ..typing import Bools, Floats
 
 # Distance of a glitch from its neighbours, in sd of the noise; noise alone does not reach it.
 _SDS = 25.0
+# Smallest distance, relative to the norm of the samples: a converter that carries its remainder
+# flips by one count in single samples.
+_LEAST = 0.02
 # Smallest number of samples that determine the noise.
 _FEWEST = 30
 
@@ -25,10 +28,11 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
     if len(samples) < _FEWEST:
         return result
     bend = np.abs(samples[1:-1] - 0.5 * (samples[2:] + samples[:-2]))
-    # About 2000 samples are sufficient for the noise.
-    some = bend[:: max(len(bend) // 2000, 1)]
-    noise = np.maximum(np.median(some, axis=0) / 0.6745, quantum)
-    is_far = (bend > _SDS * noise) & (noise > 0.0)
+    # About 2000 samples are sufficient for the noise and the norm.
+    every = slice(None, None, max(len(bend) // 2000, 1))
+    noise = np.maximum(np.median(bend[every], axis=0) / 0.6745, quantum)
+    least = _LEAST * float(np.median(np.linalg.norm(samples[every], axis=1)))
+    is_far = bend > np.maximum(_SDS * noise, least)
     is_far &= np.abs(samples[2:] - samples[:-2]) < 0.5 * bend
     # Several glitches within a few samples are a motion or a vibration.
     at = 1 + np.flatnonzero(is_far.any(axis=1))
