@@ -27,15 +27,18 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
     result = np.zeros(len(samples), dtype=bool)
     if len(samples) < _FEWEST:
         return result
-    bend = np.abs(samples[1:-1] - 0.5 * (samples[2:] + samples[:-2]))
+    is_far = np.zeros(samples.shape, dtype=bool)
     # About 2000 samples are sufficient for the noise and the norm.
-    every = slice(None, None, max(len(bend) // 2000, 1))
-    noise = np.maximum(np.median(bend[every], axis=0) / 0.6745, quantum)
+    every = slice(None, None, max(len(samples) // 2000, 1))
     least = _LEAST * float(np.median(np.linalg.norm(samples[every], axis=1)))
-    is_far = bend > np.maximum(_SDS * noise, least)
-    is_far &= np.abs(samples[2:] - samples[:-2]) < 0.5 * bend
+    for x, step, far in zip(samples.T, quantum.tolist(), is_far.T, strict=True):
+        bend = np.abs(x[1:-1] - 0.5 * (x[2:] + x[:-2]))
+        noise = max(float(np.median(bend[every])) / 0.6745, step)
+        far[1:-1] = bend > max(_SDS * noise, least)
+        if far.any():
+            far[1:-1] &= np.abs(x[2:] - x[:-2]) < 0.5 * bend
     # Several glitches within a few samples are a motion or a vibration.
-    at = 1 + np.flatnonzero(is_far.any(axis=1))
+    at = np.flatnonzero(is_far.any(axis=1))
     gap = np.diff(at, prepend=-4, append=len(samples) + 4)
     result[at[(gap[1:] > 3) & (gap[:-1] > 3)]] = True
     return result

@@ -141,10 +141,13 @@ class CellAccumulator:
             self._n_looked_at += len(samples)
         if self._is_integer:
             self._is_integer = bool((samples == np.rint(samples)).all())
-        kept = ~is_glitch(samples, self._quantum)
-        self._n_glitches += int((~kept).sum())
-        rate = None if rate is None else rate[use][kept]
-        self._accumulate(stamp_ns[kept], samples[kept], rate)
+        rate = None if rate is None else rate[use]
+        glitches = is_glitch(samples, self._quantum)
+        if glitches.any():
+            self._n_glitches += int(glitches.sum())
+            stamp_ns, samples = stamp_ns[~glitches], samples[~glitches]
+            rate = None if rate is None else rate[~glitches]
+        self._accumulate(stamp_ns, samples, rate)
 
     def forget(self, stamp_ns: int) -> None:
         """Drop the cells before a stamp."""
