@@ -152,6 +152,8 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, cut))
     assert sd_cut == pytest.approx(sd, rel=0.5)
     assert {'mountings'} <= {finding.name for finding in cut.findings}
+    # The rests of a mounting are left out together.
+    assert len(cut.fit.selected.score.norms.square) == 9
 
 
 def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):

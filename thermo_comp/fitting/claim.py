@@ -69,13 +69,13 @@ def claim_of(
     """
     # The rests of one mounting have one offset, but the regression has one for each rest. The mean
     # of k offsets with k times the variance has the variance of one.
-    mounting = regression.windows.mounting_of(chosen.state.up)
+    mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
     if prior.offset_scale > 0.0:
-        covariance, offset_sd = _over_mountings(regression, posterior, mounting)
+        covariance, offset_sd = _over_mountings(regression, posterior)
     if candidates is not None:
         wider = _with_unseen(regression, posterior, candidates)
         with_unseen = regression.solve(posterior.state, wider, n_steps=0)
@@ -153,15 +153,10 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
 
-def _over_mountings(
-    regression: Regression, posterior: Posterior, mounting: Ints
-) -> tuple[Floats, float]:
-    """
-    Return covariance and offset sd of the mixture of fits over the mounting's sd.
-
-    `mounting`: number of the mounting of each position, see `Windows.mounting_of`
-    """
-    prior, n_rests = posterior.prior, len(mounting) / (mounting[-1] + 1)
+def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Floats, float]:
+    """Return covariance and offset sd of the mixture of fits over the mounting's sd."""
+    prior, mounting = posterior.prior, regression.windows.mounting
+    n_rests = len(mounting) / (mounting[-1] + 1)
     # Grid of the mounting's standard deviation, relative to the scale of its prior: steps of a
     # quarter decade, over which the log evidence is smooth.
     grid = 10.0 ** np.arange(-3.0, 1.51, 0.25)
@@ -183,7 +178,7 @@ def _over_mountings(
     # `TRIAL_GAIN`.
     evidence = np.array([
         [fit.log_evidence for fit in fits],
-        _norm_evidence(regression, posterior, mounting, tried, fits[-1].root),
+        _norm_evidence(regression, posterior, tried, fits[-1].root),
     ])  # fmt: skip
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
     of_data, of_norms = evidence - evidence[:, [nearest]]
@@ -203,11 +198,7 @@ def _over_mountings(
 
 
 def _norm_evidence(
-    regression: Regression,
-    posterior: Posterior,
-    mounting: Ints,
-    offset_sd: Floats,
-    by_drifts: Floats,
+    regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
     Return the log evidence of the mean norms of the mountings, for each sd of mountings, (k,).
@@ -223,7 +214,7 @@ def _norm_evidence(
     residual = np.add.reduceat(residual, first) / weight[:, None]
     # Errors of the norms without offsets.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
-    first = np.flatnonzero(np.diff(mounting, prepend=-1))
+    first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
     rows = np.column_stack((along, errors, np.ones(len(along)))) * weight[:, None]
     rows = np.add.reduceat(rows, first, axis=0)
     weight = rows[:, -1]

@@ -207,7 +207,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
     are explained by nine constants, whatever the offsets.
     """
-    n = int(fit.windows.data.mounting_of(fit.posterior.state.up)[-1]) + 1
+    n = int(fit.windows.data.mounting[-1]) + 1
     is_assumed = options.mounting_sd is None and options.prior is None
     if is_assumed and POSITIONS_NEEDED <= n < POSITIONS_FOR_MOUNTINGS:
         yield advice(

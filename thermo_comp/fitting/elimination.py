@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotrs, dtrtri
 
-from ..typing import Floats
+from ..typing import Floats, Ints
 from .tangent import Normal
 from .unknowns import Layout
 
@@ -176,18 +176,16 @@ class Reduced:
         positions += _variance(solved[..., r:-1] - by_starts @ by_unit[bag], root)
         return positions, starts
 
-    @cached_property
-    def _rest(self) -> Blocks:
-        """The block of the bag of each position, without the position's contribution."""
-        bag = self.layout.bag
-        others = (bag[:, None] == bag) - np.eye(len(bag))
-        return _of_bags(others, self.shares, self.starts_prior[:, bag])
-
-    def without(self, p: int, normal: Normal) -> Floats:
-        """Return `whole` without a position, given the position's normal equations."""
-        turned = self.positions.turned[p, :, len(self.bags.root[0]) :]
-        before, after = self.bags.turned[self.layout.bag[p]], self._rest.turned[p]
-        gone = _of_unit(normal.unit, self.layout) - turned.T @ turned
+    def without(self, places: Ints, normal: Normal) -> Floats:
+        """
+        Return `whole` without some positions of one bag, given the normal equations of these.
+        """
+        bag, r = self.layout.bag, len(self.bags.root[0])
+        at = bag[places[0]]
+        others = (bag == at) & ~np.isin(np.arange(len(bag)), places)
+        rest = _of_bags(others[None].astype(np.float64), self.shares, self.starts_prior[:, [at]])
+        before, after = self.bags.turned[at], rest.turned[0]
+        gone = _of_unit(normal.unit, self.layout) - _square(self.positions.turned[places][..., r:])
         return np.asarray(self.whole - gone + before.T @ before - after.T @ after)
 
     def beside(self, rows: Floats) -> tuple[Floats, Floats]:

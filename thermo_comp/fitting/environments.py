@@ -70,7 +70,8 @@ def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
 
 def _square_of_bags(fit: Fit) -> Floats:
     """Mean square of the left-out drift of each bag, shape (n_bags,), NaN where it is unknown."""
-    bag, folds = fit.windows.data.bag_of_position, fit.selected.score.positions
+    data, folds = fit.windows.data, fit.selected.score.positions
+    bag = data.bag_of_position[np.flatnonzero(np.diff(data.mounting, prepend=-1))]
     count = np.where(np.isfinite(folds.square), folds.windows, 0.0)
     weighted = np.bincount(bag, np.where(count > 0.0, folds.square, 0.0) * count)
     total = np.bincount(bag, count)

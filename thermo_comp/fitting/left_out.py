@@ -3,11 +3,11 @@
 """
 Owns the score of a model on data that took no part in the fit, and the comparison of two scores.
 
-Each position is left out in turn, and so is each section and each half of the program, in all
-positions at once. Left-out halves detect columns that interpolate between the sections of one
-program and fail in another. The left-out windows are corrected as the node would correct them:
-with the unit's parameters alone, initial lag states at their run-time mean, no mounting offsets
-and no tilts of the support.
+Each mounting (a position, or the rests into which knocks have cut a position) is left out in turn,
+and so is each section and each half of the program, in all positions at once. Left-out halves
+detect columns that interpolate between the sections of one program and fail in another. The
+left-out windows are corrected as the node would correct them: with the unit's parameters alone,
+initial lag states at their run-time mean, no mounting offsets and no tilts of the support.
 The errors are the drift (each axis less its mean over the position, which does not depend on the
 attitude) and ``|f| - g`` of the position, if the other positions determine it.
 
@@ -57,6 +57,16 @@ class Folds:
 
     square: Floats
     windows: Floats
+
+    @classmethod
+    def of(cls, square: Floats, windows: Floats, fold: Ints) -> Folds:
+        """Average mean squares, NaN if not scored, over the positions of each fold, shape (p,)."""
+        known = np.isfinite(square)
+        count = np.bincount(fold, np.where(known, windows, 0.0))
+        total = np.bincount(fold, np.where(known, square * windows, 0.0))
+        with np.errstate(invalid='ignore'):
+            square = total / np.where(count > 0.0, count, np.nan)
+        return cls(square, np.bincount(fold, windows).astype(np.float64))
 
     @property
     def rms(self) -> float:
@@ -211,29 +221,30 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
 def _by_positions(
     regression: Regression, posterior: Posterior
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each position; return folds of drift and norm, corrected windows, their drift."""
+    """Leave out each mounting; return folds of drift and norm, corrected windows, their drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point = regression.at(posterior.state, posterior.prior)
-    n_positions = windows.n_positions
     edges = windows.edges
     counts = np.diff(edges).astype(np.float64)
     force = np.full((len(windows.time), 3), np.nan)
     sizes = regression.norms(point.state)
     drift = np.full_like(force, np.nan)
-    squares, norms = np.full((2, n_positions), np.nan)
-    for p, matrix in enumerate(point.without_each() if n_positions > 1 else ()):
-        rows = slice(edges[p], edges[p + 1])
+    squares, norms = np.full((2, windows.n_positions), np.nan)
+    for places, matrix in point.without_each():
         state, root = _refitted(point, matrix)
-        corrected, weight = regression.force(state, rows), share[rows]
-        is_known = _is_drift_determined(point, posterior, root, rows)
-        if counts[p] >= _FEWEST_WINDOWS and is_known:
-            drift[rows] = corrected - np.average(corrected, axis=0, weights=weight)
-            squares[p] = np.average(np.mean(drift[rows] ** 2, axis=1), weights=weight)
-        if _is_norm_determined(point, posterior, root, p):
-            force[rows] = corrected
-            error = np.linalg.norm(corrected, axis=1) - sizes[p]
-            norms[p] = np.average(error**2, weights=weight)
-    return Folds(squares, counts), Folds(norms, counts), force, drift
+        for p in places.tolist():
+            rows = slice(edges[p], edges[p + 1])
+            corrected, weight = regression.force(state, rows), share[rows]
+            is_known = _is_drift_determined(point, posterior, root, rows)
+            if counts[p] >= _FEWEST_WINDOWS and is_known:
+                drift[rows] = corrected - np.average(corrected, axis=0, weights=weight)
+                squares[p] = np.average(np.mean(drift[rows] ** 2, axis=1), weights=weight)
+            if _is_norm_determined(point, posterior, root, p):
+                force[rows] = corrected
+                error = np.linalg.norm(corrected, axis=1) - sizes[p]
+                norms[p] = np.average(error**2, weights=weight)
+    of_drift, of_norm = (Folds.of(square, counts, windows.mounting) for square in (squares, norms))
+    return of_drift, of_norm, force, drift
 
 
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:

@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from ..typing import Bools, Floats
+from ..typing import Bools, Floats, Ints
 from .elimination import Reduced, eliminate, factored, inverse_root, solved
 from .equations import Equations, last_result_kept, moved_by, without_inactive
 from .gains import Inactive
@@ -174,13 +174,18 @@ class Point:
             reduced = reduced.with_prior_of_sum(total, self._common_variance)
         return reduced
 
-    def without_each(self) -> Iterator[Floats]:
-        """Yield the normal equations of the unit without each position in turn."""
+    def without_each(self) -> Iterator[tuple[Ints, Floats]]:
+        """
+        Yield the positions of each mounting in turn, and the normal equations of the unit without
+        these positions; nothing for a single mounting.
+        """
         base = self.regression.products(self.layout.used).base
         at_state = self.regression.products_at(self.grams, self.state, base)
-        for p in range(self.regression.windows.n_positions):
-            normal = self.tangent.at(p).normal(at_state[[p]])
-            yield self.reduced.without(p, normal.scaled(self.prior.sigma**-2.0))
+        mounting = self.regression.windows.mounting
+        for number in range(mounting[-1] + 1 if mounting[-1] else 0):
+            places = np.flatnonzero(mounting == number)
+            normal = self.tangent.at(places).normal(at_state[places])
+            yield places, self.reduced.without(places, normal.scaled(self.prior.sigma**-2.0))
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
         """

@@ -108,10 +108,13 @@ class Tangent:
         result *= self.factor[:, :, None]
         return np.asarray(result)
 
-    def at(self, p: int) -> Tangent:
-        """Return the equations of one position."""
+    def at(self, places: Ints) -> Tangent:
+        """Return the equations of some positions."""
         return replace(
-            self, combined=self.combined[[p]], factor=self.factor[[p]], scale=self.scale[[p]]
+            self,
+            combined=self.combined[places],
+            factor=self.factor[places],
+            scale=self.scale[places],
         )
 
     def of(self, rows: Floats) -> Floats:

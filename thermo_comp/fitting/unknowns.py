@@ -119,15 +119,18 @@ class Windows:
         """First window of each position, then the number of windows, shape (n_positions + 1,)."""
         return np.searchsorted(self.position, np.arange(self.n_positions + 1))
 
-    def mounting_of(self, up: Floats) -> Ints:
+    @cached_property
+    def mounting(self) -> Ints:
         """
-        Return the number of the mounting of each position, given the attitudes (n_positions, 3).
+        Number of the mounting of each position, from 0, shape (n_positions,).
 
-        Successive positions of a bag whose attitudes differ by less than 2 degrees are rests of
-        one mounting, which a knock or a gap interrupted.
+        Successive positions of a bag whose readings differ by less than 2 degrees are rests of one
+        mounting, which a knock or a gap interrupted.
         """
-        bag, cosine = self.bag_of_position, np.sum(up[1:] * up[:-1], axis=1)
-        is_new = (bag[1:] != bag[:-1]) | (cosine < math.cos(math.radians(2.0)))
+        first, bag = self.edges[:-1], self.bag_of_position
+        means = np.add.reduceat(self.mean, first, axis=0) / np.diff(self.edges)[:, None]
+        turn = np.linalg.norm(np.diff(means, axis=0), axis=1) / np.linalg.norm(means[1:], axis=1)
+        is_new = (bag[1:] != bag[:-1]) | ~(turn < math.radians(2.0))
         return np.concatenate(([0], np.cumsum(is_new)))
 
     @property
