@@ -186,28 +186,22 @@ def slow_table(path, heading, times, first=20.0, last=45.0):
     return path
 
 
-@pytest.mark.parametrize('step', [1, 5])
-@pytest.mark.parametrize('since', [0, 1_774_747_800])
-def test_a_slow_log_of_one_attitude_is_in_seconds(tmp_path, step, since):
-    # WHY: a test of two hours at 1 Hz was read as 8 s at 1 kHz, even with stamps since 1970.
-    times = [since + step * k for k in range(4000)]
-    columns = guess_columns(slow_table(tmp_path / 'log.csv', 'time', times))
-    assert columns.stamp.unit == 's'
-
-
-def test_a_time_column_may_have_some_repeated_rows(tmp_path):
-    # WHY: a table in which one row in seven was written twice was refused as `not a rising time`.
-    times = [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)]
-    assert guess_columns(slow_table(tmp_path / 'log.csv', 'time', times)).stamp.unit == 's'
-
-
-def test_stamps_since_1970_state_their_unit(tmp_path):
-    # Without a temperature, in one attitude, the size of the stamps alone shows their unit.
-    for unit, since, step in (('s', START_NS // 10**9, 2), ('ms', START_NS // 10**6, 5000),
-                              ('us', START_NS // 10**9, 10_000)):  # fmt: skip
-        path = slow_table(tmp_path / f'{unit}.csv', 'time', [since + step * k for k in range(900)],
-                          last=20.0)  # fmt: skip
-        assert guess_columns(path).stamp.unit == unit
+@pytest.mark.parametrize(
+    ('unit', 'times', 'last'),
+    [
+        # WHY: a test of two hours at 1 Hz was read as 8 s at 1 kHz, even with stamps since 1970.
+        *(('s', [since + step * k for k in range(4000)], 45.0)
+          for since in (0, 1_774_747_800) for step in (1, 5)),
+        # WHY: a table in which one row in seven was written twice was refused as not rising.
+        ('s', [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)], 45.0),
+        # Without a temperature, in one attitude, the size of the stamps alone shows their unit.
+        *((unit, [START_NS // size + step * k for k in range(900)], 20.0)
+          for unit, size, step in (('s', 10**9, 2), ('ms', 10**6, 5000), ('us', 10**9, 10_000))),
+    ],
+)  # fmt: skip
+def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times, last):
+    path = slow_table(tmp_path / 'log.csv', 'time', times, last=last)
+    assert guess_columns(path).stamp.unit == unit
 
 
 @pytest.mark.parametrize(
@@ -303,16 +297,41 @@ def test_headings_without_a_time_take_a_rate(tmp_path, rng):
         guess_columns(path, 100.0)
 
 
-def test_the_guessed_column_map_is_printed(tmp_path, rng, cli):
-    accel = UP + 0.002 * rng.standard_normal(UP.shape)
-    rows = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(accel)]
-    (tmp_path / 'log.csv').write_text('\n'.join(['time (s),ax,ay,az', *rows]))
+@pytest.mark.parametrize(
+    ('headings', 'thermometers', 'not_used'),
+    [  # WHY: thermometers with other headings than `temp` and `T_board` were dropped silently.
+        ('board_degC,case_degC,imu', ['board_degC', 'case_degC'], 'imu'),
+        ('case,board,label', ['board', 'case'], 'label'),
+        ('T_magnet_C,case [°C],die', ['T_magnet_C', 'case [°C]'], 'die'),
+        ('imu_temp_raw,board_rev,die', ['die', None], 'imu_temp_raw, board_rev'),
+        ('case_id,phase_b,phase_c', [None, None], 'case_id, phase_b, phase_c'),
+    ],
+)
+def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermometers, not_used):
+    accel, n = UP + 0.002 * rng.standard_normal(UP.shape), headings.count(',') + 1
+    rows = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' + f',{20 + k / 100}' * n
+            for k, (x, y, z) in enumerate(accel)]  # fmt: skip
+    (tmp_path / 'log.csv').write_text('\n'.join([f'time (s),ax,ay,az,{headings}', *rows]))
     printed = cli('convert', tmp_path / 'log.csv', '-o', tmp_path / 'bag').stdout
+    assert f'log.csv: not used: {not_used}\n' in printed
     head, *lines = printed.splitlines()
     assert 'guessed column map; if it is wrong, edit it and give it as --columns' in head
     own = yaml.safe_load('\n'.join(takewhile(lambda line: line.startswith('  '), lines)))
     assert own['stamp'] == {'column': 'time (s)', 'unit': 's'}
     assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
+    assert [own.get(name, {}).get('column') for name in ('board', 'case')] == thermometers
+    (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(own)))
+    again = ('--columns', tmp_path / 'map.yaml', '-o', tmp_path / 'again')
+    assert f'not used: {not_used}\n' in cli('convert', tmp_path / 'log.csv', *again).stdout
+
+
+@pytest.mark.parametrize(('last', 'unit'), [(3, None), (1200, None), (40, 'degC')])
+def test_whole_numbers_of_a_board_may_be_its_temperature(tmp_path, last, unit):
+    # The number of a board, a count of rows, whole degrees.
+    rows = [f'{k / 10},0,6,8,{3 + k * (last - 3) // 1199}' for k in range(1200)]
+    (tmp_path / 'log.csv').write_text('\n'.join(['time,ax,ay,az,board', *rows]))
+    board = guess_columns(tmp_path / 'log.csv').board
+    assert (board and board.unit) == unit
 
 
 def test_equal_guessed_column_maps_are_printed_once(tmp_path, rng, cli):

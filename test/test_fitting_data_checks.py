@@ -70,7 +70,7 @@ def test_a_complete_thermal_test_has_only_good_findings(good):
     [
         ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 advised\)'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
-         'holds at the temperature of the test'),
+         'no thermometer: the calibration holds at the temperature of the test'),
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'only heating was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),

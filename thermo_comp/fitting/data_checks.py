@@ -67,14 +67,17 @@ def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
 def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
     """Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest."""
     yield _judge_positions(up)
-    if not windows.has_temperature:
-        text = (
-            'no change of temperature was read: the calibration holds at the temperature of the '
-            'test'
-        )
-        yield advice('temperature', text)
-        return
     used_bags = {id(bag): bag for bag, _ in windows.rests}.values()
+    if not windows.has_temperature:
+        what = 'no change of temperature was read'
+        if not any(len(bag.board.value) for bag in used_bags):
+            is_read = any(len(of.value) for bag in used_bags for of in bag.temperatures.values())
+            what = 'the bags have no thermometer'
+            what = 'the bags have no thermometer of the board' if is_read else what
+        yield advice(
+            'temperature', f'{what}: the calibration holds at the temperature of the test'
+        )
+        return
     n_still = sum(interval.count.sum() for bag in used_bags for interval in bag.intervals)
     part = 1.0 - windows.data.weight.sum() * windows.typical_count / max(n_still, 1.0)
     if used_bags and part > 0.1:
