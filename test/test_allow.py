@@ -113,6 +113,11 @@ def in_kelvins(rest):
     rest.warm += 273.15
 
 
+def in_whole_degrees(rest):
+    rest.quantum = 1.0
+    rest.temperature = lambda time: 35.0 - 0.05 * np.maximum(time - 150.0, 0.0)
+
+
 @pytest.mark.parametrize(
     ('spoil', 'text'),
     [
@@ -131,17 +136,16 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
     ('spoil', 'name', 'text'),
     [
         (two_minutes_are_lost, 'unmeasured', '^2[0-9] % of the time at rest has no temperatures'),
+        # WHY: `no temperatures ... the same clock?` for a soak before the first whole degree.
+        (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
-        (
-            in_kelvins,
-            'kelvins',
-            r'^temperature/board reads 2\d+\S* .. \d+\S* degC: that looks like',
-        ),
+        (in_kelvins, 'kelvins', r'^temperature/board reads 2\d+\S* .. \d+\S* degC: that looks'),
     ],
 )
 def test_likely_mistakes_are_refused_by_name(rng, spoil, name, text):
     findings = {note.name: note.message for note in fit(spoilt(rng, spoil), FORCE).findings}
     assert re.search(text, findings[name])
+    assert name == 'unmeasured' or 'unmeasured' not in findings
 
 
 def test_an_axis_that_is_dead_in_one_position_is_named(rng):
@@ -151,6 +155,12 @@ def test_an_axis_that_is_dead_in_one_position_is_named(rng):
     sources = [rest.source(name=f'bag{number}') for number, rest in enumerate(rests)]
     with pytest.raises(FitError, match=r'^bag4: y reads \S+ to the bit for 0\.\d+ h: the axis is'):
         fit(sources, FORCE)
+    # WHY: axes at the full scale, here 10 m/s^2, were taken for dead axes.
+    rests[2].accel[:, 0], rests[4].accel[:, 1] = -10.0, 10.0
+    with pytest.raises(
+        FitError, match=r'^bag2: x .*; bag4: y .* full scale: .* --full-scale 9.999 '
+    ):
+        fit([rest.source(name=f'bag{number}') for number, rest in enumerate(rests)], FORCE)
 
 
 def spoilt(rng, spoil):

@@ -68,7 +68,9 @@ def test_a_complete_thermal_test_has_only_good_findings(good):
 @pytest.mark.parametrize(
     ('name', 'changed', 'message'),
     [
-        ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 advised\)'),
+        ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 advised\): run the'),
+        # WHY: the thermometer of a room was taken for the board's.
+        ('span', lambda w: {'temperature': 0.01 * w.temperature}, 'is the thermometer on'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
          'no thermometer: the calibration holds at the temperature of the test'),
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
@@ -151,14 +153,15 @@ def test_a_refusal_stops_the_fit_unless_it_is_allowed():
     assert (allowed.level, allowed.message) == ('advice', 'allowed: the board leads')
 
 
-def judged(raw, fitted, slow, left_out=None, **options):
+def judged(raw, fitted, slow, left_out=None, span=30.0, drift=500.0, noise=0.1, **options):
     steps = [
         residual_statistics(np.full(0 if rms is None else 9, (rms or 0.0) * MICRO_G))
         for rms in (raw, raw, raw, fitted, left_out)
     ]
     findings = judge_result(
         np.full(3, 990.0), [ResidualRow('all', *steps)], slow * MICRO_G,
-        FitOptions(gravity=9.81, **options),
+        FitOptions(gravity=9.81, **options), span=span, drift=drift * MICRO_G,
+        noise=noise * MICRO_G,
     )  # fmt: skip
     return {finding.name: finding for finding in findings}
 
@@ -178,6 +181,10 @@ def test_the_residual_of_the_fit_is_reported():
         # The temperatures are stamped an hour late, as by another clock.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
+        # WHY: 0.3 K show nothing; noise is no misfit; a turn-on is no loose thermometer.
+        ((1.1, 1.0, 0.1, 1.0, 0.3), 'residual', '1.1 ug RMS raw'),
+        ((85.0, 2.6, 50.0, 14.6, 8.6, 2.6, 2.6), 'residual', '2.6 ug in sample'),
+        ((3689.0, 980.0, 1500.0, 1793.0, 30.0, 60.0, 40.0), 'misfit', 'mounted or switched on'),
         ((100.0, 1.0, 0.2, 1.5), 'units', 'expected near 1'),
     ],
 )
