@@ -177,11 +177,15 @@ def test_wrong_arguments_are_named(change, text):
 
 def test_a_fit_of_arrays_is_the_fit_of_their_bags(root, tmp_path, fitted):
     bags = sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]
-    again = tc.fit([tc.read(bag) for bag in bags], gravity=9.80665, model='golovach')
+    recordings = [tc.read(bag) for bag in bags]
+    again = tc.fit(recordings, gravity=9.80665, model='golovach')
     assert again.unit.serial == 'demo-0007'
     assert replace(again, provenance=fitted.provenance) == fitted
     tc.save(again, tmp_path / 'unit.yaml')
     assert tc.load(tmp_path / 'unit.yaml') == again
+    recordings[0].time_s[2] = recordings[0].time_s[1]
+    with pytest.raises(ValueError, match=r'`time_s` must rise, got 3.0 at 1 and then 3.0'):
+        tc.fit(recordings, gravity=9.80665)
 
 
 def test_the_python_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):
