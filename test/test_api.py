@@ -109,11 +109,8 @@ def test_any_origin_of_time_and_any_kind_of_array_are_accepted(arrays):
         def __array__(self, dtype=None, copy=None):
             return np.array(self.value, dtype=dtype)
 
-    for given in (
-        lists,
-        {**arrays, 'time_s': dates},
-        {name: Column(value) for name, value in arrays.items()},
-    ):
+    columns = {name: Column(value) for name, value in arrays.items()}
+    for given in (lists, {**arrays, 'time_s': dates}, columns):
         same = unit.correct(**given)
         np.testing.assert_array_equal(same.specific_force, out.specific_force)
         np.testing.assert_array_equal(same.covariance, out.covariance)
@@ -162,10 +159,7 @@ def test_empty_arrays_give_empty_arrays():
         ({'board': [20.0, 20.0]}, r'`board` must have a value for each of the 3 times'),
         ({'board': ([0.0, 1.0], [20.0])}, r'`board` must have as many values as times, 2'),
         ({'board': ([1.0, 0.0], [20.0, 20.0])}, r'`board time_s` must rise, got 1.0 at 0'),
-        (
-            {'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])},
-            'must be seconds or datetime64, as',
-        ),
+        ({'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])}, 'be seconds or datetime64, as'),
         ({'lid': [20.0] * 3}, r'`lid` is no thermometer of this calibration: it has board, case'),
     ],
 )

@@ -41,15 +41,12 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
         ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # format of actipy
         ('2026-03-28 20:00:00-05:30', 0),
         ('2026-03-29 01:30', 0),
+        *((text, None) for text in ('', '01:30', '2026-13-29 01:30:00', '2026-03-29T01:30:00+2')),
     ],
 )
 def test_dates_with_time_zones_are_read(text, seconds):
-    assert exact_ns(text, 'iso') == START_NS + round(seconds * 1e9)
-
-
-@pytest.mark.parametrize('text', ['', '01:30', '2026-13-29 01:30:00', '2026-03-29T01:30:00+2'])
-def test_cells_that_are_no_dates_give_no_stamp(text):
-    assert exact_ns(text, 'iso') == NO_STAMP
+    expected = NO_STAMP if seconds is None else START_NS + round(seconds * 1e9)
+    assert exact_ns(text, 'iso') == expected
 
 
 def times(kind):
@@ -211,33 +208,26 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
         ('time', [k // 10 for k in range(900)], "'time' has the time of the row before in 90%"),
         ('date', [46110 + k / 864000 for k in range(900)], 'no plausible interval of samples'),
         ('time', list(range(900, 0, -1)), "'time' is not a rising time"),
+        # WHY: for other dates the message was that no row holds numbers in the stamp column.
+        *(('date', [cell] * 900, f"column 'date' is a date of ISO 8601.*'{cell}'")
+          for cell in ('29/03/2026 01:30:00', '01:30:00.5')),
+        # WHY: the message `column 'temp' is given twice` read as a mistake of the command line.
+        ('t,temp', [f'{k / 10},20' for k in range(900)], r"log\.csv: 2 columns are called 'temp'"),
     ],
-)
-def test_times_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
+)  # fmt: skip
+def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
     # WHY: minutes were read as seconds; the message for other times did not apply to them.
+    path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
-        guess_columns(slow_table(tmp_path / 'log.csv', heading, times))
-
-
-@pytest.mark.parametrize('cell', ['29/03/2026 01:30:00', '01:30:00.5'])
-def test_a_date_that_is_not_iso_is_shown(tmp_path, cell):
-    # WHY: the message was that no row holds numbers in the accelerometer and stamp columns.
-    path = slow_table(tmp_path / 'log.csv', 'date', [cell] * 900)
-    with pytest.raises(
-        RecordingError, match=f"no cell of its column 'date' is a date of ISO 8601.*'{cell}'"
-    ):
         table_log(path, guess_columns(path))
 
 
-def test_a_slower_thermometer_leaves_cells_blank(tmp_path, rng):
+def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
     # WHY: blank last cells of most rows were not counted: the headings had a cell too many.
-    accel = 9.8 * (UP + 0.002 * rng.standard_normal(UP.shape))
-    rows = [
-        f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f},{20 + k / 100 if k % 100 == 0 else ""}'
-        for k, (x, y, z) in enumerate(accel)
-    ]
-    path = tmp_path / 'log.csv'
-    path.write_text('\n'.join(['time,ax,ay,az,temp', *rows]) + '\n')
+    path = slow_table(tmp_path / 'log.csv', 'time', [k / 100 for k in range(N)], last=31.99)
+    head, *rows = path.read_text().splitlines()
+    rows = [row if k % 100 == 0 else f'{row.rpartition(",")[0]},' for k, row in enumerate(rows)]
+    path.write_text('\n'.join([head, *rows]) + '\n')
     log = table_log(path, guess_columns(path))
     assert len(log.accel) == N
     np.testing.assert_allclose(log.temperatures['board'].celsius, 20.0 + np.arange(12.0))
@@ -258,15 +248,6 @@ def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
     path.write_text('\n'.join(['# one two three four five', *rows]) + '\n')
     with pytest.raises(RecordingError, match='5 columns without headings'):
         guess_columns(path)
-
-
-def test_two_columns_of_one_name_are_named_with_the_file(tmp_path):
-    # WHY: the message `column 'temp' is given twice` read as a mistake of the command line.
-    path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
-    rows = [f'{row},20.0' for row in path.read_text().splitlines()[1:]]
-    path.write_text('\n'.join(['t,ax,ay,az,temp,temp', *rows]) + '\n')
-    with pytest.raises(RecordingError, match=r"log\.csv: 2 columns are called 'temp'"):
-        table_log(path, guess_columns(path))
 
 
 def test_a_temperature_and_a_force_of_other_units_are_refused(tmp_path):
@@ -338,9 +319,7 @@ def test_equal_guessed_column_maps_are_printed_once(tmp_path, rng, cli):
     tables = [tmp_path / f'{number}.csv' for number in range(3)]
     for heading, level, table in zip(('time (s)', 'time (s)', 'time_s'), np.eye(3), tables,
                                      strict=True):  # fmt: skip
-        rows = np.column_stack(
-            (np.arange(4000) / 10.0, level + 0.002 * rng.normal(size=(4000, 3)))
-        )
+        rows = np.c_[np.arange(4000) / 10.0, level + 0.002 * rng.normal(size=(4000, 3))]
         np.savetxt(table, rows, '%.5f', ',', header=f'{heading},ax,ay,az', comments='')
     printed = cli('fit', *tables, '-o', tmp_path / 'unit.yaml', '--gravity', '9.81').stdout
     assert f'{tables[1]}: column map of {tables[0]}\n' in printed

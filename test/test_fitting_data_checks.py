@@ -63,6 +63,7 @@ def good(rng):
 def test_a_complete_thermal_test_has_only_good_findings(good):
     findings = findings_of(*good)
     assert {finding.level for finding in findings.values()} == {'good'}
+    assert findings_of(*good, has_case=False)['case'].level == 'advice'
 
 
 @pytest.mark.parametrize(
@@ -105,30 +106,20 @@ def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, r
     assert 'soaks' not in findings_of(drift, up)
 
 
-def test_a_missing_case_temperature_is_reported(good):
-    assert findings_of(*good, has_case=False)['case'].level == 'advice'
-
-
 def test_six_faces_do_not_determine_the_misalignment(good):
-    windows, _ = good
+    windows, up = good
     faces = np.vstack((np.eye(3), -np.eye(3)))
     assert not determines_misalignment(faces)
-    assert 'the misalignment keeps its prior' in (
-        findings_of(windows, faces)['misalignment'].message
-    )
+    message = findings_of(windows, faces)['misalignment'].message
+    assert 'the misalignment keeps its prior' in message
     # The same face again, two degrees off, is not a new position.
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
     assert not determines_misalignment(np.vstack((faces, tilted)))
-
-
-def test_few_and_badly_spread_positions_are_reported(good):
-    windows, up = good
-    assert (
-        '5 positions: bias and scale cannot be separated'
-        in findings_of(windows, up[:5])['positions'].message
-    )
+    # Few and badly spread positions do not either.
+    message = findings_of(windows, up[:5])['positions'].message
+    assert '5 positions: bias and scale cannot be separated' in message
     flat = np.column_stack((np.cos(np.arange(12.0)), np.sin(np.arange(12.0)), np.zeros(12)))
     assert 'misalignment' in findings_of(windows, flat)
     assert geometry(flat, with_misalignment=True) == np.inf
@@ -199,6 +190,7 @@ def test_residuals_too_large_for_a_good_fit_are_reported(given, name, message):
         ({'full_scale': -5.0}, '`full_scale` must be positive, got -5.0'),
         ({'min_rest_s': 0.0}, '`min_rest_s` must be positive, got 0.0'),
         ({'input': 'g'}, '`input` must be of counts, m/s'),
+        ({'allow': ('span',)}, r'`allow` must be of prior, saturation, .* got .span.'),
     ],
 )
 def test_options_out_of_range_are_refused(change, message):
