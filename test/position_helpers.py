@@ -43,6 +43,7 @@ class Rest:
     warm: float = 35.0
     fall: float = 20.0
     pace_s: float = 200.0
+    quantum: float = 0.0  # of the board's readings [K]
 
     def __post_init__(self):
         n = round(self.duration_s * self.rate_hz)
@@ -64,6 +65,7 @@ class Rest:
         board = self.temperature(self.board_time) + 0.02 * np.random.default_rng(
             7
         ).standard_normal(len(self.board_time))
+        board = np.rint(board / self.quantum) * self.quantum if self.quantum else board
         cuts = np.linspace(0, len(stamp_ns), n_blocks + 1).astype(int)
         blocks = []
         for first, last in pairwise(cuts.tolist()):

@@ -109,11 +109,8 @@ def test_any_origin_of_time_and_any_kind_of_array_are_accepted(arrays):
         def __array__(self, dtype=None, copy=None):
             return np.array(self.value, dtype=dtype)
 
-    for given in (
-        lists,
-        {**arrays, 'time_s': dates},
-        {name: Column(value) for name, value in arrays.items()},
-    ):
+    columns = {name: Column(value) for name, value in arrays.items()}
+    for given in (lists, {**arrays, 'time_s': dates}, columns):
         same = unit.correct(**given)
         np.testing.assert_array_equal(same.specific_force, out.specific_force)
         np.testing.assert_array_equal(same.covariance, out.covariance)
@@ -162,10 +159,7 @@ def test_empty_arrays_give_empty_arrays():
         ({'board': [20.0, 20.0]}, r'`board` must have a value for each of the 3 times'),
         ({'board': ([0.0, 1.0], [20.0])}, r'`board` must have as many values as times, 2'),
         ({'board': ([1.0, 0.0], [20.0, 20.0])}, r'`board time_s` must rise, got 1.0 at 0'),
-        (
-            {'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])},
-            'must be seconds or datetime64, as',
-        ),
+        ({'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])}, 'be seconds or datetime64, as'),
         ({'lid': [20.0] * 3}, r'`lid` is no thermometer of this calibration: it has board, case'),
     ],
 )
@@ -177,11 +171,15 @@ def test_wrong_arguments_are_named(change, text):
 
 def test_a_fit_of_arrays_is_the_fit_of_their_bags(root, tmp_path, fitted):
     bags = sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]
-    again = tc.fit([tc.read(bag) for bag in bags], gravity=9.80665, model='golovach')
+    recordings = [tc.read(bag) for bag in bags]
+    again = tc.fit(recordings, gravity=9.80665, model='golovach')
     assert again.unit.serial == 'demo-0007'
     assert replace(again, provenance=fitted.provenance) == fitted
     tc.save(again, tmp_path / 'unit.yaml')
     assert tc.load(tmp_path / 'unit.yaml') == again
+    recordings[0].time_s[2] = recordings[0].time_s[1]
+    with pytest.raises(ValueError, match=r'`time_s` must rise, got 3.0 at 1 and then 3.0'):
+        tc.fit(recordings, gravity=9.80665)
 
 
 def test_the_python_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):

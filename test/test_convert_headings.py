@@ -41,15 +41,12 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
         ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # format of actipy
         ('2026-03-28 20:00:00-05:30', 0),
         ('2026-03-29 01:30', 0),
+        *((text, None) for text in ('', '01:30', '2026-13-29 01:30:00', '2026-03-29T01:30:00+2')),
     ],
 )
 def test_dates_with_time_zones_are_read(text, seconds):
-    assert exact_ns(text, 'iso') == START_NS + round(seconds * 1e9)
-
-
-@pytest.mark.parametrize('text', ['', '01:30', '2026-13-29 01:30:00', '2026-03-29T01:30:00+2'])
-def test_cells_that_are_no_dates_give_no_stamp(text):
-    assert exact_ns(text, 'iso') == NO_STAMP
+    expected = NO_STAMP if seconds is None else START_NS + round(seconds * 1e9)
+    assert exact_ns(text, 'iso') == expected
 
 
 def times(kind):
@@ -186,28 +183,22 @@ def slow_table(path, heading, times, first=20.0, last=45.0):
     return path
 
 
-@pytest.mark.parametrize('step', [1, 5])
-@pytest.mark.parametrize('since', [0, 1_774_747_800])
-def test_a_slow_log_of_one_attitude_is_in_seconds(tmp_path, step, since):
-    # WHY: a test of two hours at 1 Hz was read as 8 s at 1 kHz, even with stamps since 1970.
-    times = [since + step * k for k in range(4000)]
-    columns = guess_columns(slow_table(tmp_path / 'log.csv', 'time', times))
-    assert columns.stamp.unit == 's'
-
-
-def test_a_time_column_may_have_some_repeated_rows(tmp_path):
-    # WHY: a table in which one row in seven was written twice was refused as `not a rising time`.
-    times = [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)]
-    assert guess_columns(slow_table(tmp_path / 'log.csv', 'time', times)).stamp.unit == 's'
-
-
-def test_stamps_since_1970_state_their_unit(tmp_path):
-    # Without a temperature, in one attitude, the size of the stamps alone shows their unit.
-    for unit, since, step in (('s', START_NS // 10**9, 2), ('ms', START_NS // 10**6, 5000),
-                              ('us', START_NS // 10**9, 10_000)):  # fmt: skip
-        path = slow_table(tmp_path / f'{unit}.csv', 'time', [since + step * k for k in range(900)],
-                          last=20.0)  # fmt: skip
-        assert guess_columns(path).stamp.unit == unit
+@pytest.mark.parametrize(
+    ('unit', 'times', 'last'),
+    [
+        # WHY: a test of two hours at 1 Hz was read as 8 s at 1 kHz, even with stamps since 1970.
+        *(('s', [since + step * k for k in range(4000)], 45.0)
+          for since in (0, 1_774_747_800) for step in (1, 5)),
+        # WHY: a table in which one row in seven was written twice was refused as not rising.
+        ('s', [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)], 45.0),
+        # Without a temperature, in one attitude, the size of the stamps alone shows their unit.
+        *((unit, [START_NS // size + step * k for k in range(900)], 20.0)
+          for unit, size, step in (('s', 10**9, 2), ('ms', 10**6, 5000), ('us', 10**9, 10_000))),
+    ],
+)  # fmt: skip
+def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times, last):
+    path = slow_table(tmp_path / 'log.csv', 'time', times, last=last)
+    assert guess_columns(path).stamp.unit == unit
 
 
 @pytest.mark.parametrize(
@@ -217,33 +208,26 @@ def test_stamps_since_1970_state_their_unit(tmp_path):
         ('time', [k // 10 for k in range(900)], "'time' has the time of the row before in 90%"),
         ('date', [46110 + k / 864000 for k in range(900)], 'no plausible interval of samples'),
         ('time', list(range(900, 0, -1)), "'time' is not a rising time"),
+        # WHY: for other dates the message was that no row holds numbers in the stamp column.
+        *(('date', [cell] * 900, f"column 'date' is a date of ISO 8601.*'{cell}'")
+          for cell in ('29/03/2026 01:30:00', '01:30:00.5')),
+        # WHY: the message `column 'temp' is given twice` read as a mistake of the command line.
+        ('t,temp', [f'{k / 10},20' for k in range(900)], r"log\.csv: 2 columns are called 'temp'"),
     ],
-)
-def test_times_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
+)  # fmt: skip
+def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
     # WHY: minutes were read as seconds; the message for other times did not apply to them.
+    path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
-        guess_columns(slow_table(tmp_path / 'log.csv', heading, times))
-
-
-@pytest.mark.parametrize('cell', ['29/03/2026 01:30:00', '01:30:00.5'])
-def test_a_date_that_is_not_iso_is_shown(tmp_path, cell):
-    # WHY: the message was that no row holds numbers in the accelerometer and stamp columns.
-    path = slow_table(tmp_path / 'log.csv', 'date', [cell] * 900)
-    with pytest.raises(
-        RecordingError, match=f"no cell of its column 'date' is a date of ISO 8601.*'{cell}'"
-    ):
         table_log(path, guess_columns(path))
 
 
-def test_a_slower_thermometer_leaves_cells_blank(tmp_path, rng):
+def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
     # WHY: blank last cells of most rows were not counted: the headings had a cell too many.
-    accel = 9.8 * (UP + 0.002 * rng.standard_normal(UP.shape))
-    rows = [
-        f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f},{20 + k / 100 if k % 100 == 0 else ""}'
-        for k, (x, y, z) in enumerate(accel)
-    ]
-    path = tmp_path / 'log.csv'
-    path.write_text('\n'.join(['time,ax,ay,az,temp', *rows]) + '\n')
+    path = slow_table(tmp_path / 'log.csv', 'time', [k / 100 for k in range(N)], last=31.99)
+    head, *rows = path.read_text().splitlines()
+    rows = [row if k % 100 == 0 else f'{row.rpartition(",")[0]},' for k, row in enumerate(rows)]
+    path.write_text('\n'.join([head, *rows]) + '\n')
     log = table_log(path, guess_columns(path))
     assert len(log.accel) == N
     np.testing.assert_allclose(log.temperatures['board'].celsius, 20.0 + np.arange(12.0))
@@ -264,15 +248,6 @@ def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
     path.write_text('\n'.join(['# one two three four five', *rows]) + '\n')
     with pytest.raises(RecordingError, match='5 columns without headings'):
         guess_columns(path)
-
-
-def test_two_columns_of_one_name_are_named_with_the_file(tmp_path):
-    # WHY: the message `column 'temp' is given twice` read as a mistake of the command line.
-    path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
-    rows = [f'{row},20.0' for row in path.read_text().splitlines()[1:]]
-    path.write_text('\n'.join(['t,ax,ay,az,temp,temp', *rows]) + '\n')
-    with pytest.raises(RecordingError, match=r"log\.csv: 2 columns are called 'temp'"):
-        table_log(path, guess_columns(path))
 
 
 def test_a_temperature_and_a_force_of_other_units_are_refused(tmp_path):
@@ -303,25 +278,48 @@ def test_headings_without_a_time_take_a_rate(tmp_path, rng):
         guess_columns(path, 100.0)
 
 
-def test_the_guessed_column_map_is_printed(tmp_path, rng, cli):
-    accel = UP + 0.002 * rng.standard_normal(UP.shape)
-    rows = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(accel)]
-    (tmp_path / 'log.csv').write_text('\n'.join(['time (s),ax,ay,az', *rows]))
+@pytest.mark.parametrize(
+    ('headings', 'thermometers', 'not_used'),
+    [  # WHY: thermometers with other headings than `temp` and `T_board` were dropped silently.
+        ('board_degC,case_degC,imu', ['board_degC', 'case_degC'], 'imu'),
+        ('case,board,label', ['board', 'case'], 'label'),
+        ('T_magnet_C,case [°C],die', ['T_magnet_C', 'case [°C]'], 'die'),
+        ('imu_temp_raw,board_rev,die', ['die', None], 'imu_temp_raw, board_rev'),
+        ('case_id,phase_b,phase_c', [None, None], 'case_id, phase_b, phase_c'),
+    ],
+)
+def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermometers, not_used):
+    accel, n = UP + 0.002 * rng.standard_normal(UP.shape), headings.count(',') + 1
+    rows = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' + f',{20 + k / 100}' * n
+            for k, (x, y, z) in enumerate(accel)]  # fmt: skip
+    (tmp_path / 'log.csv').write_text('\n'.join([f'time (s),ax,ay,az,{headings}', *rows]))
     printed = cli('convert', tmp_path / 'log.csv', '-o', tmp_path / 'bag').stdout
+    assert f'log.csv: not used: {not_used}\n' in printed
     head, *lines = printed.splitlines()
     assert 'guessed column map; if it is wrong, edit it and give it as --columns' in head
     own = yaml.safe_load('\n'.join(takewhile(lambda line: line.startswith('  '), lines)))
     assert own['stamp'] == {'column': 'time (s)', 'unit': 's'}
     assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
+    assert [own.get(name, {}).get('column') for name in ('board', 'case')] == thermometers
+    (tmp_path / 'map.yaml').write_text('\n'.join(map_lines(own)))
+    again = ('--columns', tmp_path / 'map.yaml', '-o', tmp_path / 'again')
+    assert f'not used: {not_used}\n' in cli('convert', tmp_path / 'log.csv', *again).stdout
+
+
+@pytest.mark.parametrize(('last', 'unit'), [(3, None), (1200, None), (40, 'degC')])
+def test_whole_numbers_of_a_board_may_be_its_temperature(tmp_path, last, unit):
+    # The number of a board, a count of rows, whole degrees.
+    rows = [f'{k / 10},0,6,8,{3 + k * (last - 3) // 1199}' for k in range(1200)]
+    (tmp_path / 'log.csv').write_text('\n'.join(['time,ax,ay,az,board', *rows]))
+    board = guess_columns(tmp_path / 'log.csv').board
+    assert (board and board.unit) == unit
 
 
 def test_equal_guessed_column_maps_are_printed_once(tmp_path, rng, cli):
     tables = [tmp_path / f'{number}.csv' for number in range(3)]
     for heading, level, table in zip(('time (s)', 'time (s)', 'time_s'), np.eye(3), tables,
                                      strict=True):  # fmt: skip
-        rows = np.column_stack(
-            (np.arange(4000) / 10.0, level + 0.002 * rng.normal(size=(4000, 3)))
-        )
+        rows = np.c_[np.arange(4000) / 10.0, level + 0.002 * rng.normal(size=(4000, 3))]
         np.savetxt(table, rows, '%.5f', ',', header=f'{heading},ax,ay,az', comments='')
     printed = cli('fit', *tables, '-o', tmp_path / 'unit.yaml', '--gravity', '9.81').stdout
     assert f'{tables[1]}: column map of {tables[0]}\n' in printed

@@ -63,14 +63,17 @@ def good(rng):
 def test_a_complete_thermal_test_has_only_good_findings(good):
     findings = findings_of(*good)
     assert {finding.level for finding in findings.values()} == {'good'}
+    assert findings_of(*good, has_case=False)['case'].level == 'advice'
 
 
 @pytest.mark.parametrize(
     ('name', 'changed', 'message'),
     [
-        ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 advised\)'),
+        ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 advised\): run the'),
+        # WHY: the thermometer of a room was taken for the board's.
+        ('span', lambda w: {'temperature': 0.01 * w.temperature}, 'is the thermometer on'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
-         'holds at the temperature of the test'),
+         'no thermometer: the calibration holds at the temperature of the test'),
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'only heating was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
@@ -103,30 +106,20 @@ def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, r
     assert 'soaks' not in findings_of(drift, up)
 
 
-def test_a_missing_case_temperature_is_reported(good):
-    assert findings_of(*good, has_case=False)['case'].level == 'advice'
-
-
 def test_six_faces_do_not_determine_the_misalignment(good):
-    windows, _ = good
+    windows, up = good
     faces = np.vstack((np.eye(3), -np.eye(3)))
     assert not determines_misalignment(faces)
-    assert 'the misalignment keeps its prior' in (
-        findings_of(windows, faces)['misalignment'].message
-    )
+    message = findings_of(windows, faces)['misalignment'].message
+    assert 'the misalignment keeps its prior' in message
     # The same face again, two degrees off, is not a new position.
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
     assert not determines_misalignment(np.vstack((faces, tilted)))
-
-
-def test_few_and_badly_spread_positions_are_reported(good):
-    windows, up = good
-    assert (
-        '5 positions: bias and scale cannot be separated'
-        in findings_of(windows, up[:5])['positions'].message
-    )
+    # Few and badly spread positions do not either.
+    message = findings_of(windows, up[:5])['positions'].message
+    assert '5 positions: bias and scale cannot be separated' in message
     flat = np.column_stack((np.cos(np.arange(12.0)), np.sin(np.arange(12.0)), np.zeros(12)))
     assert 'misalignment' in findings_of(windows, flat)
     assert geometry(flat, with_misalignment=True) == np.inf
@@ -151,14 +144,15 @@ def test_a_refusal_stops_the_fit_unless_it_is_allowed():
     assert (allowed.level, allowed.message) == ('advice', 'allowed: the board leads')
 
 
-def judged(raw, fitted, slow, left_out=None, **options):
+def judged(raw, fitted, slow, left_out=None, span=30.0, drift=500.0, noise=0.1, **options):
     steps = [
         residual_statistics(np.full(0 if rms is None else 9, (rms or 0.0) * MICRO_G))
         for rms in (raw, raw, raw, fitted, left_out)
     ]
     findings = judge_result(
         np.full(3, 990.0), [ResidualRow('all', *steps)], slow * MICRO_G,
-        FitOptions(gravity=9.81, **options),
+        FitOptions(gravity=9.81, **options), span=span, drift=drift * MICRO_G,
+        noise=noise * MICRO_G,
     )  # fmt: skip
     return {finding.name: finding for finding in findings}
 
@@ -178,6 +172,10 @@ def test_the_residual_of_the_fit_is_reported():
         # The temperatures are stamped an hour late, as by another clock.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
+        # WHY: 0.3 K show nothing; noise is no misfit; a turn-on is no loose thermometer.
+        ((1.1, 1.0, 0.1, 1.0, 0.3), 'residual', '1.1 ug RMS raw'),
+        ((85.0, 2.6, 50.0, 14.6, 8.6, 2.6, 2.6), 'residual', '2.6 ug in sample'),
+        ((3689.0, 980.0, 1500.0, 1793.0, 30.0, 60.0, 40.0), 'misfit', 'mounted or switched on'),
         ((100.0, 1.0, 0.2, 1.5), 'units', 'expected near 1'),
     ],
 )
@@ -192,6 +190,7 @@ def test_residuals_too_large_for_a_good_fit_are_reported(given, name, message):
         ({'full_scale': -5.0}, '`full_scale` must be positive, got -5.0'),
         ({'min_rest_s': 0.0}, '`min_rest_s` must be positive, got 0.0'),
         ({'input': 'g'}, '`input` must be of counts, m/s'),
+        ({'allow': ('span',)}, r'`allow` must be of prior, saturation, .* got .span.'),
     ],
 )
 def test_options_out_of_range_are_refused(change, message):

@@ -41,11 +41,13 @@ class Columns:
     Parameters
     ----------
     time_s : ndarray, shape (n,)
-        Time of each sample since `start_ns` [s].
+        Time of each sample since `start_ns` [s]. `fit` needs times that rise strictly; remove a
+        sample whose time does not exceed the time of the sample before.
     counts : ndarray, shape (n, 3)
         The raw samples: counts per conversion cycle, or m/s^2 from a unit that reports these.
     temperatures : dict of str to (ndarray, ndarray)
-        Times since `start_ns` [s] and readings [degC] of each thermometer, by its name.
+        Times since `start_ns` [s], which rise strictly, and readings [degC] of each thermometer,
+        by its name.
     start_ns : int, optional
         Stamp of time 0 [ns]: the whole minute before the first message.
     serial : str or None, optional
@@ -108,7 +110,7 @@ def correct(
     calibration : Calibration
         Calibration of the unit; ``calibration.correct(time_s, ...)`` is the same call.
     time_s : array_like, shape (n,)
-        Time of each sample, rising: seconds since any origin, or datetime64.
+        Time of each sample, strictly rising: seconds since any origin, or datetime64.
     counts : array_like, shape (n, 3)
         The raw samples, in the calibration's input unit.
     board : array_like, shape (n,), or (array_like, array_like), optional

@@ -93,7 +93,7 @@ def convert(
     out.end(
         output=output,
         **picked(report, 'rows rate_hz duration_s believed stillness'),
-        **picked(written, 'input unit missing chosen hint'),
+        **picked(written, 'input unit missing chosen hint not_used'),
         source=written.path,
         start_ns=int(written.stamp_ns[0]),
         **n_messages,
@@ -147,7 +147,17 @@ def flags_named() -> Iterator[None]:
 
 
 def tell_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
-    """Print a guessed column map, or name the log of `shown` whose printed map is the same."""
+    """
+    Print a guessed column map, or name the log of `shown` whose printed map is the same; print the
+    columns of a table that are not used, unless they are those of a log of `shown`.
+    """
+    _tell_map(out, log, shown)
+    not_used = f'not used: {", ".join(log.not_used)}'
+    if log.not_used and shown.setdefault(not_used, log.path) == log.path:
+        out.line(f'{log.path}: {not_used}')
+
+
+def _tell_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     from ..convert.column_map import spoken_columns
     from ..convert.headings import map_lines
 

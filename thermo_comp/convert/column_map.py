@@ -24,7 +24,7 @@ from ..recording.topics import is_thermometer
 from ..typing import Floats, Ints
 from ..unit.schema import SchemaError, build
 from .headings import Headings, read_headings
-from .log import NO_STAMP, ForeignLog, Unit, believed_unit, find_stillness
+from .log import NO_STAMP, PLAUSIBLE_CELSIUS, ForeignLog, Unit, believed_unit, find_stillness
 from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, TimeUnit, read_parquet, read_text
 
 Triple = tuple[Column, Column, Column]
@@ -43,6 +43,9 @@ _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Range of temperatures per length of a log [K/s] that no log reaches: a hair dryer warms a board
 #: by some 0.1 K/s.
 _FASTEST_K_S = 0.5
+# Largest share of rows with a change of temperature in a column of whole numbers; the numbers of
+# boards or sensors whose rows alternate change more often.
+_FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
 #: Last and first part of a counter's range; a step from the last to the first is a new start.
 _WRAP_EDGE = 0.1
@@ -182,6 +185,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
         frame_id=columns.frame_id,
         serial=columns.serial or '',
         n_short=table.n_short,
+        not_used=table.not_used,
         continued=continued,
     )
 
@@ -213,17 +217,23 @@ def _read(
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     """Guess the columns of a table, by headings if any; `rate_hz` is for a table without times."""
     table = _read(path, None, Stamp(rate_hz=1.0))
-    named = read_headings(table.headings) if table.headings else _unnamed(path, len(table.values))
-    if named is None or (named.time is None and rate_hz is None):
-        lacks, instead = ('accelerometer', '') if named is None else ('time', '--rate-hz, or ')
-        listed = ', '.join(map(repr, table.headings[:20]))
-        problem = f'its headings name no {lacks}: {listed}' if listed else 'the table has no times'
-        raise RecordingError(f'{problem}; give {instead}{_A_MAP}', path=path)
     place = {name: number for number, name in reversed(list(enumerate(table.headings)))}
 
     def values(columns: Sequence[Column]) -> Floats:
         return np.column_stack([table.values[place.get(str(col), col)] for col in columns])
 
+    def is_plausible(heading: str, unit: str) -> bool:
+        return _reads_temperature(values([heading])[:, 0], unit)
+
+    if table.headings:
+        named = read_headings(table.headings, is_plausible)
+    else:
+        named = _unnamed(path, len(table.values))
+    if named is None or (named.time is None and rate_hz is None):
+        lacks, instead = ('accelerometer', '') if named is None else ('time', '--rate-hz, or ')
+        listed = ', '.join(map(repr, table.headings[:20]))
+        problem = f'its headings name no {lacks}: {listed}' if listed else 'the table has no times'
+        raise RecordingError(f'{problem}; give {instead}{_A_MAP}', path=path)
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
@@ -274,6 +284,22 @@ def spoken_columns(columns: ColumnMap) -> str:
     if columns.gyro is not None:
         parts.append(f'angular rate x y z [{columns.gyro.unit}]')
     return ', '.join(parts)
+
+
+def _reads_temperature(values: Floats, unit: str) -> bool:
+    """
+    Whether the values of a column can be temperatures: most of them are in the plausible range,
+    and whole numbers, which may be those of a board or of a test, change, but in few rows.
+    """
+    slope, offset = _CELSIUS[unit]
+    celsius = values[np.isfinite(values)] * slope + offset
+    if not len(celsius):
+        return False
+    low, high = np.quantile(celsius, (0.02, 0.98))
+    changes = np.mean(np.diff(celsius) != 0.0) if len(celsius) > 1 else 0.0
+    is_whole = bool(np.all(values[np.isfinite(values)] % 1.0 == 0.0))
+    is_within = PLAUSIBLE_CELSIUS[0] <= low and high <= PLAUSIBLE_CELSIUS[1]
+    return bool(is_within and (not is_whole or 0.0 < changes < _FEW_CHANGES))
 
 
 def _span(values: Floats) -> float:

@@ -7,7 +7,7 @@ A guess is printed as a column map, for the user to keep or to edit.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
@@ -41,6 +41,13 @@ _TEMPERATURE = re.compile(
     'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
 )
 _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
+# Unit of a temperature at the end of a heading, and words of columns that are no temperature.
+_DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
+_NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
+# Headings of thermometers if the values of the column are temperatures: a unit of one letter, and
+# the place of a thermometer alone.
+_LETTER = re.compile('_[ck]$|^(board|case|imu|die|chip)_f$')
+_PLACE = re.compile('board|case|imu|die|chip')
 # Units as they stand in brackets or, in lower case with underscores, at the end of a heading.
 _ACCELS = {
     'g': 'g',
@@ -74,10 +81,18 @@ class Headings:
     thermometers: dict[str, tuple[str, str]]  # column and unit by thermometer
 
 
-def read_headings(headings: Sequence[str]) -> Headings | None:
-    """Find the columns by their names; None where no accelerometer is among them."""
+def read_headings(
+    headings: Sequence[str], is_plausible: Callable[[str, str], bool] = lambda *_: False
+) -> Headings | None:
+    """
+    Find the columns by their names; None where no accelerometer is among them.
+
+    `is_plausible`: whether the values of a column, in a unit, can be those of a thermometer
+    """
     names = {_plain(heading): heading for heading in reversed(headings)}
     times = [one for name, one in names.items() if _TIME.search(name) and not _is_warm(one)]
+    # A heading as `T_magnet_C` is that of the times only if no other heading is.
+    times.sort(key=lambda one: _LETTER.search(_plain(one)) is None)
     found = dict(_triads(names))
     triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
     accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
@@ -88,13 +103,7 @@ def read_headings(headings: Sequence[str]) -> Headings | None:
         return None
     gyro = next((key for key in triads if _GYRO.search(key)), None)
     time = times[-1] if times else ''
-    thermometers: dict[str, tuple[str, str]] = {}
-    for heading in dict.fromkeys(headings):
-        if _is_warm(heading):
-            is_outside = _OUTSIDE.search(_plain(heading)) and thermometers
-            usual = 'case' if is_outside or 'board' in thermometers else 'board'
-            name = usual if usual not in thermometers else f't{len(thermometers)}'
-            thermometers[name] = heading, _stated(heading, _DEGREES) or 'degC'
+    taken = {time, *(heading for three in found.values() for heading in three)}
     return Headings(
         time or None,
         _stated(time, _TIMES | _LONG_TIMES),
@@ -102,8 +111,39 @@ def read_headings(headings: Sequence[str]) -> Headings | None:
         _stated(triads[accel][0], _ACCELS),
         triads[gyro] if gyro is not None else None,
         _stated(triads[gyro][0], _RATES) if gyro is not None else '',
-        thermometers,
+        _thermometers([one for one in headings if one not in taken], names, is_plausible),
     )
+
+
+def _thermometers(
+    headings: Sequence[str], names: Container[str], is_plausible: Callable[[str, str], bool]
+) -> dict[str, tuple[str, str]]:
+    """
+    Return column and unit by thermometer. A place alone, as `board`, is the heading of a
+    thermometer if no other column is that thermometer. `names`: all headings, see `_plain`
+    """
+    units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
+    warm, places = [], []
+    for heading, unit in units.items():
+        name = _plain(heading)
+        # A column of three, as `phase_a`, `phase_b`, `phase_c`, has no unit.
+        is_letter = _LETTER.search(name) is not None and f'{name[:-1]}b' not in names
+        if _is_warm(heading) or (is_letter and is_plausible(heading, unit)):
+            warm.append(heading)
+        elif _PLACE.fullmatch(name) and is_plausible(heading, unit):
+            places.append(heading)
+    result: dict[str, tuple[str, str]] = {}
+    for heading in sorted((*warm, *places), key=_is_outside):
+        usual = 'case' if result and (_is_outside(heading) or heading in warm) else 'board'
+        if usual in result and heading in places:
+            continue
+        result[usual if usual not in result else f't{len(result)}'] = heading, units[heading]
+    return result
+
+
+def _is_outside(heading: str) -> bool:
+    """Whether a thermometer's heading names a place outside the board."""
+    return _OUTSIDE.search(_plain(heading)) is not None
 
 
 def map_lines(columns: Any) -> list[str]:
@@ -123,10 +163,12 @@ def _given(value: Any) -> Any:
 
 
 def _is_warm(heading: str) -> bool:
-    """Whether a heading is that of a temperature, by its words or by its unit in brackets."""
-    unit = _UNIT.search(heading)
+    """Whether a heading is that of a temperature, by its words or by its unit."""
+    unit, name = _UNIT.search(heading), _plain(heading)
     is_unit = unit is not None and unit[1].strip().lower() in {*_DEGREES, *_CELSIUS}
-    return is_unit or _TEMPERATURE.search(_plain(heading)) is not None
+    if is_unit or _DEGREES_END.search(name):
+        return True
+    return _TEMPERATURE.search(name) is not None and _NO_READING.search(name) is None
 
 
 def _plain(heading: str) -> str:

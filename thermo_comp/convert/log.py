@@ -45,8 +45,8 @@ _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements
 
 NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row without a stamp
-# Range of temperatures on a circuit board; kelvins and raw counts are outside.
-_PLAUSIBLE_CELSIUS = (-90.0, 200.0)
+#: Range of temperatures on a circuit board [degC]; kelvins and raw counts are outside.
+PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # number of rows processed at a time, to bound the memory
 _EXAMPLES = 5
 _RESTART_NS = 10**9  # a larger backward step is a restart of the clock, as for the compensator
@@ -70,6 +70,7 @@ class ForeignLog:
     frame_id: str = 'imu_link'
     serial: str = ''
     n_short: int = 0  # number of rows left out
+    not_used: tuple[str, ...] = ()  # columns of a table that are in no message
     continued: tuple[int, ...] = ()  # lines where a 32-bit counter began again, and was continued
     metadata: Mapping[str, str] = field(default_factory=dict)
     missing: str | None = None  # description of unreadable parts
@@ -207,7 +208,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
         raise RecordingError(
             f'the accelerometer is stated in {log.unit}, but {reason}', path=log.path
         )
-    low, high = _PLAUSIBLE_CELSIUS
+    low, high = PLAUSIBLE_CELSIUS
     for name, readings in log.temperatures.items():
         typical = float(np.nanmedian(readings.celsius)) if len(readings.celsius) else low
         if not low <= typical <= high:
@@ -238,7 +239,7 @@ def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
 
 def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
     """Leave out single readings that are no temperatures, as -127 degC of a lost DS18B20."""
-    low, high = _PLAUSIBLE_CELSIUS
+    low, high = PLAUSIBLE_CELSIUS
     kept, n = {}, 0
     for name, readings in log.temperatures.items():
         is_good = (readings.celsius >= low) & (readings.celsius <= high)

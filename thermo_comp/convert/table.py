@@ -12,7 +12,7 @@ import os
 import re
 from array import array
 from calendar import timegm
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
@@ -89,6 +89,7 @@ class Table:
     values: dict[Column, Floats]  # NaN if a cell is not a number
     stamp_ns: Ints  # `NO_STAMP` if a cell is not a number
     n_short: int = 0  # number of dropped rows with too few cells, as at a cut
+    not_used: tuple[str, ...] = ()  # headings, or else numbers, of the columns that were not read
     headings: tuple[str, ...] = ()
 
 
@@ -246,6 +247,7 @@ def _collect(
         values={name: np.array(column) for name, column in values.items()},
         stamp_ns=stamp.ticks(len(line)) if at is None else np.array(stamps),
         n_short=n_short,
+        not_used=_not_used(headings, width, {*places.values(), at}),
         headings=tuple(headings),
     )
 
@@ -265,6 +267,12 @@ def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int
     else:
         return headings.index(name)
     raise RecordingError(why, path=path)
+
+
+def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) -> tuple[str, ...]:
+    """Return the headings, or else the numbers, of the columns that are not used."""
+    names = headings or [str(number) for number in range(width)]
+    return tuple(name for place, name in enumerate(names) if name and place not in used)
 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
@@ -342,4 +350,5 @@ def read_parquet(
             unit, stamps = stamps.type.unit, stamps.cast(pa.int64())
         stamp_ns = np.array([exact_ns(cell, unit) for cell in stamps.to_pylist()])
     line = np.arange(1, table.num_rows + 1, dtype=np.int64)
-    return Table(line, values, stamp_ns, headings=tuple(headings))
+    not_used = _not_used(headings, len(headings), set(places.values()))
+    return Table(line, values, stamp_ns, not_used=not_used, headings=tuple(headings))

@@ -23,15 +23,22 @@ from ..typing import Floats
 from ..unit.gravity import MICRO_G, spoken
 from .coverage import LeastKnown, distinct_directions, geometry, spoken_direction
 from .options import FitOptions
+from .start import white_noise_of, within_positions
 from .windows import ThermalWindows
 
 if TYPE_CHECKING:
     from .evidence import ResidualRow
+    from .reduction import ReducedBag
     from .selection import Fit
 
 #: Smallest numbers of positions that determine bias and scale factor (six constants), the
 #: misalignment (three more constants), and by their norms the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
+#: Smallest span of the board temperature that shows whether the bias depends on temperature [K].
+LEAST_SPAN_K = 3.0
+#: Ratio of an RMS residual to white noise up to which noise explains the residual, and from which
+#: it is far above the noise.
+_NOISE, _FAR_ABOVE_NOISE = 2.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -67,31 +74,27 @@ def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
 def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
     """Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest."""
     yield _judge_positions(up)
+    used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
     if not windows.has_temperature:
-        text = (
-            'no change of temperature was read: the calibration holds at the temperature of the '
-            'test'
-        )
-        yield advice('temperature', text)
-        return
-    used_bags = {id(bag): bag for bag, _ in windows.rests}.values()
-    n_still = sum(interval.count.sum() for bag in used_bags for interval in bag.intervals)
-    part = 1.0 - windows.data.weight.sum() * windows.typical_count / max(n_still, 1.0)
-    if used_bags and part > 0.1:
+        what = 'no change of temperature was read'
+        if not any(len(bag.board.value) for bag in used_bags):
+            is_read = any(len(of.value) for bag in used_bags for of in bag.temperatures.values())
+            what = 'the bags have no thermometer'
+            what = 'the bags have no thermometer of the board' if is_read else what
         yield advice(
-            'unmeasured',
-            f'{100.0 * part:.0f} % of the time at rest has no temperatures and is left out: do '
-            'the thermometers and the accelerometer use the same clock?',
+            'temperature', f'{what}: the calibration holds at the temperature of the test'
         )
+        return
+    yield from _judge_unmeasured(windows, used_bags)
     span = float(np.ptp(windows.temperature))
     text = f'temperature span {span:.1f} degC'
     if span >= ADVISED_SPAN_K:
         yield Finding('span', 'good', text)
     else:
-        yield advice(
-            'span',
-            f'{text} ({ADVISED_SPAN_K:g} advised): run the chamber over the whole range of use',
-        )
+        why = 'run the chamber over the whole range of use'
+        if span < LEAST_SPAN_K and _has_drift(windows):
+            why = 'readings hardly change while the bias does: is the thermometer on the board?'
+        yield advice('span', f'{text} ({ADVISED_SPAN_K:g} advised): {why}')
     yield from _judge_ramps(windows)
     if not has_case:
         text = (
@@ -111,6 +114,45 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
                 f'the board temperature leads the case (correlation {correlation:.2f} of gradient '
                 'and rate): are the two sensors exchanged?',
             )
+
+
+def _judge_unmeasured(
+    windows: ThermalWindows, used_bags: Sequence[ReducedBag]
+) -> Iterator[Finding]:
+    """Report the samples at rest that are left out because their temperature is not known."""
+    n_still = sum(interval.count.sum() for bag in used_bags for interval in bag.intervals)
+    n_unsettled = 0.0
+    for bag, track in zip(used_bags, windows.tracks, strict=False):
+        for interval in bag.intervals:
+            since = (interval.time >= track.start_s) & (interval.time < track.settled_s)
+            n_unsettled += float(interval.count[since].sum())
+    n_used = float(windows.data.weight.sum()) * windows.typical_count
+    unsettled = n_unsettled / max(n_still, 1.0)
+    missing = 1.0 - n_used / max(n_still, 1.0) - unsettled
+    if used_bags and missing > 0.1:
+        yield advice(
+            'unmeasured',
+            f'{100.0 * missing:.0f} % of the time at rest has no temperatures and is left out: do '
+            'the thermometers and the accelerometer use the same clock?',
+        )
+    if unsettled > 0.1:
+        quantum = windows.model.detector.board.quantum_c
+        steps = f' (steps of {quantum:g} K)' if quantum else ''
+        yield advice(
+            'steps',
+            f'{100.0 * unsettled:.0f} % of the time at rest is left out: the board temperature is '
+            f'less certain than later until the reading of temperature/board{steps} changes for '
+            'the first time in a bag; begin with a ramp, or use a finer thermometer',
+        )
+
+
+def _has_drift(windows: ThermalWindows) -> bool:
+    """Whether the norm of the readings drifts within positions, far above the noise."""
+    data = windows.data
+    norm = np.linalg.norm(data.mean, axis=1, keepdims=True)
+    drift = float(np.sqrt(np.mean(within_positions(norm, data.position) ** 2)))
+    noise = float(np.sqrt(np.mean(white_noise_of(data, np.ones(3)) ** 2)))
+    return drift > _FAR_ABOVE_NOISE * noise > 0.0
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
@@ -260,22 +302,38 @@ def judge_result(
     rows: Sequence[ResidualRow],
     slow: float,
     options: FitOptions,
-    has_temperature: bool = True,
+    *,
+    span: float,
+    drift: float,
+    noise: float,
 ) -> Iterator[Finding]:
-    """Check the residuals; `slow`: sd of the bias that no temperature explains [m/s^2]."""
+    """
+    Check the residuals.
+
+    slow: sd of the bias that no temperature explains [m/s^2]
+    span: span of the board temperature [K]
+    drift: RMS of the residuals about their means in the positions [m/s^2]
+    noise: white noise of a window [m/s^2]
+    """
     overall = rows[-1]
     raw, fitted = overall.raw.rms / MICRO_G, overall.fitted.rms / MICRO_G
     others = ''
     if overall.left_out.n:
         others = f'{overall.left_out.rms / MICRO_G:.1f} ug on data left out, '
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
-    if has_temperature and slow / MICRO_G > max(0.3 * raw, 0.5 * fitted):
-        why = ': temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
-        yield advice('misfit', text + why)
-    elif raw < 1.2 * fitted and has_temperature:
+    is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
+    if span > 0.0 and is_slow and overall.fitted.rms > _NOISE * noise:
+        why = 'temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
+        if drift <= max(_NOISE * noise, 0.3 * overall.fitted.rms):
+            why = (
+                'the positions differ, while temperature explains the drift within them: the bias '
+                'does not repeat after the unit is mounted or switched on again'
+            )
+        yield advice('misfit', f'{text}: {why}')
+    elif raw < 1.2 * fitted and span >= LEAST_SPAN_K:
         why = ': no temperature drift above the noise; already compensated?'
         yield advice('compensated', text + why)
-    elif overall.left_out.rms > overall.raw.rms and has_temperature:
+    elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
         why = 'each position is predicted badly by the other positions; record more positions'
         yield advice('left out', f'{text}: left-out positions exceed the raw error: {why}')
     else:

@@ -24,6 +24,7 @@ from .gains import log_bayes_factors
 from .left_out import Score
 from .regression import Posterior, Regression
 from .selection import Fit
+from .start import within_positions
 from .unknowns import Noise, State
 from .windows import CURVE, SET
 
@@ -128,11 +129,22 @@ def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...
     return regression.solve(chosen.state, prior).state
 
 
+def _residual_of(fit: Fit) -> Floats:
+    """Return ``|f| - g`` of the windows in sample [m/s^2], shape (n,)."""
+    (_, regression, *_), state = fit, fit.posterior.state
+    sizes = regression.norms(state)[regression.windows.position]
+    return norm_residual(regression.force(state), sizes)
+
+
+def drift_of(fit: Fit) -> float:
+    """Return the RMS of the residuals in sample about their means in the positions [m/s^2]."""
+    residual = _residual_of(fit)[:, None]
+    return float(np.sqrt(np.mean(within_positions(residual, fit.windows.data.position) ** 2)))
+
+
 def position_reports(fit: Fit, left_out: Floats) -> tuple[PositionReport, ...]:
     """List the positions with their RMS residuals in sample and left out."""
-    (windows, regression, *_), state = fit, fit.posterior.state
-    sizes = regression.norms(state)[regression.windows.position]
-    residual = norm_residual(regression.force(state), sizes)
+    windows, state, residual = fit.windows, fit.posterior.state, _residual_of(fit)
     result = []
     for number, (bag, interval) in enumerate(windows.rests):
         rows = windows.data.position == number

@@ -36,7 +36,7 @@ from .environments import (
     is_better_without,
     with_excluded_error,
 )
-from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
+from .evidence import PositionReport, ResidualRow, drift_of, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
@@ -241,8 +241,12 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     residuals, left_out = residual_rows(fit)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
     K = fit.posterior.state.kappa * start.scale
-    has_temperature = fit.windows.has_temperature
-    findings += data_checks.judge_result(K, residuals, claim.offset_sd, options, has_temperature)
+    findings += data_checks.judge_result(
+        *(K, residuals, claim.offset_sd, options),
+        span=float(np.ptp(fit.windows.temperature)),
+        drift=drift_of(fit),
+        noise=fit.selected.score.noise,
+    )
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
     try:
         nonlinearity = of_file(fit.regression, terms, options)

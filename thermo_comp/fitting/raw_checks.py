@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,9 +69,17 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     if not any(interval.sample_sd.any() for bag in bags for interval in bag.intervals):
         text = 'at rest all samples are equal: does the sensor repeat one reading?'
         yield advice('stuck', text)
-    if dead := '; '.join(_dead_axes(bags)):
-        text = f'{dead}: the axis is dead there, leave out a bag with a dead axis'
-        yield Finding('stuck', 'refusal', text)
+    if dead := list(_dead_axes(bags)):
+        why = 'the axis is dead there, leave out a bag with a dead axis'
+        if top := _full_scale(bags, dead):
+            # A limit below the clipped reading, so that rounding does not exclude the reading.
+            limit = f'--full-scale {top * (1.0 - 1e-4):.5g}'
+            why = (
+                'the largest reading of the bags, with both signs or on several axes, is the full '
+                f'scale: leave out a clipped bag, or the clipped rests of a bag with {limit}'
+            )
+        text = '; '.join(axis.text for axis in dead)
+        yield Finding('stuck', 'refusal', f'{text}: {why}')
     size = _typical_size(bags)
     yield from _judge_thermometers(bags)
     yield from _judge_units(bags, size, options)
@@ -136,8 +145,28 @@ def _judge_units(
             )
 
 
-def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[str]:
-    """Describe axes that are constant throughout a rest, but not in most of the rests."""
+class _DeadAxis(NamedTuple):
+    """An axis that is constant throughout a rest: the reading, and a description."""
+
+    axis: int
+    value: float
+    text: str
+
+
+def _full_scale(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> float:
+    """
+    Return the magnitude of the dead axes' readings if it is the largest of all rests and occurs
+    with both signs or on several axes, as at the full scale; else 0.
+    """
+    largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
+    # The limits of a two's complement differ by one count.
+    is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
+    ends = {(axis.axis, axis.value > 0.0) for axis in dead}
+    return largest if is_at_top.all() and len(ends) > 1 else 0.0
+
+
+def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
+    """Find axes that are constant throughout a rest, but not in most of the rests."""
     rests = [(bag.source.name, rest) for bag in bags for rest in bag.intervals]
     alive = np.array([rest.sample_sd > 0.0 for _, rest in rests])
     usual = 2 * alive.sum(axis=0) >= len(rests)
@@ -146,8 +175,9 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[str]:
         # The samples of a working axis show noise or drift within a thousand samples.
         for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
             hours = (rest.end_ns - rest.start_ns) / 3600e9
-            letter, value = 'xyz'[axis], rest.mean[0, axis]
-            yield f'{name}: {letter} reads {value:g} to the bit for {hours:.2g} h'
+            value = float(rest.mean[0, axis])
+            text = f'{name}: {"xyz"[axis]} reads {value:g} to the bit for {hours:.2g} h'
+            yield _DeadAxis(int(axis), value, text)
 
 
 def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:

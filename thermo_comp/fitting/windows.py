@@ -130,12 +130,15 @@ class Track(NamedTuple):
 
     start_s, step_s: start and step of the time grid [s]
     states: thermal states, shape (n, width); is_known: which states are known, shape (n,)
+    settled_s: time from which the estimate of the board temperature is settled [s]: in the first
+        step of coarse readings, the temperature is only known to this step
     """
 
     start_s: float
     step_s: float
     states: Floats
     is_known: Bools
+    settled_s: float = -np.inf
 
 
 @dataclass(frozen=True)
@@ -385,8 +388,9 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     step_s = max(shortest / 5.0, 0.1)
     start_s, states, is_known = thermal_states(bag, tracker, step_s)
     is_settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
-    is_known[: int(np.argmax(is_settled))] = False
-    return Track(start_s, step_s, states, is_known)
+    n_unsettled = int(np.argmax(is_settled))
+    is_known[:n_unsettled] = False
+    return Track(start_s, step_s, states, is_known, start_s + step_s * n_unsettled)
 
 
 def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
