@@ -147,18 +147,18 @@ class Score:
         return max(known, default=float('nan'))
 
 
-def is_better(before: Score, after: Score, *, by_halves: bool = True, errors: float = 1.0) -> bool:
+def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
     """
-    Whether the second model is better on left-out data by more than `errors` standard errors.
-    Halves of the program limit the number of columns, so `by_halves` is false for models of the
-    same columns.
+    Whether the second model is better on left-out data by more than the standard error. Halves of
+    the program limit the number of columns, so `by_halves` is false for models of the same
+    columns.
     """
-    return gain(before, after, by_halves=by_halves, errors=errors) > 0.0
+    return gain(before, after, by_halves=by_halves) > 0.0
 
 
-def gain(before: Score, after: Score, *, by_halves: bool = True, errors: float = 1.0) -> float:
+def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
-    Return the gain by a model if each gain exceeds `errors` standard errors, else 0.
+    Return the gain by a model if the gain exceeds its standard errors, else 0.
 
     The gain is the sum of the log gains of the drift of positions and of sections. If the drifts
     are equal, the gain is the log gain of the norms of left-out positions, which must exceed two
@@ -178,7 +178,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True, errors: float =
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0
     total = sum(gain for gain, _ in drift)
-    is_sure = bool(must_gain) and all(gain > errors * error for gain, error in must_gain)
+    is_sure = bool(must_gain) and all(gain > error for gain, error in must_gain)
     if is_sure and total > _EQUAL * len(drift):
         return total
     is_sure = norms is not None and norms[0] > max(2.0 * norms[1], _EQUAL)

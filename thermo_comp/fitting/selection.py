@@ -274,8 +274,7 @@ def select(
         parts = better_beginning([growth.extended(fit, (PART,)) for fit in fits])
     chosen, tried = _grown(growth, first, parts, progress)
     trials += tried
-    # The best of several models is better by chance more often than one model: two errors.
-    if chosen is not constants and not is_better(constants.score, chosen.score, errors=2.0):
+    if chosen is not constants and not is_better(constants.score, chosen.score):
         more_evidence = chosen.posterior.log_evidence - constants.posterior.log_evidence
         if not is_undecided(constants.score, chosen.score) or more_evidence < TRIAL_GAIN:
             chosen = constants
