@@ -150,7 +150,8 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
         fit([turned(rng, np.repeat(positions(9, 3), n, axis=0))], OPTIONS) for n in (1, 5)
     )
     sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, cut))
-    assert sd_cut == pytest.approx(sd, rel=0.5)
+    # Nine norms do not determine the sd, which stays at its prior in both fits.
+    assert sd_cut == pytest.approx(sd, rel=0.1)
     assert {'mountings'} <= {finding.name for finding in cut.findings}
     # The rests of a mounting are left out together.
     assert len(cut.fit.selected.score.norms.square) == 9

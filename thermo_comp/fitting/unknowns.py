@@ -129,8 +129,8 @@ class Windows:
         """
         first, bag = self.edges[:-1], self.bag_of_position
         means = np.add.reduceat(self.mean, first, axis=0) / np.diff(self.edges)[:, None]
-        turn = np.linalg.norm(np.diff(means, axis=0), axis=1) / np.linalg.norm(means[1:], axis=1)
-        is_new = (bag[1:] != bag[:-1]) | ~(turn < math.radians(2.0))
+        step, size = np.linalg.norm(np.diff(means, axis=0), axis=1), np.linalg.norm(means, axis=1)
+        is_new = (bag[1:] != bag[:-1]) | (step >= math.radians(2.0) * size[1:])
         return np.concatenate(([0], np.cumsum(is_new)))
 
     @property
