@@ -23,7 +23,8 @@ from thermo_comp.unit.columns import (
     bank,
     memory_of,
 )
-from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.correction import VARIANCES, Correction
+from thermo_comp.unit.covariance import N_ROWS
 from thermo_comp.unit.terms import TERMS, Term
 
 WIDE = {'range': UNBOUNDED}
@@ -159,11 +160,11 @@ def test_a_new_kind_of_column_is_one_class(monkeypatch):
     state = tracker.sample(599 * SECOND_NS)
     place = Layout(correction.memory).places[Rate('case')]
     rate, variance = state[place : place + 2]
-    line = correction.line(state, state, np.zeros(9), 0.0)
+    line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
     assert line[8] == pytest.approx(3e6 * rate**2) == pytest.approx(300.0, rel=0.02)
     # d(bias)/d(rate) = 2 * 3e6 rate; 300 counts per m/s^2.
     by_rate = (2.0 * 3e6 * rate / 300.0) ** 2 * variance
-    assert line[18] - correction.noise[2] == pytest.approx(by_rate, rel=1e-6)
+    assert line[VARIANCES[2]] - correction.noise[2] == pytest.approx(by_rate, rel=1e-6)
     with pytest.raises(ValueError, match=r'make a bias within .* of its column'):
         calibration(response=(term('rate_square', (1e13, 0.0, 0.0), range=(0.0, 1e9)),))
 

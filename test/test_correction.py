@@ -34,7 +34,8 @@ from thermo_comp.unit.calibration import (
     parameter_layout,
 )
 from thermo_comp.unit.columns import bank
-from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.correction import VARIANCES, Correction
+from thermo_comp.unit.covariance import N_ROWS, CovarianceMap, covariance_at
 from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
 from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import SlowUncertainty
@@ -144,7 +145,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
     sd = np.full(n, 1e-3)
     for block in layout.scale:
         sd[block.static : block.end] = 1e-6
-    sd[layout.misalignment :] = 0.0
+    sd[layout.misalignment :] = 2e-6
     root = rng.standard_normal((n, 5)) * sd[:, np.newaxis]
     covariance = root @ root.T + np.diag(0.3 * sd**2)
     posterior = posterior_of(covariance)
@@ -165,12 +166,31 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
             moved[1, axis] += (1.0 - weights) * d[block.static] + weights * d[block.dynamic]
         scatter.append(moved)
     scatter = np.array(scatter)
+    tilted = np.zeros((len(draws), 3, 3))
+    tilted[:, [1, 2, 2], [0, 0, 1]] = draws[:, layout.misalignment :]
+    M = np.array([[1.0, 0.0, 0.0], [0.1, 1.0, 0.0], [-0.2, 0.15, 1.0]])
+    elements = CovarianceMap((0.1, -0.2, 0.15))
     for k, state in enumerate(pair.T.tolist()):
-        for axis, (a, b, c) in enumerate(np.reshape(slow.at(state, nobody), (3, 3))):
+        rows = np.array(slow.at(state, nobody))[:, np.newaxis]
+        coefficients = elements.coefficients(rows)[:, 0].tolist()
+        for axis, (a, b, c) in enumerate(rows[:9].reshape(3, 3)):
             for x in (-9.8, 0.0, 9.8):
                 variance = np.var(scatter[:, 0, axis, k] + scatter[:, 1, axis, k] * x)
                 # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %; tolerance: 4 sd.
                 assert a + b * x + c * x * x == pytest.approx(variance, rel=0.33)
+        for force in rng.uniform(-9.8, 9.8, (5, 3)):
+            along = -scatter[:, 0, :, k] - scatter[:, 1, :, k] * force
+            errors = along @ M.T + tilted @ force
+            expected = np.cov(errors.T)
+            claimed = np.zeros((3, 3))
+            claimed[np.triu_indices(3)] = covariance_at(coefficients, *force.tolist())
+            claimed += np.triu(claimed, 1).T
+            # A covariance from n draws has an sd of at most sqrt(2 / n) of both sds; 4 sd.
+            sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+            assert (np.abs(claimed - expected) < 0.33 * sds).all()
+            # Along every direction, too: the correlations of the axes are not lost.
+            root = np.linalg.inv(np.linalg.cholesky(expected))
+            assert np.abs(root @ claimed @ root.T - np.eye(3)).max() < 0.5
 
 
 def drawn(unit, layout, d):
@@ -225,7 +245,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     small = 0.05
     moved[places] += small * (draws * np.array(shares)).T
     values = Correction(wide).bias_scale(moved)
-    for axis, (a, b, c) in enumerate(np.reshape(slow, (3, 3))):
+    for axis, (a, b, c) in enumerate(np.reshape(slow[:9], (3, 3))):
         bias, scale = values[:, axis]
         for x in (-9.8, 0.0, 9.8):
             expected = np.var(bias / 300.0 + scale / 300.0 * x) / small**2
@@ -307,10 +327,11 @@ def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
     )
     correction = Correction(unit)
     inside, outside = ((20.0, 0.0, 0.0, 0.0, 0.0, g, 0.0) for g in (1.0, 3.0))
-    edge, beyond = (correction.line(s, s, np.zeros(9), 0.0) for s in (inside, outside))
+    edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    assert beyond[15:18].tolist() == edge[15:18].tolist()
+    of_y = [27, 29, 32]  # constant, y and y^2 of the element yy
+    assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert excess.relative == pytest.approx(2.0)
     assert excess[:3] == (0.0, 0.0, 2.0)
@@ -324,7 +345,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
     state[BOARD] = board
     for lag in layout.lags:
         state[layout.places[lag]] = behind
-    line = correction.line(tuple(state), tuple(state), np.zeros(9), 0.0)
+    line = correction.line(tuple(state), tuple(state), np.zeros(N_ROWS), 0.0)
     a, b, c = line[12:15]
     return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
 
@@ -438,7 +459,7 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
             state = [0.0] * Layout(correction.memory).width
             state[BOARD] = 20.0 + sign * (15.0 + beyond)
             line = correction.line(state, state, np.array(slow.at(state, nobody)), 0.0)
-            variances.append(line[12:].reshape(3, 3)[:, 0])
+            variances.append(line[list(VARIANCES)])
         assert (np.diff(variances, axis=0) > 0.0).all()
         # The claimed sd is at least the error of a curve that is constant from the edge on.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]

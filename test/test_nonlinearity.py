@@ -19,6 +19,7 @@ from thermo_comp.thermal.state import BOARD, Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.covariance import N_ROWS
 from thermo_comp.unit.gravity import STANDARD_GRAVITY as G
 from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm, linearised
 from thermo_comp.unit.posterior import posterior_of
@@ -109,7 +110,7 @@ def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
     state = np.zeros(Layout(correction.memory).width)
     state[BOARD] = 20.0 + t
     slow = SlowUncertainty(unit, correction).at(state.tolist(), [])
-    linear, beyond = np.reshape(slow[:9], (3, 3)), np.reshape(slow[9:], (3, 5))
+    linear, beyond = np.reshape(slow[:9], (3, 3)), np.reshape(slow[N_ROWS:], (3, 5))
     for axis in range(3):
         for f in (-60.0, -9.8, 0.0, 30.0):
             along = np.zeros(layout.n_parameters)

@@ -28,7 +28,9 @@ from ..thermal.state import BOARD, Layout
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.correction import Correction
+from ..unit.covariance import covariance_at
 from ..unit.metrics import means_by
+from ..unit.nonlinearity import nonlinear_covariance
 from ..unit.prediction import SlowUncertainty
 from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
@@ -214,9 +216,11 @@ def series_of(
     v = u @ M
     white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
     noise = (v**2 * white).sum(axis=1) / sizes
-    bare = SlowUncertainty(replace(calibration, posterior=None), correction)
-    full = SlowUncertainty(calibration, correction)
-    slow, claim = (_along(correction, states, shares, model, v, x) for model in (bare, full))
+    without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
+    bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
+    slow, claim = (_along(correction, states, shares, model, u, x) for model in (bare, full))
+    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
+    slow, claim = slow - of_one_sample, claim - of_one_sample
     unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
     slow -= (v**2 * unexplained).sum(axis=1)
     residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
@@ -281,23 +285,23 @@ def _along(
     states: Floats,
     shares: Floats,
     slow: SlowUncertainty,
-    v: Floats,
+    u: Floats,
     x: Floats,
 ) -> Floats:
-    """Return the error variance along the force, without the noise of a sample."""
+    """Return the error variance along the force's directions u, with the noise of a sample."""
     parts = np.array(
         [slow.at(s, p) for s, p in zip(states.tolist(), shares.tolist(), strict=True)]
     )
     columns = states.T
-    line = correction.line(columns, columns, parts.T, np.zeros(len(states)))
-    a, b, c = np.moveaxis(line[12:21].reshape(3, 3, -1), 1, 0)
-    higher: Floats = np.zeros_like(x.T)
-    if correction.of_force is not None:
-        for row in np.moveaxis(line[21:].reshape(3, 7, -1)[:, 3:], 1, 0)[::-1]:
-            higher = x.T * (row + higher)
-    variance = a + x.T * (b + x.T * (c + higher))
-    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
-    return np.asarray((v.T**2 * variance).sum(axis=0) - of_one_sample)
+    line = list(correction.line(columns, columns, parts.T, np.zeros(len(states))))
+    covariance = (
+        covariance_at(line[12:], *x.T)
+        if correction.of_force is None
+        else nonlinear_covariance(line, correction.misalignment, *x.T)
+    )
+    i, j = np.triu_indices(3)
+    products = u[:, i] * u[:, j] * np.where(i == j, 1.0, 2.0)
+    return np.asarray((products.T * np.array(covariance)).sum(axis=0))
 
 
 def _by_parameter(

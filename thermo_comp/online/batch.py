@@ -176,7 +176,7 @@ def _apply(
 ) -> CompensatedBlock:
     """Correct the samples of segments; return the published samples."""
     correction, of_rate = compensator.thermal.correction, compensator.thermal.rate_correction
-    line = rate_line = np.empty((21, 0))
+    line = rate_line = np.empty((0, 0))
     if segments:
         n_slow = correction.n_slow
         line = _line(correction, segments, slice(n_slow))
@@ -226,7 +226,7 @@ def _corrected(
     start_ns = np.array([one.start_ns for one in each], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
     order = range(6) if misalignment is None else _COLUMNS
-    corrected_force = corrected if len(table) == 21 else corrected_nonlinear
+    corrected_force = corrected if len(misalignment or ()) == 3 else corrected_nonlinear
     n = len(stamps)
     result = np.empty((len(order), n))
     # Samples that are not finite are corrected like all others; the caller drops them.
@@ -237,7 +237,7 @@ def _corrected(
             high = int(np.searchsorted(ends, stop, 'left')) + 1
             counts = np.diff(np.minimum(ends[low:high], stop), prepend=begin)
             dt = (stamps[begin:stop] - np.repeat(start_ns[low:high], counts)) * 1e-9
-            line = np.repeat(table[:, low:high], counts, axis=1)
+            line = list(np.repeat(table[:, low:high], counts, axis=1))
             x, y, z = samples[begin:stop].T
             values = (
                 corrected_rate(line, dt, x, y, z)

@@ -13,7 +13,7 @@ first sample of each segment, so that the checks cost nothing per sample.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Final, TypeVar
@@ -22,7 +22,8 @@ from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.correction import Excess, is_sound
+from ..unit.correction import VARIANCES, Excess, is_sound
+from ..unit.covariance import covariance_at
 from ..unit.functions import TANGENT_SPANS
 from ..unit.nonlinearity import corrected_nonlinear
 from .checks import GravityCheck, StuckCheck
@@ -301,7 +302,7 @@ class Compensator:
     def status(self) -> CompensatorStatus:
         """Return the state of the compensator, for diagnostics."""
         thermal = self.thermal
-        tracker, rate = thermal.tracker, thermal.rate_correction
+        tracker = thermal.tracker
         detector, gravity = tracker.detector, self.gravity
         stamp_ns = tracker.updated_ns if self.now_ns is None else self.now_ns
         ahead_s = 0.0 if stamp_ns is None else thermal.queue.ahead(stamp_ns)
@@ -334,43 +335,34 @@ class Compensator:
             tracker.lead.is_reversed,
             gravity.result,
             gravity.is_refuted,
-            thermal.bias_sd(rate, self.rate_line[12::3]) if rate else (),
+            self._rate_bias_sd(),
         )
+
+    def _rate_bias_sd(self) -> tuple[float, ...]:
+        correction, line = self.thermal.rate_correction, self.rate_line
+        if correction is None or not line:
+            return ()
+        return self.thermal.bias_sd(correction, [line[place] for place in VARIANCES])
 
 
 def corrected(
-    line: Iterable[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
+    line: Sequence[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
     """Return force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s after a segment began."""
-    (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
-     ax, lx, qx, ay, ly, qy, az, lz, qz) = line  # fmt: skip
-    yx, zx, zy, var_yx, var_zx, var_zy = misalignment
+    bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
+    yx, zx, zy = misalignment
     # Eq. (7) of the paper, solved for the input of each axis.
     x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
     y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
     z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)
-    vx = ax + x * (lx + x * qx)
-    vy = ay + y * (ly + y * qy)
-    vz = az + z * (lz + z * qz)
-    xx = x * x
-    cxy = yx * vx
-    cxz = zx * vx
-    return (
-        x,
-        yx * x + y,
-        zx * x + zy * y + z,
-        vx,
-        cxy,
-        cxz,
-        yx * cxy + vy + xx * var_yx,
-        yx * cxz + zy * vy,
-        zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy,
-    )
+    xx, xy, xz, yy, yz, zz = covariance_at(line[12:], x, y, z)
+    return x, yx * x + y, zx * x + zy * y + z, xx, xy, xz, yy, yz, zz
 
 
 def corrected_rate(
-    line: Iterable[Real], dt: Real, x: Real, y: Real, z: Real
+    line: Sequence[Real], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real]:
     """Return the angular rate x, y, z and each axis' variance, `dt` s after a segment's start."""
-    bx, bx1, _, _, by, by1, _, _, bz, bz1, _, _, xx, _, _, yy, _, _, zz, _, _ = line
+    bx, bx1, _, _, by, by1, _, _, bz, bz1 = line[:10]
+    xx, yy, zz = (line[place] for place in VARIANCES)
     return x - (bx + bx1 * dt), y - (by + by1 * dt), z - (bz + bz1 * dt), xx, yy, zz

@@ -7,7 +7,8 @@ Thermal states are columns, shape (width, n), of the numbers that `thermal.state
 single state n = 1. Sums run in a fixed order and each state is evaluated alone, so a stream and a
 batch get the same bits. Results for three axes stand in rows: the bias of x, y, z, then the scale
 of x, y, z. The notation is that of `calibration`; x is the specific force of an axis before the
-misalignment, and the error variance of x is ``v(x) = a + b x + c x^2`` [m^2/s^4].
+misalignment, and the error variance of x is ``v(x) = a + b x + c x^2`` [m^2/s^4]. The covariance
+of errors of different axes, and of the misalignment, comes from `covariance`.
 """
 
 from collections.abc import Sequence
@@ -21,8 +22,9 @@ from ..thermal.state import BOARD, UNKNOWN, VAR_BOARD, WEIGHT, Layout
 from ..typing import Floats
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
+from .covariance import CONSTANTS, N_ROWS, CovarianceMap, grown, misalignment_variances
 from .curves import Curves
-from .functions import hold
+from .functions import hold, in_order
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection
 
@@ -41,6 +43,8 @@ _LEAST_SHARE = 1e-13
 #: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
 #: samples do not overflow.
 _LARGEST = 1e140
+#: Places of the variances of the axes at zero force in a result of `Correction.line`.
+VARIANCES = tuple(12 + place for place in CONSTANTS)
 #: Number of thermal states from which one call per column costs less than a table of all sums.
 _FEW = 64
 #: Largest number of thermal states evaluated at once, to bound the memory.
@@ -63,7 +67,7 @@ class Correction:
     memory: memory that the tracker needs for force and angular rate, or the tracker's memory
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
-    misalignment: yx, zx, zy of M and their variances; with a nonlinearity then its constants
+    misalignment: yx, zx, zy of M; with a nonlinearity then its constants
     """
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
@@ -95,19 +99,16 @@ class Correction:
         )
         self.noise_trace = sum(self.noise, 0.0)
         self._noise = np.array(self.noise)[:, np.newaxis]
-        M, variances = calibration.misalignment, [sd**2 for sd in calibration.misalignment_sd]
-        posterior = calibration.posterior
-        if posterior is not None:
-            of_elements = (posterior.matrix[-3:] ** 2).sum(axis=1) + posterior.variances[-3:]
-            variances = of_elements.tolist()
-        self.misalignment: tuple[float, ...] = (M[1][0], M[2][0], M[2][1], *variances)
+        M = calibration.misalignment
+        self.misalignment: tuple[float, ...] = (M[1][0], M[2][0], M[2][1])
+        self._covariance = CovarianceMap(self.misalignment)
         #: The nonlinearity over specific force; None if the calibration has none.
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
             self.misalignment += self.of_force.constants
         #: Number of rows of the slow part of the error variance.
-        self.n_slow = 9 if self.of_force is None else 24
+        self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
         """
@@ -192,11 +193,11 @@ class Correction:
         Evaluate the correction of segments, linear in time between the thermal states at both
         ends.
 
-        `slow` is the slow part of the error variance's coefficients a, b, c by axis, shape (9, n).
-        Returns by axis bias and its change over the segment, scale and its change, then by axis
-        the coefficients a, b, c of the error variance with the noise of a message: (21,) or (21,
-        n). With a nonlinearity `slow` has 15 more rows and the result 21 more, see
-        `ForceCorrection.rows`.
+        `slow` is the slow part of the error's covariance, shape (n_slow, n), see
+        `SlowUncertainty.at`. Returns by axis bias and its change over the segment, scale and its
+        change, then the coefficients of the covariance with the noise of a message, see
+        `covariance.covariance_at`: (52,) or (52, n). With a nonlinearity `slow` has 15 more rows
+        and the result 21 more, see `ForceCorrection.rows`.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -217,22 +218,24 @@ class Correction:
         factors_at_end = factors[0][:, n:], factors[1][:, n:]
         gap = (sets[1] - sets[0])[:, n:]
         slow = np.reshape(slow, (self.n_slow, n))
-        unchanging = slow[:9].reshape(3, 3, n)
-        v = self._variance(states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, unchanging)
+        v, growth = self._variance(
+            states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, slow[:9].reshape(3, 3, n)
+        )
+        between = grown(slow[9:N_ROWS], growth)
         # The largest force that each axis can measure [m/s^2], and the error variance at this
         # force.
         most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
-        variance = v[:, 0] + most * (
-            np.abs(v[:, 1]) + most * (v[:, 2] + max(self.misalignment[3:]))
-        )
+        tilts = misalignment_variances(between).max(axis=0)
+        variance = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + tilts))
         least = _LEAST_SHARE * variance.max(axis=0)
         v[:, 0] += np.maximum(self._noise * (1.0 + np.asarray(noise_excess)), least)
         beyond = np.empty((0, n))
         if self.of_force is not None:
-            v[:, 2] += slow[9::5]
+            v[:, 2] += slow[N_ROWS::5]
             middle = 0.5 * (board[:n] + board[n:])
-            beyond = self.of_force.rows(middle, slow[9:])
-        line = np.concatenate((both.swapaxes(0, 1).reshape(12, n), v.reshape(9, n), beyond))
+            beyond = self.of_force.rows(middle, slow[N_ROWS:])
+        covariance = self._covariance.coefficients(np.concatenate((v.reshape(9, n), between)))
+        line = np.concatenate((both.swapaxes(0, 1).reshape(12, n), covariance, beyond))
         return line.reshape(-1, *ends.shape[2:])
 
     def _variance(
@@ -243,9 +246,10 @@ class Correction:
         factors: tuple[Floats, Floats],
         gap: Floats,
         slow: Floats,
-    ) -> Floats:
+    ) -> tuple[Floats, Floats]:
         """
-        Evaluate a, b, c of each axis' error variance, (3, 3, n), without the noise of a message.
+        Evaluate a, b, c of each axis' error variance, (3, 3, n), without the noise of a message,
+        and the factor (3, n) by which the variance of the parameters grows outside the ranges.
 
         The difference of the two sets (`gap`) is added as an error while the sets are blended,
         outside the ranges, and while the regime is unknown; while it is unknown the variances of
@@ -268,6 +272,7 @@ class Correction:
         v = self._spread(np.concatenate(variances), np.concatenate((slopes + on_board, by_pair)))
         v[:, 0] += (shares[:, np.newaxis] * self.curves.unexplained(board)).sum(axis=0)
         v += slow
+        growth = np.ones((3, len(board)))
         is_beyond = bool(beyond_range.any())
         # A part that lags the board may still be outside the range when the board is back inside.
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
@@ -285,10 +290,11 @@ class Correction:
             v += self._spread(np.concatenate((bent, bent)), bends)
             # The posterior holds within the calibrated ranges, so the variance grows with the
             # distance outside.
-            v *= (1.0 + (outside + columns_out) ** 2)[:, np.newaxis]
+            growth = 1.0 + (outside + columns_out) ** 2
+            v *= growth[:, np.newaxis]
         of_gap = unknown + weight * static_weight + outside * outside
         if not (is_beyond or of_gap.any()):
-            return v
+            return v, growth
         if self.table.differs:
             of_static, of_dynamic = (
                 self.table.factors(board, np.full_like(weight, w))[0] for w in (0.0, 1.0)
@@ -296,7 +302,7 @@ class Correction:
             gap = self._weigh(held * (of_dynamic - of_static), gap)
         held_back = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
         of_gaps = np.array([of_gap, np.ones_like(of_gap)])
-        return np.asarray(v + self._spread(of_gaps, np.array([gap, held_back])))
+        return v + self._spread(of_gaps, np.array([gap, held_back])), growth
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
@@ -316,11 +322,3 @@ def is_sound(line: Floats) -> npt.NDArray[np.bool_]:
     scale = line[2:12:4]
     is_finite = (np.abs(line) < _LARGEST).all(axis=0)
     return np.asarray(is_finite & (scale * (scale + line[3:12:4]) > 0.0).all(axis=0))
-
-
-def in_order(values: Floats, axis: int) -> Floats:
-    """Sum along an axis in a fixed order, whatever the size of the other axes."""
-    if not values.shape[axis]:
-        return np.asarray(values.sum(axis=axis))
-    total: Floats = np.add.accumulate(values, axis=axis).take(-1, axis)
-    return total

@@ -291,3 +291,11 @@ def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
     curvature = np.linalg.solve(matrix, right)
     b = slopes - h * (2.0 * curvature[:-1] + curvature[1:]) / 6.0
     return np.array([y[:-1], b, curvature[:-1] / 2.0, np.diff(curvature) / (6.0 * h)])
+
+
+def in_order(values: Floats, axis: int) -> Floats:
+    """Sum along an axis in a fixed order, whatever the size of the other axes."""
+    if not values.shape[axis]:
+        return np.asarray(values.sum(axis=axis))
+    total: Floats = np.add.accumulate(values, axis=axis).take(-1, axis)
+    return total

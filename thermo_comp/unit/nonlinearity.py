@@ -12,14 +12,15 @@ the sensitivity axis. With x and f in g, as in IEEE Std 1293::
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
 
 import numpy as np
 
 from ..quantities import QUANTITIES
 from ..typing import Floats
+from .covariance import N_COEFFICIENTS, covariance_at
 from .functions import hold
 from .gravity import STANDARD_GRAVITY
 from .schema import Vector, check_ranges
@@ -34,6 +35,9 @@ POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
 #: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
 #: sufficient.
 LARGEST_SLOPE = 0.2
+
+#: Place of the first coefficient of the nonlinearity in a result of `Correction.line`.
+_NONLINEAR: Final = 12 + N_COEFFICIENTS
 
 # Type of a quantity: the value of one sample, or an array of many samples.
 Real = TypeVar('Real', float, Floats)
@@ -128,37 +132,39 @@ def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
 
 
 def corrected_nonlinear(
-    line: Iterable[Real], constants: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
+    line: Sequence[Real], constants: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
     """Correct a sample as `online.compensator.corrected` does, for axes with a nonlinearity."""
-    (bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1,
-     ax, lx, qx, ay, ly, qy, az, lz, qz,
-     k2x, kqx, k3x, dx, ex, fx, gx, k2y, kqy, k3y, dy, ey, fy, gy,
-     k2z, kqz, k3z, dz, ez, fz, gz) = line  # fmt: skip
-    yx, zx, zy, var_yx, var_zx, var_zy, edge, growth = constants
+    bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
+    k2x, kqx, k3x, k2y, kqy, k3y, k2z, kqz, k3z = line[_NONLINEAR : _NONLINEAR + 9]
+    yx, zx, zy = constants[:3]
     # Eq. (7) of the paper is solved for the input of each axis, then the nonlinearity.
     x = linearised((x - (bx + bx1 * dt)) / (sx + sx1 * dt), k2x, kqx, k3x)
     y = linearised((y - (by + by1 * dt)) / (sy + sy1 * dt), k2y, kqy, k3y)
     z = linearised((z - (bz + bz1 * dt)) / (sz + sz1 * dt), k2z, kqz, k3z)
-    vx = ax + x * (lx + x * (qx + x * (dx + x * (ex + x * (fx + x * gx)))))
-    vy = ay + y * (ly + y * (qy + y * (dy + y * (ey + y * (fy + y * gy)))))
-    vz = az + z * (lz + z * (qz + z * (dz + z * (ez + z * (fz + z * gz)))))
-    vx = vx + _grown(x, edge, growth)
-    vy = vy + _grown(y, edge, growth)
-    vz = vz + _grown(z, edge, growth)
-    xx = x * x
+    xx, xy, xz, yy, yz, zz = nonlinear_covariance(line, constants, x, y, z)
+    return x, yx * x + y, zx * x + zy * y + z, xx, xy, xz, yy, yz, zz
+
+
+def nonlinear_covariance(
+    line: Sequence[Real], constants: tuple[float, ...], x: Real, y: Real, z: Real
+) -> tuple[Real, Real, Real, Real, Real, Real]:
+    """Evaluate the covariance as `covariance_at` does, for axes with a nonlinearity."""
+    xx, xy, xz, yy, yz, zz = covariance_at(line[12:_NONLINEAR], x, y, z)
+    dx, ex, fx, gx, dy, ey, fy, gy, dz, ez, fz, gz = line[_NONLINEAR + 9 :]
+    yx, zx, zy, edge, growth = constants
+    vx = x * x * x * (dx + x * (ex + x * (fx + x * gx))) + _grown(x, edge, growth)
+    vy = y * y * y * (dy + y * (ey + y * (fy + y * gy))) + _grown(y, edge, growth)
+    vz = z * z * z * (dz + z * (ez + z * (fz + z * gz))) + _grown(z, edge, growth)
     cxy = yx * vx
     cxz = zx * vx
     return (
-        x,
-        yx * x + y,
-        zx * x + zy * y + z,
-        vx,
-        cxy,
-        cxz,
-        yx * cxy + vy + xx * var_yx,
-        yx * cxz + zy * vy,
-        zx * cxz + zy * zy * vy + vz + xx * var_zx + y * y * var_zy,
+        xx + vx,
+        xy + cxy,
+        xz + cxz,
+        yy + (yx * cxy + vy),
+        yz + (yx * cxz + zy * vy),
+        zz + (zx * cxz + zy * zy * vy + vz),
     )
 
 
@@ -209,11 +215,12 @@ class ForceCorrection:
 
     def rows(self, board: Floats, slow: Floats) -> Floats:
         """
-        Return by axis K2, Kq, K3 and the variance's coefficients of x^3 to x^6, shape (21, n);
+        Return K2, Kq, K3 by axis, then the variance's coefficients of x^3 to x^6 by axis, (21, n);
         rows of the slow part: by axis the coefficients of x^2 to x^6, shape (15, n).
         """
         k = self._of.coefficients(self.held(board)).swapaxes(0, 1)
-        return np.concatenate((k, slow.reshape(3, 5, -1)[:, 1:]), axis=1).reshape(21, -1)
+        higher = slow.reshape(3, 5, -1)[:, 1:]
+        return np.concatenate((k.reshape(9, -1), higher.reshape(12, -1)))
 
     def variance(
         self, t: float, rows: Floats, rest: Floats, on_bias: Floats, on_scale: Floats

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns predictions for a thermal state: the slow part of the error variance (by the parameters, and
+Owns predictions for a thermal state: the slow part of the error covariance (by the parameters, and
 by lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
@@ -20,10 +20,11 @@ from ..thermal.state import BOARD, WEIGHT, Gradient, Layout, Rate
 from ..typing import Floats
 from .calibration import Calibration, parameter_layout
 from .correction import Correction
+from .covariance import rows_between
 
 
 class SlowUncertainty:
-    """Error variance of a thermal state by the posterior and by the unknown initial lag states."""
+    """Error covariance of a thermal state by the posterior and the unknown initial lag states."""
 
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
@@ -32,6 +33,8 @@ class SlowUncertainty:
         #: By axis the rows of the posterior's factor, and the added variances: of bias, scale and
         #: nonlinear terms.
         self._blocks: list[list[tuple[Floats, Floats]]] = []
+        #: The same of the misalignment.
+        self._misalignment = np.zeros((3, 0)), np.square(calibration.misalignment_sd)
         posterior = calibration.posterior
         if posterior is None:
             return
@@ -39,19 +42,15 @@ class SlowUncertainty:
         matrix, diagonal = posterior.matrix, posterior.variances
         for bias, scale, force in zip(layout.bias, layout.scale, layout.force, strict=True):
             parts = bias.rows, scale.rows, force
-            variances = [diagonal[part] for part in parts]
-            rows = np.concatenate([matrix[part] for part in parts])
-            if matrix.shape[1] > len(rows):
-                # An equivalent factor of the covariance of one axis has fewer columns.
-                rows = np.ascontiguousarray(np.linalg.qr(rows.T)[1].T)
-            by_part = np.split(rows, np.cumsum([len(part) for part in variances])[:-1])
-            self._blocks.append(list(zip(by_part, variances, strict=True)))
+            self._blocks.append([(matrix[part], diagonal[part]) for part in parts])
+        self._misalignment = matrix[layout.misalignment :], diagonal[layout.misalignment :]
 
     def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
         """
-        Evaluate a, b, c of each axis' error variance ``v(x) = a + b x + c x^2`` [m^2/s^4] at one
-        thermal state; with a nonlinearity then its contribution to the coefficients of x^2 to x^6
-        of each axis.
+        Evaluate the rows of the error covariance (see `unit.covariance`) at one thermal state: a,
+        b, c of each axis' error variance ``v(x) = a + b x + c x^2`` [m^2/s^4], then the rows
+        between axes and misalignment; with a nonlinearity then its contribution to the
+        coefficients of x^2 to x^6 of each axis' variance.
         """
         states = np.array(state)[:, np.newaxis]
         table = self._correction.table
@@ -61,26 +60,35 @@ class SlowUncertainty:
         by_pair = by_pair[self._correction.layout.lag_pairs, :, 0]
         moved = by_pair * np.array(start_shares)[:, np.newaxis]
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
-        result: list[float] = []
+        of_misalignment, var_misalignment = self._misalignment
+        n_lags, rank = len(moved), of_misalignment.shape[1]
+        errors = np.zeros((9, n_lags + rank))
+        # A larger element of the misalignment increases the force, a larger bias or scale factor
+        # decreases it.
+        errors[6:, n_lags:] = -of_misalignment
+        added = np.zeros((3, 3))
         beyond: list[float] = []
         nonlinear = self._correction.of_force
         for axis, K in enumerate(self._K):
-            bias, scale = ((self._root * moved[:, [row]]).sum(axis=0) for row in (axis, axis + 3))
-            v = _products(bias / K, scale)
+            on_bias, on_scale = errors[2 * axis : 2 * axis + 2]
+            on_bias[:n_lags] = (self._root * moved[:, [axis]]).sum(axis=0) / K
+            on_scale[:n_lags] = (self._root * moved[:, [axis + 3]]).sum(axis=0)
             if self._blocks:
                 (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
-                on_bias, on_scale = regressors[axis] / K, regressors[axis + 3]
-                both = (of_bias * on_bias).sum(axis=0), (of_scale * on_scale).sum(axis=0)
-                v += _products(*both)
-                v[0] += (var_bias * on_bias[:, 0] ** 2).sum()
-                v[2] += (var_scale * on_scale[:, 0] ** 2).sum()
+                by_bias, by_scale = regressors[axis] / K, regressors[axis + 3]
+                on_bias[n_lags:] = (of_bias * by_bias).sum(axis=0)
+                on_scale[n_lags:] = (of_scale * by_scale).sum(axis=0)
+                added[axis, 0] = (var_bias * by_bias[:, 0] ** 2).sum()
+                added[axis, 2] = (var_scale * by_scale[:, 0] ** 2).sum()
                 if nonlinear is not None:
                     t = float(nonlinear.held(states[BOARD])[0])
+                    both = on_bias[n_lags:], on_scale[n_lags:]
                     beyond += nonlinear.variance(t, *of_force, *both)
             elif nonlinear is not None:
                 beyond += [0.0] * 5
-            result += v.tolist()
-        return result + beyond
+            added[axis] += _products(on_bias, on_scale)
+        between = rows_between(errors, var_misalignment)
+        return [*added.ravel().tolist(), *between, *beyond]
 
     def of_bias(
         self, states: Floats, mean_of: Callable[[Floats], Floats]

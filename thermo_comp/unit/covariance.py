@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the covariance of a corrected sample as polynomials in the forces of the three axes.
+
+x, y, z are the specific forces along the axes, before the misalignment. A sample has nine errors
+u: of each axis a constant and a multiple of the axis' force, and of the three elements of the
+misalignment M. To first order the error of the corrected force is ::
+
+    e_x = u0 + x u1
+    e_y = yx (u0 + x u1) + u2 + y u3 + x u6
+    e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
+
+so that each element of its covariance is a polynomial of second degree in x, y, z. Its
+coefficients are sums over the covariance of u, whose numbers are called rows here: first a, b, c
+of each axis, with the axis' error variance ``a + b x + c x^2``, then one row for each pair in
+`BETWEEN`.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
+from typing import Final, TypeVar
+
+import numpy as np
+
+from ..typing import Floats
+from .functions import in_order
+
+# Type of a quantity: the value of one sample, or an array of many samples.
+Real = TypeVar('Real', float, Floats)
+
+_OF_AXES: Final = [(u + i, u + j) for u in (0, 2, 4) for i, j in ((0, 0), (0, 1), (1, 1))]
+_PAIRS: Final = list(combinations_with_replacement(range(9), 2))
+#: Pairs of errors of different axes or of the misalignment, each pair once.
+BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
+#: Number of rows of a covariance of u.
+N_ROWS: Final = len(_PAIRS)
+#: Axis of each error of `BETWEEN`; 3 for the misalignment.
+_AXES: Final = np.minimum(np.array(BETWEEN).T // 2, 3)
+_OF_M: Final = [BETWEEN.index((u, u)) for u in (6, 7, 8)]
+#: Products of two of (1, x, y, z), by their numbers, in the elements xx, xy, xz, yy, yz, zz.
+_TERMS: Final = [
+    [(i, j) for i, j in combinations_with_replacement(range(4), 2) if i < first and j < second]
+    for first, second in combinations_with_replacement((2, 3, 4), 2)
+]
+#: Number of coefficients of all elements, and the places of the constants of xx, yy, zz.
+N_COEFFICIENTS: Final = sum(map(len, _TERMS))
+CONSTANTS: Final = tuple(sum(map(len, _TERMS[:element])) for element in (0, 3, 5))
+
+
+class CovarianceMap:
+    """The linear map from the rows of a covariance of u to the coefficients of the elements."""
+
+    def __init__(self, misalignment: Sequence[float]) -> None:
+        yx, zx, zy = misalignment
+        # Derivative of the force by u: (axis of the force, 1 or x or y or z, u).
+        J = np.zeros((3, 4, 9))
+        J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0
+        J[2] += zx * J[0] + zy * J[1]
+        J[1] += yx * J[0]
+        J[1, 1, 6] = J[2, 1, 7] = J[2, 2, 8] = 1.0
+        sums = np.zeros((N_COEFFICIENTS, 9, 9))
+        elements = zip(combinations_with_replacement(range(3), 2), _TERMS, strict=True)
+        places = [(*axes, *term) for axes, terms in elements for term in terms]
+        for place, (k, m, i, j) in enumerate(places):
+            products = np.outer(J[k, i], J[m, j]) + np.outer(J[k, j], J[m, i]) * (i != j)
+            sums[place] = products + np.tril(products, -1).T
+        u, w = np.array([*_OF_AXES, *BETWEEN]).T
+        factors = sums[:, u, w]
+        # The row b of an axis is twice the covariance of its two errors.
+        factors[:, 1:9:3] /= 2.0
+        # Few rows have a factor in a sum: keep their places and factors only.
+        n = int((factors != 0.0).sum(axis=1).max())
+        self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
+        self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
+
+    def coefficients(self, rows: Floats) -> Floats:
+        """Return the coefficients of the elements, (40, n), for rows of shape (45, n)."""
+        return in_order(self._factors * rows[self._places], 1)
+
+
+def grown(between: Floats, growth: Floats) -> Floats:
+    """Multiply rows `BETWEEN` (36, n) by the factors (3, n) by which the axes' variances grow."""
+    roots = np.concatenate((np.sqrt(growth), np.ones((1, growth.shape[1]))))
+    return np.asarray(between * roots[_AXES[0]] * roots[_AXES[1]])
+
+
+def rows_between(errors: Floats, misalignment_variances: Floats) -> list[float]:
+    """
+    Return the rows `BETWEEN` of errors that are linear in independent unit variances, (9, p), and
+    of variances that are added to the elements of the misalignment, (3,).
+    """
+    # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
+    result = [float((errors[u] * errors[w]).sum()) for u, w in BETWEEN]
+    for place, variance in zip(_OF_M, misalignment_variances.tolist(), strict=True):
+        result[place] += variance
+    return result
+
+
+def misalignment_variances(between: Floats) -> Floats:
+    """Return the variances of the elements of the misalignment, (3, n), in rows `BETWEEN`."""
+    return between[_OF_M]
+
+
+def covariance_at(
+    coefficients: Sequence[Real], x: Real, y: Real, z: Real
+) -> tuple[Real, Real, Real, Real, Real, Real]:
+    """Evaluate xx, xy, xz, yy, yz, zz of the covariance of the corrected force [m^2/s^4]."""
+    (a, ax, axx, b, bx, by, bxx, bxy, c, cx, cy, cz, cxx, cxy, cxz, d, dx, dy, dxx, dxy, dyy,
+     e, ex, ey, ez, exx, exy, exz, eyy, eyz,
+     f, fx, fy, fz, fxx, fxy, fxz, fyy, fyz, fzz) = coefficients  # fmt: skip
+    return (
+        a + x * (ax + x * axx),
+        b + x * (bx + x * bxx + y * bxy) + y * by,
+        c + x * (cx + x * cxx + y * cxy + z * cxz) + y * cy + z * cz,
+        d + x * (dx + x * dxx + y * dxy) + y * (dy + y * dyy),
+        e + x * (ex + x * exx + y * exy + z * exz) + y * (ey + y * eyy + z * eyz) + z * ez,
+        f
+        + x * (fx + x * fxx + y * fxy + z * fxz)
+        + y * (fy + y * fyy + z * fyz)
+        + z * (fz + z * fzz),
+    )
