@@ -35,8 +35,7 @@ _PAIRS: Final = list(combinations_with_replacement(range(9), 2))
 BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
 #: Number of rows of a covariance of u.
 N_ROWS: Final = len(_PAIRS)
-#: Axis of each error of `BETWEEN`; 3 for the misalignment.
-_AXES: Final = np.minimum(np.array(BETWEEN).T // 2, 3)
+_FIRST, _SECOND = np.array(BETWEEN).T
 _OF_M: Final = [BETWEEN.index((u, u)) for u in (6, 7, 8)]
 #: Products of two of (1, x, y, z), by their numbers, in the elements xx, xy, xz, yy, yz, zz.
 _TERMS: Final = [
@@ -81,8 +80,11 @@ class CovarianceMap:
 
 def grown(between: Floats, growth: Floats) -> Floats:
     """Multiply rows `BETWEEN` (36, n) by the factors (3, n) by which the axes' variances grow."""
-    roots = np.concatenate((np.sqrt(growth), np.ones((1, growth.shape[1]))))
-    return np.asarray(between * roots[_AXES[0]] * roots[_AXES[1]])
+    # The misalignment does not depend on the temperature.
+    roots = np.repeat(
+        np.concatenate((np.sqrt(growth), np.ones_like(growth))), [2] * 3 + [1] * 3, 0
+    )
+    return np.asarray(between * roots[_FIRST] * roots[_SECOND])
 
 
 def rows_between(errors: Floats, misalignment_variances: Floats) -> list[float]:
@@ -91,10 +93,10 @@ def rows_between(errors: Floats, misalignment_variances: Floats) -> list[float]:
     of variances that are added to the elements of the misalignment, (3,).
     """
     # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
-    result = [float((errors[u] * errors[w]).sum()) for u, w in BETWEEN]
-    for place, variance in zip(_OF_M, misalignment_variances.tolist(), strict=True):
-        result[place] += variance
-    return result
+    result = (errors[_FIRST] * errors[_SECOND]).sum(axis=1)
+    result[_OF_M] += misalignment_variances
+    numbers: list[float] = result.tolist()
+    return numbers
 
 
 def misalignment_variances(between: Floats) -> Floats:

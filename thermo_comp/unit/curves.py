@@ -141,16 +141,30 @@ class Curves:
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
         is_outside = bool((held != t).any())
-        result = []
-        for place, functions in enumerate(zip(*self._functions.rows, strict=True)):
+        made: dict[int, Floats] = {}
+        for place in self._families:
+            if place in made:
+                continue
             derivatives = []
-            for regime, function in enumerate(functions):
-                basis = shares[regime] * np.reshape(function.basis(held[regime]), (-1, len(t)))
+            for regime, row in enumerate(self._functions.rows):
+                basis = row[place].basis(held[regime])
+                basis = shares[regime] * np.reshape(basis, (-1, len(t)))
                 if is_outside:
                     basis += self._followed(regime, place, t, shares)
                 derivatives += [shares[regime], *basis]
-            result.append(np.array([*derivatives, *phi]))
-        return result
+            made[place] = np.array([*derivatives, *phi])
+        return [made[place] for place in self._families]
+
+    @cached_property
+    def _families(self) -> list[int]:
+        """
+        For each bias and scale the first one whose functions have the same basis in both sets.
+        """
+        bases = [
+            tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
+            for functions in zip(*self._functions.rows, strict=True)
+        ]
+        return [bases.index(basis) for basis in bases]
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
