@@ -172,6 +172,10 @@ def test_glitches_are_counted_and_end_no_rest(rng):
     # A tap of ten samples is a motion.
     whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
     bag = reduced([whole])
+    # A unit turned by hand for 20 s shakes: none of these samples is a glitch.
+    turned = block(still(rng, 200.0, (0.0, 0.0, 3000.0)))
+    turned.accel[9000:11_000] += 600.0 * rng.standard_normal((2000, 3))
+    assert reduced([turned]).n_glitches == 0
     assert bag.n_glitches == len(whole.accel) // 100
     assert len(bag.intervals) == 2
     assert abs(bag.intervals[0].mean[:, 1].mean()) < 1.0

@@ -39,6 +39,10 @@ from .start import within_positions
 from .unknowns import Layout, Prior, State
 from .windows import CURVE, PART
 
+#: Grid of the standard deviation of offsets, relative to the scale of its prior, in steps of a
+#: quarter decade, over which the log evidence is smooth.
+_GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -74,8 +78,17 @@ def claim_of(
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
+    # The mountings of a bag share the offset of one turn-on, so that its mean over the bags is an
+    # error of the bias.
+    n_bags = regression.n_bags
+    shared = offset_sd**2 * (1.0 / n_bags - 1.0 / (mounting[-1] + 1))
     if prior.offset_scale > 0.0:
         covariance, offset_sd = _over_mountings(regression, posterior)
+        turn_on_sd = _turn_on_sd(regression, posterior)
+        shared = turn_on_sd**2 / n_bags
+        offset_sd = float(np.hypot(offset_sd, turn_on_sd))
+    covariance = covariance.copy()
+    covariance[layout.bias, layout.bias] += shared
     if candidates is not None:
         wider = _with_unseen(regression, posterior, candidates)
         with_unseen = regression.solve(posterior.state, wider, n_steps=0)
@@ -157,9 +170,7 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     """Return covariance and offset sd of the mixture of fits over the mounting's sd."""
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
-    # Grid of the mounting's standard deviation, relative to the scale of its prior: steps of a
-    # quarter decade, over which the log evidence is smooth.
-    grid = 10.0 ** np.arange(-3.0, 1.51, 0.25)
+    grid = _GRID
     tried = prior.offset_scale * grid
 
     def solved(offset_sd: Floats) -> list[Posterior]:
@@ -169,10 +180,7 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
         ]
 
     fits = solved(tried)
-    # Prior density per step of the logarithm: flat below the scale, a Student's tail above the
-    # scale, and falling to 0 below a hundredth of the scale, which few mountings reach.
-    density = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
-    density += np.log(np.minimum(grid / 0.01, 1.0))
+    density = _log_density(grid)
     # A large mounting sd leaves the attitudes free to absorb errors of the model. Therefore the
     # drifts may increase the log evidence of an sd, over that of the mode, by at most
     # `TRIAL_GAIN`.
@@ -197,11 +205,46 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     return covariance, float(np.sqrt(weight @ tried**2))
 
 
+def _log_density(grid: Floats) -> Floats:
+    """
+    Return the log prior density of an sd of offsets per step of its logarithm: flat below the
+    scale, a Student's tail above the scale, and falling to 0 below a hundredth of the scale, which
+    few mountings reach.
+    """
+    tail = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
+    return np.asarray(tail + np.log(np.minimum(grid / 0.01, 1.0)))
+
+
+def _turn_on_sd(regression: Regression, posterior: Posterior) -> float:
+    """
+    Return the sd of the bias offset of a turn-on beside that of a mounting [m/s^2]; 0 if each
+    mounting has a bag of its own, as then the offset of a mounting contains that of the turn-on.
+
+    All mountings of a bag share one turn-on. The norms show how well turn-ons repeat only if there
+    are several bags; for a single bag the sd is that of the prior.
+    """
+    if regression.n_bags == regression.windows.mounting[-1] + 1 or not regression.gravity:
+        return 0.0
+    tried = posterior.prior.offset_scale * _GRID
+    without_norms = replace(posterior.prior, offset_sd=float(tried[-1]))
+    by_drifts = regression.solve(posterior.state, without_norms, n_steps=1).root
+    weight = _norm_evidence(regression, posterior, tried, by_drifts, of_bags=True)
+    weight += _log_density(_GRID)
+    weight = np.exp(weight - weight.max())
+    return float(np.sqrt(weight @ tried**2 / weight.sum()))
+
+
 def _norm_evidence(
-    regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
+    regression: Regression,
+    posterior: Posterior,
+    offset_sd: Floats,
+    by_drifts: Floats,
+    *,
+    of_bags: bool = False,
 ) -> Floats:
     """
-    Return the log evidence of the mean norms of the mountings, for each sd of mountings, (k,).
+    Return the log evidence of the mean norms of the mountings, for each sd of the offsets of
+    mountings, or with `of_bags` of the offsets that the mountings of a bag share, (k,).
 
     `by_drifts`: root of the unit's covariance without information from the norms; the covariance
         of the thermal weights is taken from it
@@ -215,10 +258,11 @@ def _norm_evidence(
     # Errors of the norms without offsets.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
-    rows = np.column_stack((along, errors, np.ones(len(along)))) * weight[:, None]
-    rows = np.add.reduceat(rows, first, axis=0)
+    rows = np.column_stack((point.norm_by_axes, along, errors, np.ones(len(along))))
+    rows = np.add.reduceat(rows * weight[:, None], first, axis=0)
     weight = rows[:, -1]
-    along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
+    by_axes, along, (errors,) = np.split(rows[:, :-1].T / weight, [3, 3 + along.shape[1]])
+    along = along.T
     if prior.informative is None:
         # The prior of the constants is almost flat, so it is centred on the state.
         weights = layout.axis[:, 2:].ravel()
@@ -231,9 +275,19 @@ def _norm_evidence(
         errors += along @ point.away[: layout.n_unit]
         of_prior = solve_triangular(prior.informative.root, along.T, trans='T').T
     noise = float(np.mean(prior.sigma**2)) * (1.0 / weight + prior.noise.ratio)
-    variances, vectors = np.linalg.eigh(of_prior @ of_prior.T + np.diag(noise))
-    variances = np.maximum(variances, noise.min()) + offset_sd[:, None] ** 2
-    return np.asarray(-0.5 * np.sum((vectors.T @ errors) ** 2 / variances + np.log(variances), 1))
+    known = of_prior @ of_prior.T
+    if not of_bags:
+        variances, vectors = np.linalg.eigh(known + np.diag(noise))
+        variances = np.maximum(variances, noise.min()) + offset_sd[:, None] ** 2
+        square = np.sum((vectors.T @ errors) ** 2 / variances, axis=1)
+        return np.asarray(-0.5 * (square + np.sum(np.log(variances), axis=1)))
+    known += np.diag(noise + prior.offset_sd**2)
+    bag = regression.bag_of_position[first]
+    shared = (by_axes.T @ by_axes) * (bag[:, None] == bag)
+    roots = [np.linalg.cholesky(known + sd**2 * shared) for sd in offset_sd.tolist()]
+    squares = [np.sum(solve_triangular(root, errors, lower=True) ** 2) for root in roots]
+    logs = [2.0 * np.sum(np.log(np.diag(root))) for root in roots]
+    return np.asarray(-0.5 * (np.array(squares) + np.array(logs)))
 
 
 def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 #: Smallest numbers of positions that determine bias and scale factor (six constants), the
 #: misalignment (three more constants), and by their norms the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
+#: Number of recordings whose turn-ons show how well turn-ons repeat, if they hold all positions:
+#: the bias of the first recording is that of the unit, the others differ from it.
+RECORDINGS_FOR_TURN_ONS = 4
 #: Smallest span of the board temperature that shows whether the bias depends on temperature [K].
 LEAST_SPAN_K = 3.0
 #: Ratio of an RMS residual to white noise up to which noise explains the residual, and from which
@@ -249,14 +252,22 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
     are explained by nine constants, whatever the offsets.
     """
-    n = int(fit.windows.data.mounting[-1]) + 1
-    is_assumed = options.mounting_sd is None and options.prior is None
-    if is_assumed and POSITIONS_NEEDED <= n < POSITIONS_FOR_MOUNTINGS:
+    n, n_bags = int(fit.windows.data.mounting[-1]) + 1, fit.regression.n_bags
+    if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
+        return
+    assumed = f'the uncertainty assumes {spoken(offset_sd)}: state --mounting-sd'
+    if n_bags < min(n, RECORDINGS_FOR_TURN_ONS):
+        yield advice(
+            'mountings',
+            f'{n} rests in {counted(n_bags, "recording")} have {counted(n_bags, "turn-on")}, too '
+            f'few to show how well the bias repeats after the unit is switched on again; {assumed}'
+            f', or switch the unit off between {RECORDINGS_FOR_TURN_ONS} recordings or more',
+        )
+    elif n < POSITIONS_FOR_MOUNTINGS:
         yield advice(
             'mountings',
             f'{n} positions do not show how well the bias repeats after the unit is mounted or '
-            f'switched on again; the uncertainty assumes {spoken(offset_sd)}: state '
-            f'--mounting-sd, or record {POSITIONS_FOR_MOUNTINGS} positions or more',
+            f'switched on again; {assumed}, or record {POSITIONS_FOR_MOUNTINGS} positions or more',
         )
 
 

@@ -22,23 +22,27 @@ _FEWEST = 30
 def is_glitch(samples: Floats, quantum: Floats) -> Bools:
     """
     Return which samples, shape (n, 3), are single errors of a transfer: far from both neighbours,
-    which agree. A glitch would end a rest, as a knock does.
+    which agree, among samples without a motion. A glitch would end a rest, as a knock does.
     """
     result = np.zeros(len(samples), dtype=bool)
     if len(samples) < _FEWEST:
         return result
     is_far = np.zeros(samples.shape, dtype=bool)
+    is_moving = np.zeros(len(samples), dtype=bool)
     # About 2000 samples are sufficient for the noise and the norm.
     every = slice(None, None, max(len(samples) // 2000, 1))
     least = _LEAST * float(np.median(np.linalg.norm(samples[every], axis=1)))
     for x, step, far in zip(samples.T, quantum.tolist(), is_far.T, strict=True):
         bend = np.abs(x[1:-1] - 0.5 * (x[2:] + x[:-2]))
         noise = max(float(np.median(bend[every])) / 0.6745, step)
-        far[1:-1] = bend > max(_SDS * noise, least)
+        limit = max(_SDS * noise, least)
+        is_moving[1:-1] |= bend > limit / 3.0
+        far[1:-1] = bend > limit
         if far.any():
             far[1:-1] &= np.abs(x[2:] - x[:-2]) < 0.5 * bend
-    # Several glitches within a few samples are a motion or a vibration.
+    # Beyond its two neighbours, which bend with it, a glitch has three calm samples on each side.
     at = np.flatnonzero(is_far.any(axis=1))
-    gap = np.diff(at, prepend=-4, append=len(samples) + 4)
-    result[at[(gap[1:] > 3) & (gap[:-1] > 3)]] = True
+    beside = np.array([-4, -3, -2, 2, 3, 4])
+    around = np.clip(at[:, np.newaxis] + beside, 0, len(samples) - 1)
+    result[at[~is_moving[around].any(axis=1)]] = True
     return result
