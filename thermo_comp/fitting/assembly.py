@@ -74,7 +74,7 @@ def build_calibration(
         unit=unit,
         reference_temperature_c=model.reference_temperature,
         gravity_m_s2=regression.gravity,
-        axes=Axes(*[AxisReference(1.0, 0.0)] * 3),
+        axes=Axes(*(AxisReference(float(K), 0.0) for K in regression.nominal_scale)),
         static=static,
         dynamic=dynamic,
         noise_density_m_s2_sqrt_hz=_triple(np.maximum(prior.sigma * np.sqrt(window_s), 1e-9)),

@@ -28,7 +28,7 @@ from ..unit.calibration import Calibration
 from ..unit.columns import bank
 from ..unit.functions import CubicSpline, Exponential, Polynomial, TemperatureFunction
 from ..unit.gravity import STANDARD_GRAVITY
-from ..unit.nonlinearity import Kind
+from ..unit.nonlinearity import K2_SD, Kind
 from .reduction import ReducedBag
 from .windows import Sets
 
@@ -142,13 +142,12 @@ class FitOptions:
 
     def nonlinear_sd(self, kind: Kind) -> float:
         """
-        Return the prior sd of a nonlinear term [g/g^2; for the cube g/g^3].
-
-        Data sheets of quartz pendulums have lower limits: 20 .. 60 ug/g^2, a few ug/g^3.
+        Return the prior sd of a nonlinear term [g/g^2; for the cube g/g^3, whose limits in data
+        sheets of quartz pendulums are a few ug/g^3].
         """
         if kind == 'cube':
             return 1e-5 if self.k3_sd is None else self.k3_sd
-        return 1e-4 if self.k2_sd is None else self.k2_sd
+        return K2_SD if self.k2_sd is None else self.k2_sd
 
     @property
     def saturated_at(self) -> float | None:

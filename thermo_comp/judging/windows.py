@@ -26,6 +26,7 @@ from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
 from ..unit.gravity import MICRO_G
 from ..unit.metrics import norm_residual
+from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
@@ -142,9 +143,7 @@ def corrected_windows(
         claimed_sd = np.sqrt(variance + table['size_sd'] ** 2)
         noise_sd = np.sqrt(mean_white)
         known = calibration.nonlinearity
-        is_inside &= table['size'] <= (
-            known.force_range_m_s2[1] if known else (1.0 + _USUAL) * gravity
-        )
+        is_inside &= table['size'] <= (known.force_range_m_s2[1] if known else AT_REST * gravity)
     return Windows(
         window_s=window_s,
         gravity=gravity,

@@ -196,7 +196,7 @@ def _apply(
     force = rate = np.empty((12, 0))
     has_rate = angular_rate is not None and of_rate is not None
     if segments:
-        force = _corrected(line, segments, stamps, samples, correction.misalignment)
+        force = _corrected(line, segments, stamps, samples, correction)
         is_kept = _judge(compensator, segments, stamps, samples, force)
         if angular_rate is not None and of_rate is not None:
             rate = _corrected(rate_line, segments, stamps, angular_rate)[:, is_kept]
@@ -219,14 +219,18 @@ def _corrected(
     segments: Segments,
     stamps: Stamps,
     samples: Floats,
-    misalignment: tuple[float, ...] | None = None,
+    correction: Correction | None = None,
 ) -> Floats:
-    """Return force and row-major covariance (12, n) of segments; or rates and variances (6, n)."""
+    """
+    Return force and row-major covariance (12, n) of segments; without the correction of the force
+    angular rates and their variances, (6, n).
+    """
     each = [segment for segment, _ in segments]
     start_ns = np.array([one.start_ns for one in each], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
-    order = range(6) if misalignment is None else _COLUMNS
-    corrected_force = corrected if len(misalignment or ()) == 3 else corrected_nonlinear
+    order = range(6) if correction is None else _COLUMNS
+    is_nonlinear = correction is not None and correction.of_force is not None
+    corrected_force = corrected_nonlinear if is_nonlinear else corrected
     n = len(stamps)
     result = np.empty((len(order), n))
     # Samples that are not finite are corrected like all others; the caller drops them.
@@ -239,11 +243,12 @@ def _corrected(
             dt = (stamps[begin:stop] - np.repeat(start_ns[low:high], counts)) * 1e-9
             line = list(np.repeat(table[:, low:high], counts, axis=1))
             x, y, z = samples[begin:stop].T
-            values = (
-                corrected_rate(line, dt, x, y, z)
-                if misalignment is None
-                else corrected_force(line, misalignment, dt, x, y, z)
-            )
+            values: tuple[Floats, ...]
+            if correction is None:
+                values = corrected_rate(line, dt, x, y, z)
+            else:
+                values = corrected_force(line, correction.misalignment, dt, x, y, z)
+                values = correction.beyond.widened(*values)
             for column, place in zip(result, order, strict=True):
                 column[begin:stop] = values[place]
     return result

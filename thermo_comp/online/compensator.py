@@ -110,6 +110,7 @@ class Compensator:
     def _use(self, calibration: Calibration) -> None:
         self.calibration = calibration
         self._full_scale = self._limit = calibration.unit.full_scale
+        self._edge = self.thermal.correction.beyond.edge
         self.gravity = self._gravity_check()
         self._corrected = corrected_nonlinear if calibration.nonlinearity else corrected
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
@@ -153,7 +154,11 @@ class Compensator:
             return None
         self.counters.n_out += 1
         start_ns, line, misalignment = self._segment
-        return self._corrected(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
+        row = self._corrected(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
+        edge = self._edge
+        if -edge < row[0] < edge and -edge < row[1] < edge and -edge < row[2] < edge:
+            return row
+        return self.thermal.correction.beyond.widened(*row)
 
     @property
     def corrects_rate(self) -> bool:

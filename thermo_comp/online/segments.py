@@ -30,6 +30,7 @@ from .status import CompensatorConfig, Counters
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000  # time for which the slow part of the variance is held [ns]
+YOUNG_READINGS: Final = 30  # number of readings after a start that determine the rate
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -205,7 +206,10 @@ class ThermalSide:
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[float]:
         """Return the slow part of a segment's variance, held for `SLOW_NS` once evaluated."""
-        key = start_ns // SLOW_NS
+        # The first readings after a start do not show the rate yet, on which the unknown initial
+        # lag states depend: evaluate the variance in each segment.
+        is_young = self.tracker.board.n_in_row < YOUNG_READINGS
+        key = start_ns // (SEGMENT_NS if is_young else SLOW_NS)
         if key != self._slow_key:
             self._slow_key = key
             shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)

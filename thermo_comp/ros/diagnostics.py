@@ -25,6 +25,7 @@ from ..thermal.regime import Regime
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT
 from ..topics import STATUS
 from ..unit.calibration import Calibration
+from ..unit.gravity import STANDARD_GRAVITY
 from .messages import qos_of, type_name
 from .reader import LoadedCalibration
 from .relay import Relay
@@ -106,7 +107,10 @@ class Reporter:
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._inputs(), *self._lost_rests()]
         findings += findings_of(loaded, status, new, rate, silence_s)
-        if (over := self._force_excess(loaded.calibration)) > 0.0:
+        # For a calibration at rest alone a warning at each acceleration of a vehicle would be
+        # useless: the warning begins where the unknown square term has an sd of 0.1 mg.
+        least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
+        if (over := self._force_excess()) > least:
             findings.append((_WARN, f'|f| {over:.3g} m/s^2 {_BEYOND_FORCE}'))
         findings.sort(key=lambda finding: -finding[0])
         values = self._values(loaded, status, counts, rate)
@@ -131,12 +135,12 @@ class Reporter:
             else:
                 log.error(message.message)
 
-    def _force_excess(self, calibration: Calibration) -> float:
+    def _force_excess(self) -> float:
         """Return by how much the last sample's |f| exceeds the largest |f| of the fit [m/s^2]."""
         last = self._relay.running.converter.last_result
-        if last is None or calibration.nonlinearity is None:
+        if last is None:
             return 0.0
-        return max(0.0, math.hypot(*last[:3]) - calibration.nonlinearity.force_range_m_s2[1])
+        return max(0.0, math.hypot(*last[:3]) - self._compensator.thermal.correction.beyond.edge)
 
     def _count(self) -> dict[str, int]:
         counters, traffic = self._compensator.counters, asdict(self._relay.traffic)
@@ -206,9 +210,7 @@ class Reporter:
 
     def _force_values(self, calibration: Calibration, status: CompensatorStatus) -> dict[str, str]:
         """List the figures of the samples: |f|, rests, noise and uncertainty of each axis."""
-        values, gravity = {}, status.gravity
-        if calibration.nonlinearity is not None:
-            values['force excess [m/s^2]'] = f'{self._force_excess(calibration):.3f}'
+        values, gravity = {'force excess [m/s^2]': f'{self._force_excess():.3f}'}, status.gravity
         if gravity is not None:
             values |= {
                 'gravity residual [m/s^2]': f'{gravity.residual:.3e}',

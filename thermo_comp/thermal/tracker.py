@@ -54,6 +54,8 @@ class ThermalTracker:
         self._weight = 0.0
         self._weight_ns = 0
         self._target = 0.0
+        #: Gradient of each sensor at rest, at its last reading in the static regime [K].
+        self._rest_gradients: dict[str, float] = {}
         self._begin_watch()
 
     def _begin_watch(self) -> None:
@@ -96,8 +98,13 @@ class ThermalTracker:
             self._follow_board(stamp_ns)
             return True
         bank = self.memory.banks[name]
-        if bank.taus and self.board.stamp_ns is not None:
-            bank.step(stamp_ns, sensor.temperature - self.board.at(stamp_ns)[0])
+        if self.board.stamp_ns is not None:
+            board, rate, _ = self.board.at(stamp_ns)
+            gradient = sensor.temperature - board
+            if bank.taus:
+                bank.step(stamp_ns, gradient)
+            if self.detector.regime is Regime.STATIC:
+                self._rest_gradients[name] = gradient - self._board_lag_s * rate
         if sensor is self.case:
             self.checks[BOARD_INPUT].watch_other()
             if check.fault is not Fault.STILL or self.detector.regime is not Regime.DYNAMIC:
@@ -116,7 +123,7 @@ class ThermalTracker:
                     continue
                 if not self.is_live(stamp_ns, sensor):
                     # The lags of a gradient continue while its sensor is lost.
-                    gradient, variance = self._lost_gradient(stamp_ns, board.rate)
+                    gradient, variance = self._lost_gradient(name, stamp_ns, board.rate)
                     bank.step(stamp_ns, gradient, sqrt(variance))
         for name in self.spec.sensors:
             self.checks[name].watch_other()
@@ -203,7 +210,7 @@ class ThermalTracker:
                 celsius, _, variance = sensor.at(stamp_ns)
                 gradient = celsius - board
             else:
-                gradient, variance = self._lost_gradient(stamp_ns, rate)
+                gradient, variance = self._lost_gradient(name, stamp_ns, rate)
             gradients.append(gradient)
             pairs += [gradient, variance + self.checks[name].extra_variance(stamp_ns)]
         for name in self.spec.rates:
@@ -219,10 +226,13 @@ class ThermalTracker:
             pairs += self.memory.at(stamp_ns, board, gradients)
         return board, var_board, rate, self.weight_at(stamp_ns), float(not is_known), *pairs
 
-    def _lost_gradient(self, stamp_ns: int, rate: float) -> tuple[float, float]:
-        """Estimate a gradient from the board's rate, while its sensor is lost."""
+    def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
+        """
+        Estimate a gradient while its sensor is lost: the last one at rest, by which the unit heats
+        itself, plus that of the board's rate.
+        """
         lag = self._board_lag_s
-        gradient = lag * rate
+        gradient = self._rest_gradients.get(name, 0.0) + lag * rate
         # Largest change of the case temperature since the last board reading [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (

@@ -26,7 +26,7 @@ from .covariance import CONSTANTS, N_ROWS, CovarianceMap, grown, misalignment_va
 from .curves import Curves
 from .functions import hold, in_order
 from .gravity import MICRO_G
-from .nonlinearity import ForceCorrection
+from .nonlinearity import ForceCorrection, beyond_force
 
 #: Largest rate of change of the output while the two sets are blended [m/s^3], 1 ug per second,
 #: and the number of transition times up to which the blending is lengthened to keep this rate.
@@ -67,7 +67,8 @@ class Correction:
     memory: memory that the tracker needs for force and angular rate, or the tracker's memory
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
-    misalignment: yx, zx, zy of M; with a nonlinearity then its constants
+    misalignment: yx, zx, zy of M
+    beyond: variance of forces beyond those of the fit
     """
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
@@ -102,11 +103,11 @@ class Correction:
         M = calibration.misalignment
         self.misalignment: tuple[float, ...] = (M[1][0], M[2][0], M[2][1])
         self._covariance = CovarianceMap(self.misalignment)
+        self.beyond = beyond_force(calibration)
         #: The nonlinearity over specific force; None if the calibration has none.
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
-            self.misalignment += self.of_force.constants
         #: Number of rows of the slow part of the error variance.
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 

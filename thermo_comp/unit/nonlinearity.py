@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -32,6 +32,10 @@ Kind = Literal['square', 'odd_square', 'cube']
 #: The nonlinear terms in the order of a calibration file, and the power of 1/g in the unit of each
 #: coefficient.
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
+#: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 .. 60 ug/g^2.
+K2_SD = 1e-4
+#: Largest |f| of a fit at rest, over gravity.
+AT_REST = 1.01
 #: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
 #: sufficient.
 LARGEST_SLOPE = 0.2
@@ -132,30 +136,30 @@ def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
 
 
 def corrected_nonlinear(
-    line: Sequence[Real], constants: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
+    line: Sequence[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
     """Correct a sample as `online.compensator.corrected` does, for axes with a nonlinearity."""
     bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
     k2x, kqx, k3x, k2y, kqy, k3y, k2z, kqz, k3z = line[_NONLINEAR : _NONLINEAR + 9]
-    yx, zx, zy = constants[:3]
+    yx, zx, zy = misalignment
     # Eq. (7) of the paper is solved for the input of each axis, then the nonlinearity.
     x = linearised((x - (bx + bx1 * dt)) / (sx + sx1 * dt), k2x, kqx, k3x)
     y = linearised((y - (by + by1 * dt)) / (sy + sy1 * dt), k2y, kqy, k3y)
     z = linearised((z - (bz + bz1 * dt)) / (sz + sz1 * dt), k2z, kqz, k3z)
-    xx, xy, xz, yy, yz, zz = nonlinear_covariance(line, constants, x, y, z)
+    xx, xy, xz, yy, yz, zz = nonlinear_covariance(line, misalignment, x, y, z)
     return x, yx * x + y, zx * x + zy * y + z, xx, xy, xz, yy, yz, zz
 
 
 def nonlinear_covariance(
-    line: Sequence[Real], constants: tuple[float, ...], x: Real, y: Real, z: Real
+    line: Sequence[Real], misalignment: tuple[float, ...], x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real]:
     """Evaluate the covariance as `covariance_at` does, for axes with a nonlinearity."""
     xx, xy, xz, yy, yz, zz = covariance_at(line[12:_NONLINEAR], x, y, z)
     dx, ex, fx, gx, dy, ey, fy, gy, dz, ez, fz, gz = line[_NONLINEAR + 9 :]
-    yx, zx, zy, edge, growth = constants
-    vx = x * x * x * (dx + x * (ex + x * (fx + x * gx))) + _grown(x, edge, growth)
-    vy = y * y * y * (dy + y * (ey + y * (fy + y * gy))) + _grown(y, edge, growth)
-    vz = z * z * z * (dz + z * (ez + z * (fz + z * gz))) + _grown(z, edge, growth)
+    yx, zx, zy = misalignment
+    vx = x * x * x * (dx + x * (ex + x * (fx + x * gx)))
+    vy = y * y * y * (dy + y * (ey + y * (fy + y * gy)))
+    vz = z * z * z * (dz + z * (ez + z * (fz + z * gz)))
     cxy = yx * vx
     cxz = zx * vx
     return (
@@ -168,31 +172,47 @@ def nonlinear_covariance(
     )
 
 
-def _grown(x: Real, edge: float, growth: float) -> Real:
+class BeyondForce(NamedTuple):
     """
-    Return the variance of the unknown square term that begins at the largest force of the fit.
+    The variance of an unknown square term that begins at the largest |f| of the fit [m/s^2];
+    `growth`: variance over the fourth power of twice the distance beyond this force.
     """
-    over = abs(x) - edge
-    over = over + abs(over)  # twice the distance beyond the largest force, or 0
-    over = over * over
-    return growth * over * over
+
+    edge: float
+    growth: float
+
+    def widened(self, x: Real, y: Real, z: Real, *covariance: Real) -> tuple[Real, ...]:
+        """Add the variance to the covariance xx, xy, xz, yy, yz, zz of a corrected sample."""
+        xx, xy, xz, yy, yz, zz = covariance
+        xx, yy, zz = xx + self._variance(x), yy + self._variance(y), zz + self._variance(z)
+        return x, y, z, xx, xy, xz, yy, yz, zz
+
+    def _variance(self, x: Real) -> Real:
+        over = abs(x) - self.edge
+        over = over + abs(over)  # twice the distance beyond the largest force, or 0
+        over = over * over
+        return self.growth * over * over
+
+
+def beyond_force(calibration: Calibration) -> BeyondForce:
+    """
+    Return the variance of an unknown square term beyond the largest force of a calibration: |f| of
+    the fit, or, without a nonlinearity, 1 % above gravity.
+    """
+    known = calibration.nonlinearity
+    edge = known.force_range_m_s2[1] if known else AT_REST * calibration.gravity_m_s2
+    sd = (known.beyond_sd_g_g2 if known else K2_SD) / STANDARD_GRAVITY
+    return BeyondForce(edge, sd * sd / 16.0)
 
 
 class ForceCorrection:
-    """
-    The nonlinearity of a calibration, prepared for the segments of a correction.
-
-    constants: largest |f| of the fit, and the factor of the fourth power of twice the distance
-        beyond it in `corrected_nonlinear`
-    """
+    """The nonlinearity of a calibration, prepared for the segments of a correction."""
 
     def __init__(
         self, calibration: Calibration, nonlinearity: Nonlinearity, span: tuple[float, float]
     ) -> None:
         self._of = nonlinearity
         self._reference, self._span = calibration.reference_temperature_c, span
-        growth = nonlinearity.beyond_sd_g_g2 / STANDARD_GRAVITY
-        self.constants = nonlinearity.force_range_m_s2[1], growth * growth / 16.0
 
     def held(self, board: Floats) -> Floats:
         """Return board temperatures less the reference, limited to the calibrated range."""

@@ -16,11 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..thermal.memory import BOARD_INPUT, Lag, Play, start_covariance
-from ..thermal.state import BOARD, WEIGHT, Gradient, Layout, Rate
+from ..thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout, Rate
 from ..typing import Floats
 from .calibration import Calibration, parameter_layout
 from .correction import Correction
 from .covariance import rows_between
+from .functions import hold
 
 
 class SlowUncertainty:
@@ -29,7 +30,15 @@ class SlowUncertainty:
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
         self._K = correction.K[:, 0].tolist()
-        self._root = np.asarray(np.linalg.cholesky(start_covariance(correction.memory.lags)))
+        lags = correction.memory.lags
+        self._root = np.asarray(np.linalg.cholesky(start_covariance(lags)))
+        edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
+        self._span = max(edges) - min(edges)
+        #: How far each lag's part is behind the board in a long ramp, per rate of the ramp [s].
+        self._behind_s = np.array([
+            sum(share * tau for (name, tau), share in lag.singles.items() if name == BOARD_INPUT)
+            for lag in lags
+        ])  # fmt: skip
         #: By axis the rows of the posterior's factor, and the added variances: of bias, scale and
         #: nonlinear terms.
         self._blocks: list[list[tuple[Floats, Floats]]] = []
@@ -59,9 +68,13 @@ class SlowUncertainty:
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         by_pair = by_pair[self._correction.layout.lag_pairs, :, 0]
         moved = by_pair * np.array(start_shares)[:, np.newaxis]
+        # If the start was in a ramp, the parts were behind the board, by an unknown amount up to
+        # that of a long ramp at the rate of now, within the calibrated temperatures.
+        behind = hold(state[RATE] * self._behind_s, -self._span, self._span)
+        in_ramp = (moved * behind[:, np.newaxis]).sum(axis=0)
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
         of_misalignment, var_misalignment = self._misalignment
-        n_lags, rank = len(moved), of_misalignment.shape[1]
+        n_lags, rank = len(moved) + 1, of_misalignment.shape[1]
         errors = np.zeros((9, n_lags + rank))
         # A larger element of the misalignment increases the force, a larger bias or scale factor
         # decreases it.
@@ -71,8 +84,9 @@ class SlowUncertainty:
         nonlinear = self._correction.of_force
         for axis, K in enumerate(self._K):
             on_bias, on_scale = errors[2 * axis : 2 * axis + 2]
-            on_bias[:n_lags] = (self._root * moved[:, [axis]]).sum(axis=0) / K
-            on_scale[:n_lags] = (self._root * moved[:, [axis + 3]]).sum(axis=0)
+            on_bias[: n_lags - 1] = (self._root * moved[:, [axis]]).sum(axis=0) / K
+            on_scale[: n_lags - 1] = (self._root * moved[:, [axis + 3]]).sum(axis=0)
+            on_bias[n_lags - 1], on_scale[n_lags - 1] = in_ramp[axis] / K, in_ramp[axis + 3]
             if self._blocks:
                 (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
                 by_bias, by_scale = regressors[axis] / K, regressors[axis + 3]
