@@ -37,6 +37,11 @@ from .windows import CURVE, ThermalWindows
 STEEPEST = np.array([5e-3, 2e-4])
 
 
+#: Prior sd of an element of the misalignment [rad] for the estimate from faces: the cross-axis
+#: sensitivity of good consumer MEMS.
+FACES_MISALIGNMENT_SD = 2.5e-3
+
+
 @dataclass(frozen=True)
 class Problem:
     """
@@ -67,6 +72,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
+    prior = _with_faces(prior, problem.up)
     candidates = _candidates(windows, start, options, has_one_direction=n_directions == 1)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
@@ -147,6 +153,22 @@ def _initial_prior(
     if options.mounting_sd is not None:
         prior = replace(prior, offset_sd=options.mounting_sd, offset_scale=0.0)
     return prior
+
+
+def _with_faces(prior: Prior, up: Floats) -> Prior:
+    """
+    Return the prior for a noisy sensor near the six faces, which hardly show the misalignment.
+
+    The other errors of such a sensor would be explained by misalignments of some degrees, to
+    second order. The sd for the estimate is therefore smaller than that in the covariance.
+    """
+    by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
+    sd = prior.misalignment_scale
+    # Faces that are set by hand, a few degrees off, are below 0.1; the edges of a cube have 0.3.
+    is_near = float(np.sqrt(np.mean(by_element**2))) < 0.1
+    if not is_near or sd <= FACES_MISALIGNMENT_SD:
+        return prior
+    return replace(prior, misalignment_sd=FACES_MISALIGNMENT_SD, unseen_misalignment_sd=sd)
 
 
 def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:

@@ -95,7 +95,7 @@ def _updated(
         tilt_sd = float(tilt_sd * np.exp(step))
         changes.append(float(np.abs(step)) / 3.0)
     misalignment_sd = prior.misalignment_sd
-    if prior.informative is None:
+    if prior.informative is None and not prior.unseen_misalignment_sd:
         # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
         # Elements count only if the data determine more than one of them.
         gamma = float(determined[layout.misalignment].sum())

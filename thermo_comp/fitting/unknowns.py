@@ -200,6 +200,8 @@ class Prior:
     noise: Gauss-Markov part of the noise
     offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0: offset_sd is constant
     misalignment_scale: misalignment_sd before the data [rad]
+    unseen_misalignment_sd: sd of the elements of M in the covariance, if the positions do not show
+        them; `misalignment_sd` is then constant and smaller [rad]; 0 else
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
     start_share: variance of the initial lag states over that of the run-time prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
@@ -218,6 +220,7 @@ class Prior:
     scale_mean: Floats = field(default_factory=lambda: np.ones(3))
     offset_scale: float = 0.0
     misalignment_scale: float = MISALIGNMENT_SD
+    unseen_misalignment_sd: float = 0.0
     tilt_sd: float = 1e-7
     start_share: float = 1.0
     nonlinear_sd: Floats = field(default_factory=lambda: np.zeros(0))
