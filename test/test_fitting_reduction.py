@@ -183,6 +183,29 @@ def test_glitches_are_counted_and_end_no_rest(rng):
     assert '2000 samples' in finding.message
 
 
+def test_samples_stamped_on_arrival_in_bursts_are_at_rest(rng):
+    # WHY: cells of 30 samples, by the median step of 0.3 ms, were empty between the bursts, and
+    # a unit at rest for 22 min was called worn or driven.
+    whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
+    number = np.arange(len(whole.accel))
+    for size in (20, 100, 200):
+        # 100 Hz: the samples of a burst are 0.3 ms apart.
+        stamps = (number // size * size + size) * 10_000_000 + number % size * 300_000
+        bag = reduced([replace(whole, accel_stamp_ns=whole.accel_stamp_ns[0] + stamps)])
+        assert len(bag.intervals) == 1
+        assert bag.cycle_s == pytest.approx(0.01, rel=0.1)
+        assert bag.n_dropped == 0
+
+
+def test_samples_of_a_message_batch_with_one_stamp_are_named(rng):
+    whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
+    stamps = whole.accel_stamp_ns[np.arange(len(whole.accel)) // 10 * 10]
+    bag = reduced([replace(whole, accel_stamp_ns=stamps)])
+    assert bag.n_repeated == bag.n_dropped == 0.9 * len(whole.accel)
+    (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'dropped')
+    assert 'several samples with one stamp' in finding.message
+
+
 def test_stamps_that_do_not_rise_are_left_out(rng):
     whole = block(still(rng, 30.0, (0.0, 0.0, 3000.0)))
     again = split(whole, 3)

@@ -47,13 +47,18 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
             'it can measure, or --full-scale is wrong',
         )
-    part = sum(bag.n_dropped for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
-    if part > 0.01:
-        yield advice(
-            'dropped',
-            f'{100.0 * part:.0f} % of the samples are not finite, or have a stamp that does not '
-            'rise, and are left out: was a clock set back?',
-        )
+    n_samples = max(sum(bag.n_samples for bag in bags), 1)
+    n_dropped, n_repeated = (
+        sum(getattr(bag, name) for bag in bags) for name in ('n_dropped', 'n_repeated')
+    )
+    if n_dropped > 0.01 * n_samples:
+        share = f'{100.0 * n_dropped / n_samples:.0f} % of the samples'
+        text = f'{share} are not finite, or have a stamp that does not rise, and are left out: '
+        if 2 * n_repeated > n_dropped:
+            text += 'does the driver send several samples with one stamp?'
+        else:
+            text += 'was a clock set back?'
+        yield advice('dropped', text)
     if n := sum(bag.n_glitches for bag in bags):
         yield advice(
             'glitches',

@@ -78,6 +78,7 @@ class ReducedBag:
     angular_rate: part of the bag that has finite angular rates
     n_spikes: number of readings of each thermometer that are spikes, see `readings`
     n_glitches: number of single samples far from their neighbours, which are left out
+    n_repeated: number of samples with the stamp of the sample before, among the dropped samples
     """
 
     source: FitSource
@@ -101,6 +102,7 @@ class ReducedBag:
     angular_rate: Literal['none', 'part', 'whole'] = 'none'
     n_spikes: Mapping[str, int] = field(default_factory=dict)
     n_glitches: int = 0
+    n_repeated: int = 0
 
     @property
     def board(self) -> Readings:
@@ -230,6 +232,7 @@ def _bag(
         n_dropped=cells.n_dropped,
         n_saturated=cells.n_saturated,
         n_glitches=cells.n_glitches,
+        n_repeated=cells.n_repeated,
         n_cells=len(cells.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
         # A bag without a usable sample has no cells; the length of its windows is that of the

@@ -56,8 +56,8 @@ class Cells:
     Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
-    `is_glitch`. `quantum` is the samples' step or 0; `middle` is 32768 for unsigned 16-bit words,
-    else 0; rates are in rad/s. `roughness` is half the mean square change from sample to sample:
+    `is_glitch`. `n_repeated` counts the samples with the stamp of the sample before. `quantum` is
+    the samples' step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in rad/s. `roughness` is half the mean square change from sample to sample:
     the variance of white noise; `seam` the change to a cell's first sample from the last sample of
     the cell right before it.
     """
@@ -67,6 +67,7 @@ class Cells:
     n_dropped: int
     n_saturated: int
     n_glitches: int
+    n_repeated: int
     is_integer: bool
     quantum: Floats
     middle: float
@@ -110,6 +111,7 @@ class CellAccumulator:
         # further samples.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_glitches = self._n_looked_at = 0
+        self._n_repeated = 0
         self._is_integer, self._is_negative = True, False
         self._middle, self._quantum = 0.0, np.zeros(3)
 
@@ -121,6 +123,7 @@ class CellAccumulator:
         before = self._last_ns if self._last_ns is not None else int(stamp_ns[0]) - 1
         use &= stamp_ns > np.maximum.accumulate(np.concatenate(([before], stamp_ns[:-1])))
         self._n_dropped += int((~use).sum())
+        self._n_repeated += int((np.diff(stamp_ns, prepend=before) == 0).sum())
         if self._full_scale is not None:
             if self._full_scale == _WORD - 1.0 and not self._middle:
                 self._look_for_sign(samples[use])
@@ -171,6 +174,7 @@ class CellAccumulator:
         cell_s = self._cell_ns * 1e-9
         return Cells(
             *(self._start_ns, cell_s, self._n_dropped, self._n_saturated, self._n_glitches),
+            self._n_repeated,
             *(self._is_integer, self._quantum, self._middle),
             *(sums[:, 2] / count + index * cell_s, count.astype(np.int64), index),
             *(mean[:, :3] + self._shift, variance[:, :3], sums[:, -3:] / pairs),
@@ -186,8 +190,14 @@ class CellAccumulator:
             self._middle = _WORD if is_word.all() else 0.0
 
     def _begin(self, stamp_ns: Ints, samples: Floats) -> None:
-        step = float(np.median(np.diff(stamp_ns))) if len(stamp_ns) > 1 else 0.0
-        least = min(max(self._asked_cell_s * 1e9, self._least * step, 1.0), _LONGEST_CELL_NS)
+        steps = np.diff(stamp_ns) if len(stamp_ns) > 1 else np.zeros(1)
+        step, between = float(np.median(steps)), 0.0
+        gaps = steps[steps > 10.0 * step]
+        if gaps.sum() > 0.5 * steps.sum():
+            # Samples that are stamped on their arrival in bursts: two bursts in a cell.
+            step, between = float(steps.mean()), 2.0 * float(np.median(gaps))
+        least = max(self._asked_cell_s * 1e9, self._least * step, between, 1.0)
+        least = min(least, _LONGEST_CELL_NS)
         self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
         self._start_ns = int(stamp_ns[0])
         self._shift = samples[0].copy()
