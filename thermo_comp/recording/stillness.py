@@ -57,7 +57,8 @@ class Cells:
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
     `is_glitch`. `n_repeated` counts the samples with the stamp of the sample before. `quantum` is
-    the samples' step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in rad/s. `roughness` is half the mean square change from sample to sample:
+    the samples' step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in
+    rad/s. `roughness` is half the mean square change from sample to sample:
     the variance of white noise; `seam` the change to a cell's first sample from the last sample of
     the cell right before it.
     """
@@ -194,8 +195,13 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # Samples that are stamped on their arrival in bursts: two bursts in a cell.
-            step, between = float(steps.mean()), 2.0 * float(np.median(gaps))
+            # Samples that are stamped on their arrival come in bursts at a constant interval, of 5
+            # s at most, as of a buffer that is polled; the pauses of a tumble by hand differ. Two
+            # bursts are in a cell.
+            usual = float(np.median(gaps))
+            is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
+            if is_regular and usual < 5e9:
+                step, between = float(steps.mean()), 2.0 * usual
         least = max(self._asked_cell_s * 1e9, self._least * step, between, 1.0)
         least = min(least, _LONGEST_CELL_NS)
         self._cell_ns = round(least if self._window_s is None else _part_of(self._window_s, least))
