@@ -1,0 +1,64 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The covariance after a start in a ramp, with a lost thermometer, and beyond 1 g."""
+
+import math
+
+import pytest
+from builders import SECOND_NS, calibration, term
+
+from thermo_comp.online.compensator import Compensator
+from thermo_comp.online.status import CompensatorConfig
+
+UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
+
+
+def test_a_start_in_a_ramp_is_claimed():
+    # WHY: a node that restarted in a ramp claimed a third of its error: the parts lag the board by
+    # the rate times their time constant, 1 K here, and not by the sd of a start at rest, 0.4 K.
+    unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
+    sd = {}
+    for rate in (0.0, 1.0 / 60.0):
+        compensator = Compensator(unit, UNCHECKED)
+        for second in range(61):
+            stamp = 10**12 + second * SECOND_NS
+            # Constant readings would be those of a faulty thermometer.
+            flicker = 1e-5 * (-1) ** second
+            compensator.push('board', stamp, 10.0 + rate * second + flicker)
+            compensator.push('case', stamp, 10.0 + rate * second - flicker)
+            row = compensator.process(stamp, 0.0, 0.0, 1.0)
+        sd[rate] = math.sqrt(row[3] - compensator.thermal.correction.noise[0])
+    # One time constant after the start a share of 1/e is left; 300 counts per m/s^2.
+    left = 30.0 / 300.0 / math.e
+    assert sd[0.0] == pytest.approx(0.387 * left, rel=0.2)
+    assert sd[1.0 / 60.0] == pytest.approx(math.hypot(1.0, 0.387) * left, rel=0.2)
+
+
+def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
+    # WHY: a unit heats itself by 1 K above the case; while the case was lost, 0 K was assumed.
+    unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
+    compensator = Compensator(unit, UNCHECKED)
+    corrected = []
+    for second in range(3000):
+        stamp = 10**12 + second * SECOND_NS
+        # Thermometers of a few mK, as constant readings are those of a faulty thermometer.
+        compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
+        if second < 2000:
+            compensator.push('case', stamp, 19.0 + 2e-3 * (second % 5))
+        corrected.append(compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2))
+    # 0.1 K of 1 K: 3 counts of 300 per m/s^2.
+    assert corrected[-1][0] == pytest.approx(corrected[1999][0], abs=0.01)
+
+
+def test_beyond_1_g_the_covariance_has_an_unknown_square():
+    # The K2 of a unit that was fitted at rest is unknown: its sd is 100 ug/g^2 from 1.01 g on.
+    compensator = Compensator(calibration(), UNCHECKED)
+    for name in ('board', 'case'):
+        compensator.push(name, 10**12, 20.0)
+    at_1_g, at_4_g = (
+        compensator.process(10**12 + k * 10**6, 0.0, 0.0, 300.0 * 9.80665 * force)
+        for k, force in enumerate((1.0, 4.0))
+    )
+    grown = 9.80665e-4 * (4.0 - 1.01) ** 2
+    assert math.sqrt(at_4_g[8] - at_1_g[8]) == pytest.approx(grown, rel=0.01)
+    assert at_4_g[3] == pytest.approx(at_1_g[3])
