@@ -38,6 +38,7 @@ TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 _SNIFF_BYTES = 65536
 _LAYOUT_ROWS = 50  # rows at the end of the sniffed text that decide the layout
 _PREAMBLE_ROWS = 1000  # longest preamble of a logger
+_ROWS_AT_ONCE = 4096  # number of rows whose cells are read together
 _MOST_ROWS_PER_BYTE = 4  # largest number of rows per byte of a Parquet file with measurements
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
@@ -163,7 +164,10 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
     else:
         cells = csv.reader(file, delimiter=delimiter)
     for number, row in enumerate(cells, 1):
-        if row and not _is_comment(row[0]) and any(cell.strip() for cell in row):
+        # A row that begins with a digit, as nearly all do, needs no further test.
+        if row and (
+            row[0][:1].isdigit() or (not _is_comment(row[0]) and any(map(str.strip, row)))
+        ):
             yield number, row
 
 
@@ -207,6 +211,15 @@ def _number(cell: str) -> float | None:
         return None
 
 
+def _numbers(cells: list[str]) -> list[float]:
+    """Read cells as numbers, NaN if a cell is not a number."""
+    try:
+        return list(map(float, cells))
+    except ValueError:
+        numbers = map(_number, cells)
+        return [nan if number is None else number for number in numbers]
+
+
 def _collect(
     path: Path, headings: list[str], rows: _Rows, columns: Sequence[Column] | None, stamp: Stamp
 ) -> Table:
@@ -226,16 +239,15 @@ def _collect(
 
     line, stamps, n_short = array('q'), array('q'), 0
     values = {name: array('d') for name in places}
-    for number, row in chain([first], rows):
-        if len(row) < needed:
-            n_short += 1
-            continue
-        line.append(number)
+    rows = chain([first], rows)
+    while part := list(islice(rows, _ROWS_AT_ONCE)):
+        whole = [(number, row) for number, row in part if len(row) >= needed]
+        n_short += len(part) - len(whole)
+        line.extend(number for number, _ in whole)
         for name, place in places.items():
-            value = _number(row[place])
-            values[name].append(nan if value is None else value)
+            values[name].extend(_numbers([row[place] for _, row in whole]))
         if at is not None:
-            stamps.append(exact_ns(row[at], stamp.unit))
+            stamps.extend(exact_ns(row[at], stamp.unit) for _, row in whole)
     if at is not None and stamp.unit == 'iso' and stamps and max(stamps) == NO_STAMP:
         raise RecordingError(
             f'no cell of its column {stamp.column!r} is a date of ISO 8601, as '
