@@ -31,6 +31,7 @@ from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import LackOfFit
+from .data_checks import POSITIONS_FOR_MOUNTINGS
 from .equations import as_vector
 from .hyperparameters import STUDENT_NU
 from .regression import Posterior, Regression
@@ -64,12 +65,15 @@ def claim_of(
     chosen: Posterior,
     candidates: Floats | None = None,
     gravity_sd: float = 0.0,
+    known_offset_sd: float = 0.0,
 ) -> Claim:
     """
     Return the published covariance of the fit of the chosen model.
 
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
-    do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2]
+    do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
+    `known_offset_sd`: sd of the offset of a turn-on in the prior calibration, which fewer turn-ons
+    do not reduce [m/s^2]; 0 for none
     """
     # The rests of one mounting have one offset, but the regression has one for each rest. The mean
     # of k offsets with k times the variance has the variance of one.
@@ -87,8 +91,11 @@ def claim_of(
     if prior.offset_scale > 0.0:
         covariance, offset_sd = _over_mountings(regression, posterior)
         turn_on_sd = _turn_on_sd(regression, posterior)
-        shared = turn_on_sd**2 / n_bags
         offset_sd = float(np.hypot(offset_sd, turn_on_sd))
+        if n_bags < POSITIONS_FOR_MOUNTINGS:
+            offset_sd = max(offset_sd, known_offset_sd)
+            turn_on_sd = max(turn_on_sd, known_offset_sd * (n_bags <= mounting[-1]))
+        shared = turn_on_sd**2 / n_bags
     covariance = covariance.copy()
     covariance[layout.bias, layout.bias] += shared
     if candidates is not None:

@@ -237,7 +237,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     if known is None:
         selected, terms = choose(fit.regression, fit.selected, options)
         fit = fit._replace(selected=selected)
-    claim = claim_of(fit.regression, fit.posterior, fit.typical, options.gravity_sd)
+    claim = claim_of(
+        *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known))
+    )
     residuals, left_out = residual_rows(fit)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
     K = fit.posterior.state.kappa * start.scale
@@ -273,6 +275,12 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         bags=tuple(bags),
         rates=rates,
     )
+
+
+def _offset_sd(known: Calibration | None) -> float:
+    """Return the sd of the offset of a turn-on by a prior calibration [m/s^2]; 0 without one."""
+    axes = [axis for part in known.regime_sets() for axis in part.axes()] if known else []
+    return min((axis.residual_sd_m_s2 for axis in axes), default=0.0)
 
 
 def _judged(
