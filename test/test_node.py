@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node on real DDS: its input, its output and its diagnostics."""
 
+import math
 import time
 from dataclasses import replace
 
@@ -32,7 +33,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 
 from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
-from thermo_comp.unit.calibration import Unit
+from thermo_comp.unit.calibration import Unit, parameter_layout
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.nonlinearity import Nonlinearity
 
@@ -210,6 +211,10 @@ def test_diagnostics_have_noise_density_and_bias_sd(peer, saved):
             noise = density**2 / unit.unit.cycle_time_s + 1.0 / 6.0 / counts**2
             assert whole**2 == pytest.approx(bias**2 + noise, rel=1e-2)
             assert bias > 0.0
+            layout, covariance = parameter_layout(unit), unit.posterior.covariance()
+            level = layout.scale['xyz'.index(axis)].static
+            sd = float(values[f'scale sd {axis}'])
+            assert sd >= 0.99 * math.sqrt(covariance[level, level])
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
             # In an unknown regime the bias sd contains the sets' difference, about 30 urad/s.

@@ -22,6 +22,7 @@ from typing import Literal
 import numpy as np
 
 from ..errors import FitError
+from ..quantities import QUANTITIES
 from ..recording.stillness import STILL_SD
 from ..thermal.settings import DetectorSettings
 from ..unit.calibration import Calibration
@@ -117,6 +118,10 @@ class FitOptions:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise ValueError(f'`{name}` must be positive, got {value}')
+            if name in ('k2_sd', 'k3_sd') and value is not None:
+                fault = QUANTITIES['nonlinearity'].fault(value)
+                if fault:
+                    raise ValueError(f'`{name}` {fault}, got {value:g}')
         for name in ('ageing_bias', 'ageing_scale', 'gravity_sd'):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f'`{name}` must be 0 or positive, got {getattr(self, name)}')

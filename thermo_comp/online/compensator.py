@@ -22,7 +22,7 @@ from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.correction import VARIANCES, Excess, is_sound
+from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess, is_sound
 from ..unit.covariance import covariance_at
 from ..unit.functions import TANGENT_SPANS
 from ..unit.nonlinearity import corrected_nonlinear
@@ -86,6 +86,8 @@ class CompensatorStatus:
     is_refuted: bool = False
     #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
+    #: Sd of the relative scale of each axis; empty before the first sample.
+    scale_sd: tuple[float, ...] = ()
 
 
 class Compensator:
@@ -104,6 +106,8 @@ class Compensator:
         #: Stamp of a sample that is far ahead of the sample before and is not confirmed yet.
         self.leapt_ns: int | None = None
         self.reading_ns = EVER_NS  # the latest stamp of a reading
+        #: The present segment: start [ns], result of `Correction.line`, and misalignment.
+        self._segment: tuple[int, list[float], tuple[float, ...]] = (0, [], ())
         #: Rate correction of the present segment (`Correction.line`); empty without a gyroscope.
         self.rate_line: list[float] = []
 
@@ -322,7 +326,7 @@ class Compensator:
         # error.
         timeout_s = self.config.temperature_timeout_s
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
-        state = thermal.sample(stamp_ns)
+        state, line = thermal.sample(stamp_ns), self._segment[1]
         return CompensatorStatus(
             stamp_ns,
             faults,
@@ -341,6 +345,7 @@ class Compensator:
             gravity.result,
             gravity.is_refuted,
             self._rate_bias_sd(),
+            tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line),
         )
 
     def _rate_bias_sd(self) -> tuple[float, ...]:

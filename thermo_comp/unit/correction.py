@@ -45,6 +45,9 @@ _LEAST_SHARE = 1e-13
 _LARGEST = 1e140
 #: Places of the variances of the axes at zero force in a result of `Correction.line`.
 VARIANCES = tuple(12 + place for place in CONSTANTS)
+#: Places of the variances of the relative scale of the axes in a result of `Correction.line`: the
+#: coefficients of x^2 in xx, y^2 in yy, z^2 in zz.
+SCALE_VARIANCES = tuple(place + last for place, last in zip(VARIANCES, (2, 5, 9), strict=True))
 #: Number of thermal states from which one call per column costs less than a table of all sums.
 _FEW = 64
 #: Largest number of thermal states evaluated at once, to bound the memory.

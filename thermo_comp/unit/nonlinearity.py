@@ -181,9 +181,11 @@ class BeyondForce(NamedTuple):
     edge: float
     growth: float
 
-    def widened(self, x: Real, y: Real, z: Real, *covariance: Real) -> tuple[Real, ...]:
+    def widened(
+        self, x: Real, y: Real, z: Real,
+        xx: Real, xy: Real, xz: Real, yy: Real, yz: Real, zz: Real,
+    ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:  # fmt: skip
         """Add the variance to the covariance xx, xy, xz, yy, yz, zz of a corrected sample."""
-        xx, xy, xz, yy, yz, zz = covariance
         xx, yy, zz = xx + self._variance(x), yy + self._variance(y), zz + self._variance(z)
         return x, y, z, xx, xy, xz, yy, yz, zz
 
