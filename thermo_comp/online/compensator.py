@@ -86,8 +86,6 @@ class CompensatorStatus:
     is_refuted: bool = False
     #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
-    #: Sd of the relative scale of each axis; empty before the first sample.
-    scale_sd: tuple[float, ...] = ()
 
 
 class Compensator:
@@ -326,7 +324,7 @@ class Compensator:
         # error.
         timeout_s = self.config.temperature_timeout_s
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
-        state, line = thermal.sample(stamp_ns), self._segment[1]
+        state = thermal.sample(stamp_ns)
         return CompensatorStatus(
             stamp_ns,
             faults,
@@ -345,8 +343,13 @@ class Compensator:
             gravity.result,
             gravity.is_refuted,
             self._rate_bias_sd(),
-            tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line),
         )
+
+    @property
+    def scale_sd(self) -> tuple[float, ...]:
+        """Sd of the relative scale of each axis in the present segment; empty without one."""
+        line = self._segment[1]
+        return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
 
     def _rate_bias_sd(self) -> tuple[float, ...]:
         correction, line = self.thermal.rate_correction, self.rate_line

@@ -232,7 +232,7 @@ class Reporter:
             bias_sd = thermal.bias_sd(thermal.correction, variances)
             values |= _of_axes('sd {} [m/s^2]', map(math.sqrt, variances))
             values |= _of_axes('bias sd {} [m/s^2]', bias_sd)
-            values |= _of_axes('scale sd {}', status.scale_sd)
+            values |= _of_axes('scale sd {}', self._compensator.scale_sd)
             elements = zip(('yx', 'zx', 'zy'), calibration.misalignment_sd, strict=True)
             values |= {f'misalignment sd {name} [rad]': f'{sd:.3e}' for name, sd in elements}
         if gyroscope:
