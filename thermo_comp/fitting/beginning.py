@@ -72,7 +72,8 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
-    prior = _with_faces(prior, problem.up)
+    if n_directions >= POSITIONS_NEEDED:
+        prior = _with_faces(prior, problem.up)
     candidates = _candidates(windows, start, options, has_one_direction=n_directions == 1)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
