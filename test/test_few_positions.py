@@ -147,6 +147,16 @@ def test_the_assumed_repeatability_of_the_bias_is_said(rng):
     assert 'mountings' not in names(12, OPTIONS, n_bags=12)
 
 
+def test_counts_of_32_bits_are_fitted(rng):
+    # WHY: a full scale above 1e7 counts was refused after the fit, as that of a scale factor of 1.
+    source = turned(rng, positions(9, 3))
+    K = 2.0**31 / (12.0 * GRAVITY)
+    options = FitOptions(gravity=GRAVITY, input='counts', full_scale=2.0**31)
+    blocks = [replace(block, accel=np.rint(K * block.accel)) for block in source.blocks()]
+    axes = fit([replace(source, blocks=lambda: blocks)], options).calibration.axes
+    assert axes.x.scale_factor == pytest.approx(K, rel=0.01)
+
+
 def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
     # WHY: the positions of one recording agree, and its bias was claimed to a sixth of the error.
     offsets = 5e-3 * rng.standard_normal((8, 3))
