@@ -86,3 +86,10 @@ def test_thermometers_of_another_time_zone_are_named(tmp_path, zone_s, n):
     survey = survey_recording(tmp_path / 'bag.mcap')
     assert text in (survey.info.chosen or '')
     assert 'a fit needs one clock for all' in survey.findings
+
+
+def test_samples_without_stamps_beside_stamped_thermometers_are_named(tmp_path):
+    # WHY: an Imu stamped 0 s was reported as a thermometer 50 years ahead: 'two clocks?'.
+    true_ns = START_NS + STEP_NS * np.arange(1000)
+    with pytest.raises(RecordingError, match='stamped 0 s: the driver does not stamp them'):
+        blocks_of(tmp_path / 'bag.mcap', 0 * true_ns, true_ns[::10])

@@ -35,8 +35,6 @@ from .windows import CURVE, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-
-
 #: Prior sd of an element of the misalignment [rad] for the estimate from faces: the cross-axis
 #: sensitivity of good consumer MEMS.
 FACES_MISALIGNMENT_SD = 2.5e-3

@@ -33,8 +33,6 @@ WINDOW_S = 60.0
 # Distance outside a calibrated range that noise can explain, so that a window counts as inside
 # [half ranges].
 _EDGE = 0.02
-# Largest relative difference of a known |f| from gravity for a rest that counts as at 1 g.
-_USUAL = 0.01
 # Smallest ratio of the number of samples in a partial sum to the median of this number.
 _LEAST_FILLED = 0.9
 
@@ -97,7 +95,7 @@ class Windows:
     @property
     def is_usual(self) -> Bools:
         """Whether |f| is gravity in each window."""
-        return np.asarray(np.abs(self.size / self.gravity - 1.0) < _USUAL)
+        return np.asarray(np.abs(self.size / self.gravity - 1.0) < AT_REST - 1.0)
 
 
 def sum_length(window_s: float) -> float:

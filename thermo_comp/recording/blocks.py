@@ -281,11 +281,16 @@ def _restamp(messages: Messages, stamp_ns: Ints) -> None:
     scatter(messages.data, messages.start + 4, stamps.view((np.void, 8))[:, 0])
 
 
+def unstamped(stamp_ns: int) -> str:
+    """Describe samples with one stamp."""
+    return f'all its samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
+
+
 def clocks_apart(block: Block) -> str:
-    """Name a thermometer whose stamps are far from those of the samples around it."""
+    """Name a thermometer whose stamps are far from those of the samples around it, and why."""
     stamps = block.accel_stamp_ns
-    if len(stamps) > 1 and (stamps == stamps[0]).all():
-        return ''  # the driver does not stamp the samples
+    if len(stamps) >= _FEWEST_READINGS and (stamps == stamps[0]).all():
+        return unstamped(int(stamps[0]))
     for name, readings in block.temperatures.items():
         inside = (readings.after > 0) & (readings.after < len(block))
         stamp_ns, after = readings.stamp_ns[inside], readings.after[inside]

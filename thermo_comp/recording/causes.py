@@ -7,7 +7,7 @@ Owns the likely reasons why a recording is not one of an accelerometer at rest, 
 import numpy as np
 
 from ..unit.gravity import STANDARD_GRAVITY
-from .blocks import Block
+from .blocks import Block, unstamped
 from .stillness import Cells
 
 # Share of faulty samples below which the fault is a glitch, and above which all samples are taken
@@ -46,8 +46,7 @@ class CauseCounter:
                 '(linear_acceleration_covariance[0] = -1): another topic of the driver has it'
             )
         if self._n > 1 and len(self._stamps_ns) == 1:
-            stamp_s = next(iter(self._stamps_ns)) * 1e-9
-            return f'all its samples are stamped {stamp_s:g} s: the driver does not stamp them'
+            return unstamped(next(iter(self._stamps_ns)))
         if self._n_zero == self._n and self._n:
             return 'all its samples are exactly zero: the sensor does not answer'
         if self._n_zero > _SOME * self._n:

@@ -34,7 +34,7 @@ Kind = Literal['square', 'odd_square', 'cube']
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
 #: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 .. 60 ug/g^2.
 K2_SD = 1e-4
-#: Largest |f| of a fit at rest, over gravity.
+#: Largest |f| of a rest that counts as at 1 g, over gravity.
 AT_REST = 1.01
 #: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
 #: sufficient.
