@@ -4,8 +4,9 @@
 
 import math
 
+import numpy as np
 import pytest
-from builders import SECOND_NS, calibration, term
+from builders import SECOND_NS, axis_set, calibration, regime_set, term
 
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
@@ -62,3 +63,37 @@ def test_beyond_1_g_the_covariance_has_an_unknown_square():
     grown = 9.80665e-4 * (4.0 - 1.01) ** 2
     assert math.sqrt(at_4_g[8] - at_1_g[8]) == pytest.approx(grown, rel=0.01)
     assert at_4_g[3] == pytest.approx(at_1_g[3])
+
+
+@pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
+def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fault):
+    # WHY: the bias follows a part that lags the board by 10 min, so a sudden error of the board
+    # temperature changes nothing, but a lasting error does; only the sudden error was claimed.
+    per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
+    part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
+    parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
+    compensator = Compensator(
+        calibration(static=parts, dynamic=parts, response=(part,), board_lag_s=60.0), UNCHECKED
+    )
+    of_part, errors, sds = 20.0, [], []
+    for second in range(3600):
+        stamp = 10**12 + second * SECOND_NS
+        ramp_s = max(second - 1200.0, 0.0)
+        # The case changes by 1 K/min; the board is 1 K behind.
+        case, board = 20.0 + ramp_s / 60.0, 20.0 + max(ramp_s - 60.0, 0.0) / 60.0
+        of_part += (board - of_part) / 600.0
+        flicker = 2e-3 * (second % 3)
+        readings = {'board': board + flicker, 'case': case - flicker}
+        if fault == 'swapped topics':
+            readings = {'board': readings['case'], 'case': readings['board']}
+        elif second >= 1500:
+            readings = {'board': 24.0, 'case': 25.0}
+        for name, celsius in readings.items():
+            compensator.push(name, stamp, celsius)
+        row = compensator.process(stamp, per_kelvin * (of_part - 20.0), 0.0, 2943.0)
+        if second >= 1800:
+            errors.append(row[0])
+            sds.append(math.sqrt(row[3] - compensator.thermal.correction.noise[0]))
+    ratio = np.abs(errors) / sds
+    assert ratio.max() < 3.0
+    assert ratio.max() > 0.1

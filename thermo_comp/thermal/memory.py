@@ -317,9 +317,9 @@ class ThermalMemory:
             bank.forget()
         self._held = []
 
-    def board_step(self, stamp_ns: int, board: float) -> None:
-        """Take the next estimate of the board temperature [degC]."""
-        self.board.step(stamp_ns, board)
+    def board_step(self, stamp_ns: int, board: float, sd: float = 0.0) -> None:
+        """Take the next estimate of the board temperature [degC], with an error `sd`."""
+        self.board.step(stamp_ns, board, sd)
         values = self.board.lagging
         if self._needs_sensors:
             # The other sensors have no reading at this stamp, so their last gradients are used.

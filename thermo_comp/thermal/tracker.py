@@ -102,7 +102,9 @@ class ThermalTracker:
             board, rate, _ = self.board.at(stamp_ns)
             gradient = sensor.temperature - board
             if bank.taus:
-                bank.step(stamp_ns, gradient)
+                leading = self.case.at(stamp_ns)[0] - board
+                variance = check.extra_variance(stamp_ns) + self._board_error(stamp_ns, leading)
+                bank.step(stamp_ns, gradient, sqrt(variance))
             if self.detector.regime is Regime.STATIC:
                 self._rest_gradients[name] = gradient - self._board_lag_s * rate
         if sensor is self.case:
@@ -116,7 +118,10 @@ class ThermalTracker:
     def _follow_board(self, stamp_ns: int) -> None:
         board, memory = self.board, self.memory
         if not memory.is_empty:
-            memory.board_step(stamp_ns, board.temperature)
+            name = self.spec.sensors[0]
+            leading, _ = self._gradient(name, stamp_ns, board.temperature, board.rate)
+            error = sqrt(self._board_error(stamp_ns, leading))
+            memory.board_step(stamp_ns, board.temperature, error)
             for name, bank in memory.banks.items():
                 sensor = self.thermometers[name]
                 if sensor is board or not bank.taus or bank.stamp_ns is None:
@@ -205,12 +210,7 @@ class ThermalTracker:
         )
         gradients, pairs = [], []
         for name in self.spec.sensors:
-            sensor = self.thermometers[name]
-            if self.is_live(stamp_ns, sensor):
-                celsius, _, variance = sensor.at(stamp_ns)
-                gradient = celsius - board
-            else:
-                gradient, variance = self._lost_gradient(name, stamp_ns, rate)
+            gradient, variance = self._gradient(name, stamp_ns, board, rate)
             gradients.append(gradient)
             pairs += [gradient, variance + self.checks[name].extra_variance(stamp_ns)]
         for name in self.spec.rates:
@@ -218,13 +218,30 @@ class ThermalTracker:
             is_live = self.is_live(stamp_ns, sensor)
             # The rate of a lost sensor is taken to be the board's rate, with an sd of 100 %.
             pairs += [sensor.rate, sensor.var_rate] if is_live else [rate, rate * rate]
-        var_board += self.checks[BOARD_INPUT].extra_variance(stamp_ns)
-        # If the board leads the case in a ramp, the topics of case and board may be swapped.
-        is_reversed = self.lead.is_reversed
-        var_board += gradients[0] * gradients[0] if is_reversed else self.lead.extra_variance
+        var_board += self._board_error(stamp_ns, gradients[0])
         if not self.memory.is_empty:
             pairs += self.memory.at(stamp_ns, board, gradients)
         return board, var_board, rate, self.weight_at(stamp_ns), float(not is_known), *pairs
+
+    def _board_error(self, stamp_ns: int, gradient: float) -> float:
+        """
+        Return the variance of a lasting error of the board temperature [K^2], given the gradient
+        of the leading sensor: readings stand still or have jumped, or topics may be swapped.
+        """
+        variance = self.checks[BOARD_INPUT].extra_variance(stamp_ns)
+        # If the board leads the case in a ramp, the topics of case and board may be swapped.
+        is_reversed = self.lead.is_reversed
+        return variance + (gradient * gradient if is_reversed else self.lead.extra_variance)
+
+    def _gradient(
+        self, name: str, stamp_ns: int, board: float, rate: float
+    ) -> tuple[float, float]:
+        """Return a gradient and the variance of its sensor, given the board's temperature."""
+        sensor = self.thermometers[name]
+        if self.is_live(stamp_ns, sensor):
+            celsius, _, variance = sensor.at(stamp_ns)
+            return celsius - board, variance
+        return self._lost_gradient(name, stamp_ns, rate)
 
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
