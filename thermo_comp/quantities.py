@@ -83,6 +83,7 @@ _PREPARED: dict[str, Bounds] = {
     'angular rate': _between(-1e3, 1e3, 'rad/s', '1000 rad/s are 57000 deg/s'),
     # Temperatures.
     'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='0 K to molten solder'),
+    'temperature difference': _between(-1273.15, 1273.15, 'K', 'of two possible temperatures'),
     'temperature span': _positive(1e-2, 1273.15, 'K', 'a thermometer resolves no less'),
     'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1000 K/min'),
     'rate span': _positive(1e-6, 2e5, 'K/min', 'no less than 1 K in two years'),

@@ -86,6 +86,7 @@ def build_calibration(
         ),
         response=blank_terms(columns),
         board_lag_s=known.board_lag_s if known else _board_lag(windows),
+        gradient_range_k=_gradient_range(windows, known),
         detector=model.detector,
         provenance=_provenance(fit, bags, residuals, findings),
         evidence=group_evidence(regression, posterior) if windows.was_measured else (),
@@ -325,6 +326,14 @@ def file_parameters(
     # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the elements (a, b, c) of its inverse.
     of_a, of_b, of_c = unknown[layout.misalignment]
     return np.array([*rows, -of_a, c * of_a - of_b + a * of_c, -of_c])
+
+
+def _gradient_range(windows: ThermalWindows, known: Calibration | None) -> Range | None:
+    """Return the range of the gradient of the first sensor; None without this sensor."""
+    ranges = [_range(windows.gradient, 0.01)] if windows.gradient.any() else []
+    if known is not None and known.gradient_range_k is not None:
+        ranges.append(known.gradient_range_k)
+    return union(ranges) if ranges else None
 
 
 def _board_lag(windows: ThermalWindows) -> float:

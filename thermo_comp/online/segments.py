@@ -20,7 +20,7 @@ from ..thermal.reading_queue import NEVER_NS, ReadingQueue
 from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig
 from ..thermal.state import BOARD
-from ..thermal.tracker import ThermalTracker
+from ..thermal.tracker import ANY_RANGE, ThermalTracker
 from ..unit.calibration import Calibration, rate_triad
 from ..unit.correction import Correction
 from ..unit.prediction import SlowUncertainty
@@ -98,9 +98,11 @@ class ThermalSide:
             self.calibration.detector, self.correction.memory, *self._tracker_config()
         )
 
-    def _tracker_config(self) -> tuple[ThermalConfig, float]:
+    def _tracker_config(self) -> tuple[ThermalConfig, float, tuple[float, float]]:
         gentle_s = self.correction.gentle_transition(self.config.transition_time_s)
-        return replace(self.config, transition_time_s=gentle_s), self.calibration.board_lag_s
+        config = replace(self.config, transition_time_s=gentle_s)
+        unit = self.calibration
+        return config, unit.board_lag_s, unit.gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
         """Continue with another model or configuration; the original of a copy stays unchanged."""

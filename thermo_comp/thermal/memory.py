@@ -339,9 +339,28 @@ class ThermalMemory:
         for bank in self.banks.values():
             bank.note_jump(change)
 
-    def at(self, stamp_ns: int, board: float, gradients: list[float]) -> list[float]:
-        """Return each lag [K] and its extra variance [K^2], then each play less its input [K]."""
+    def at(
+        self,
+        stamp_ns: int,
+        board: float,
+        gradients: list[float],
+        still: Sequence[tuple[float, float]] = (),
+    ) -> list[float]:
+        """
+        Return each lag [K] and its extra variance [K^2], then each play less its input [K].
+
+        still: if readings of an input stand still, for each input their possible error [K] and
+            for how long they do [s]
+        """
         behind, extra = self._single_lags(stamp_ns, board, gradients)
+        if still:
+            taus = [bank.taus for bank in self.banks.values()]
+            errors = [
+                sd * math.expm1(-still_s / tau)
+                for (sd, still_s), of_bank in zip(still, taus, strict=True)
+                for tau in of_bank
+            ]
+            extra = [variance + sd * sd for variance, sd in zip(extra, errors, strict=True)]
         if self._sums:
             values, variances = behind, extra
             behind = [sum([share * values[k] for k, share in lag]) for lag in self._sums]

@@ -197,14 +197,20 @@ class SensorCheck:
 
     def extra_variance(self, stamp_ns: int) -> float:
         """Return the variance that standstills and jumps add to the temperature's [K^2]."""
-        variance = self._jump_at(stamp_ns)
+        return self._jump_at(stamp_ns) + self.still(stamp_ns)[0] ** 2
+
+    def still(self, stamp_ns: int) -> tuple[float, float]:
+        """
+        Return the possible error of readings that stand still [K], and for how long they do [s];
+        0 if they do not.
+        """
         changed_ns = self.sensor.changed_ns
         if changed_ns is None or self._n_same < self._n_doubtful:
-            return variance
+            return 0.0, 0.0
         if self._has_cells and self.fault != Fault.FROZEN:
-            return variance
-        moved: float = min(self._rate * max(stamp_ns - changed_ns, 0) * 1e-9, LARGEST_ERROR)
-        return variance + moved * moved
+            return 0.0, 0.0
+        still_s = max(stamp_ns - changed_ns, 0) * 1e-9
+        return min(self._rate * still_s, LARGEST_ERROR), still_s
 
 
 def still_readings(settings: ThermometerSettings) -> int:

@@ -9,20 +9,27 @@ stamp, and the thermal state is requested for a stamp.
 """
 
 from copy import copy
-from math import sqrt
+from math import inf, sqrt
 from typing import Final
 
 from .memory import BOARD_INPUT, MemorySpec, ThermalMemory, start_covariance
 from .plausibility import Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
-from .state import MEMORY_SETTLED_SD, USUAL_BOARD_LAG_S, Layout
+from .state import BOARD, GRADIENT, MEMORY_SETTLED_SD, USUAL_BOARD_LAG_S
 from .thermometer import Thermometer
 
 #: Relative sd of the gradient that is estimated from the board's rate while a sensor is lost.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: Time without a reading after which the regime is unknown, as a share of the thermal lag.
 UNWATCHED_SHARE: Final = 0.25
+#: Gradient outside the range of the fit that is claimed as an error of the board temperature [K]:
+#: beyond a change of the unit's self-heating (say, with the air flow) and the gradient of a ramp
+#: in surroundings where the board lags twice as much as in the fit.
+SELF_HEATING_CHANGE_K: Final = 1.0
+RAMP_LAGS: Final = 2.0
+#: A range without limits.
+ANY_RANGE: Final = (-inf, inf)
 
 
 class ThermalTracker:
@@ -34,10 +41,11 @@ class ThermalTracker:
         memory: MemorySpec | None = None,
         config: ThermalConfig | None = None,
         board_lag_s: float = USUAL_BOARD_LAG_S,
+        gradient_range_k: tuple[float, float] = ANY_RANGE,
     ) -> None:
         self.settings = detector
         self.spec = memory or MemorySpec()
-        self._configure(config or ThermalConfig(), board_lag_s)
+        self._configure(config or ThermalConfig(), board_lag_s, gradient_range_k)
         self.board = Thermometer(detector.board)
         beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **beside}
@@ -62,8 +70,11 @@ class ThermalTracker:
         self.detector = RegimeDetector(self.settings)
         self.lead = LeadCheck(self.case, self.board, self.settings.relaxed_rate_k_min)
 
-    def _configure(self, config: ThermalConfig, board_lag_s: float) -> None:
+    def _configure(
+        self, config: ThermalConfig, board_lag_s: float, gradient_range_k: tuple[float, float]
+    ) -> None:
         self.config = config
+        self._gradient_range = gradient_range_k
         #: Lag of the board behind the case [s], for the gradient while the case is lost.
         self._board_lag_s = board_lag_s
         self._case_timeout_s = config.case_timeout_s
@@ -74,12 +85,18 @@ class ThermalTracker:
         )
         self._unwatched_s = min(max(UNWATCHED_SHARE * lag_s, config.case_timeout_s), longest_s)
 
-    def reconfigure(self, config: ThermalConfig, board_lag_s: float, stamp_ns: int | None) -> None:
+    def reconfigure(
+        self,
+        config: ThermalConfig,
+        board_lag_s: float,
+        gradient_range_k: tuple[float, float],
+        stamp_ns: int | None,
+    ) -> None:
         """Use another configuration from a stamp on, without a step in the weight of the sets."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
-        self._configure(config, board_lag_s)
+        self._configure(config, board_lag_s, gradient_range_k)
         # The check is copied, because another tracker may share it.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
@@ -103,8 +120,7 @@ class ThermalTracker:
             gradient = sensor.temperature - board
             if bank.taus:
                 leading = self.case.at(stamp_ns)[0] - board
-                variance = check.extra_variance(stamp_ns) + self._board_error(stamp_ns, leading)
-                bank.step(stamp_ns, gradient, sqrt(variance))
+                bank.step(stamp_ns, gradient, sqrt(self._board_error(leading)))
             if self.detector.regime is Regime.STATIC:
                 self._rest_gradients[name] = gradient - self._board_lag_s * rate
         if sensor is self.case:
@@ -120,7 +136,7 @@ class ThermalTracker:
         if not memory.is_empty:
             name = self.spec.sensors[0]
             leading, _ = self._gradient(name, stamp_ns, board.temperature, board.rate)
-            error = sqrt(self._board_error(stamp_ns, leading))
+            error = sqrt(self._board_error(leading))
             memory.board_step(stamp_ns, board.temperature, error)
             for name, bank in memory.banks.items():
                 sensor = self.thermometers[name]
@@ -218,17 +234,26 @@ class ThermalTracker:
             is_live = self.is_live(stamp_ns, sensor)
             # The rate of a lost sensor is taken to be the board's rate, with an sd of 100 %.
             pairs += [sensor.rate, sensor.var_rate] if is_live else [rate, rate * rate]
-        var_board += self._board_error(stamp_ns, gradients[0])
+        var_board += self.checks[BOARD_INPUT].extra_variance(stamp_ns)
+        var_board += self._board_error(gradients[0])
         if not self.memory.is_empty:
-            pairs += self.memory.at(stamp_ns, board, gradients)
+            still = [self.checks[name].still(stamp_ns) for name in self.spec.inputs]
+            if not any(sd for sd, _ in still):
+                still = []
+            pairs += self.memory.at(stamp_ns, board, gradients, still)
         return board, var_board, rate, self.weight_at(stamp_ns), float(not is_known), *pairs
 
-    def _board_error(self, stamp_ns: int, gradient: float) -> float:
+    def _board_error(self, gradient: float) -> float:
         """
-        Return the variance of a lasting error of the board temperature [K^2], given the gradient
-        of the leading sensor: readings stand still or have jumped, or topics may be swapped.
+        Return the variance of an error of the board temperature [K^2] that the gradient of the
+        leading sensor shows: the thermometer may be loose, or topics may be swapped.
         """
-        variance = self.checks[BOARD_INPUT].extra_variance(stamp_ns)
+        variance = 0.0
+        lower, upper = self._gradient_range
+        excess = max(gradient - upper, lower - gradient) - SELF_HEATING_CHANGE_K
+        if excess > 0.0:
+            excess = max(excess - RAMP_LAGS * self._board_lag_s * abs(self.board.rate), 0.0)
+            variance += excess * excess
         # If the board leads the case in a ramp, the topics of case and board may be swapped.
         is_reversed = self.lead.is_reversed
         return variance + (gradient * gradient if is_reversed else self.lead.extra_variance)
@@ -263,8 +288,13 @@ class ThermalTracker:
         """
         Whether the effect of the unknown temperatures before the start on the memory has decayed.
         """
-        layout = Layout(self.spec)
-        extra = self.sample(stamp_ns)[layout.variances][layout.lag_pairs]
+        state, n_sensors, n_lags = (
+            self.sample(stamp_ns),
+            len(self.spec.sensors),
+            len(self.spec.lags),
+        )
+        gradients = list(state[GRADIENT : GRADIENT + 2 * n_sensors : 2])
+        extra = self.memory.at(stamp_ns, state[BOARD], gradients)[1 : 2 * n_lags : 2]
         start = start_covariance(self.spec.lags).diagonal().tolist()
         shares = self.memory.start_shares(stamp_ns)
         return all(

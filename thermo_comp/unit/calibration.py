@@ -48,6 +48,7 @@ AXES = ('x', 'y', 'z')
 POPULATION = 'population'
 
 Celsius = Annotated[float, QUANTITIES['temperature']]
+_Kelvin = Annotated[float, QUANTITIES['temperature difference']]
 _RateEdge = Annotated[float, QUANTITIES['temperature rate']]
 _Density = Annotated[float, QUANTITIES['noise density']]
 _Slow = Annotated[float, QUANTITIES['slow noise']]
@@ -216,6 +217,11 @@ class Calibration:
         QUANTITIES['time constant'],
         'Lag of T_board behind T_case; while the case is lost, gradient = lag * dT_board/dt.',
     ] = 900.0
+    gradient_range_k: Annotated[
+        tuple[_Kelvin, _Kelvin] | None,
+        'T_case - T_board of the fit, first sensor; null: unknown. Beyond it by over 1 K, and not '
+        'by a ramp, an error of T_board is claimed.',
+    ] = None
     detector: Annotated[
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
     ] = field(default_factory=DetectorSettings)
@@ -237,6 +243,8 @@ class Calibration:
             raise ValueError(f'`format_version` must be {FORMAT_VERSION}, got {version}')
         self._check_misalignment()
         self._check_sensors()
+        if self.gradient_range_k is not None:
+            check_ranges(self, gradient_range_k=QUANTITIES['temperature span'])
         check_reach(self, parameter_layout(self))
         if self.gyroscope is not None:
             self._check_gyroscope()
