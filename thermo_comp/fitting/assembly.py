@@ -68,6 +68,7 @@ def build_calibration(
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     static, dynamic = _regime_sets(fit, claim, known)
     columns = _valid_columns(windows, state, used, known)
+    lag_s = known.board_lag_s if known else _board_lag(windows)
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     blank = Calibration(
         format_version=FORMAT_VERSION,
@@ -85,8 +86,8 @@ def build_calibration(
             if not k or any(name == column.sensor for column in columns)
         ),
         response=blank_terms(columns),
-        board_lag_s=known.board_lag_s if known else _board_lag(windows),
-        gradient_range_k=_gradient_range(windows, known),
+        board_lag_s=lag_s,
+        rest_gradient_range_k=_rest_gradient_range(windows, lag_s, known),
         detector=model.detector,
         provenance=_provenance(fit, bags, residuals, findings),
         evidence=group_evidence(regression, posterior) if windows.was_measured else (),
@@ -328,11 +329,17 @@ def file_parameters(
     return np.array([*rows, -of_a, c * of_a - of_b + a * of_c, -of_c])
 
 
-def _gradient_range(windows: ThermalWindows, known: Calibration | None) -> Range | None:
-    """Return the range of the gradient of the first sensor; None without this sensor."""
-    ranges = [_range(windows.gradient, 0.01)] if windows.gradient.any() else []
-    if known is not None and known.gradient_range_k is not None:
-        ranges.append(known.gradient_range_k)
+def _rest_gradient_range(
+    windows: ThermalWindows, lag_s: float, known: Calibration | None
+) -> Range | None:
+    """
+    Return the range of the first sensor's gradient without that of ramps; None without the sensor.
+    """
+    ranges = []
+    if windows.gradient.any():
+        ranges.append(_range(windows.gradient - lag_s * windows.rate, 0.01))
+    if known is not None and known.rest_gradient_range_k is not None:
+        ranges.append(known.rest_gradient_range_k)
     return union(ranges) if ranges else None
 
 

@@ -40,16 +40,23 @@ class _Shape(NamedTuple):
     most_noise: ratio of the RMS residual to white noise up to which noise explains the residual
     has_stress: whether bias and scale also depend on m, by a coefficient that is linear in x: the
         stress between a part and the board
+    has_gradient: whether the bias also depends on the gradient of the case
     """
 
     n_nodes: int
     most_noise: float
     has_stress: bool = False
+    has_gradient: bool = False
 
 
 # Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so the
 # residual must be noise.
-_SHAPES = (_Shape(4, 1.1), _Shape(60, 1.5), _Shape(60, 1.5, has_stress=True))
+_SHAPES = (
+    _Shape(4, 1.1),
+    _Shape(4, 1.1, has_gradient=True),
+    _Shape(60, 1.5),
+    _Shape(60, 1.5, has_gradient=True, has_stress=True),
+)
 
 
 @dataclass(frozen=True)
@@ -80,6 +87,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     noise = white_noise_of(data, start.scale)
     accepted = None
     for shape in _SHAPES:
+        if shape.has_gradient and not windows.gradient.any():
+            continue
 
         def curves(n_windows: int, *, shape: _Shape = shape) -> _PartCurves:
             rows = slice(None, None, max(len(data.time) // n_windows, 1))
@@ -126,6 +135,7 @@ class _PartCurves:
         )
         self._bag, self._age = data.bag[rows], data.age[rows]
         self._weight = data.weight[rows, None]
+        self._case = windows.gradient[rows]
         self._t = windows.temperature[rows] - windows.model.reference_temperature
         self._taus = np.array([columns[k].tau_s for k in of_board])
         #: Time constants tried [s]: those of the columns, and shorter time constants.
@@ -297,6 +307,8 @@ class _PartCurves:
         rows = np.arange(len(x))
         u = (x / span)[:, None]
         stress = (self._t - x)[:, None] * u ** np.arange(2.0 * self._shape.has_stress)
+        if self._shape.has_gradient:
+            bias = np.hstack((bias, self._case[:, None]))
         scale = self._force[:, [axis]] * np.hstack((u ** np.arange(1, 4), stress))
         # The lag of the part at the start of each bag is unknown and decays.
         begin = np.zeros((len(x), int(self._bag[-1]) + 1))

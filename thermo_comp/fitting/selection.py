@@ -32,6 +32,7 @@ from .windows import BEND, CURVE, PART, PART_SUMS, SET, ThermalWindows
 #: Smallest possible gain in log evidence of a group that is tried: odds of e^4 = 55 to one.
 TRIAL_GAIN = 4.0
 #: Groups that are linear in a temperature difference.
+GRADIENT = 'gradient'
 LAGS = ('gradient', 'board', 'gradient_lag')
 
 
@@ -293,6 +294,8 @@ def _grown(
     chosen, trials = first, []
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND] if BEND in growth.free else [])]
+        if GRADIENT in growth.free and not _is_complete(_best(chosen, trials)):
+            trials.append(growth.extended(parts, (GRADIENT,)))
         chosen = _best(chosen, trials)
     if growth.regression.windows.has_part_lags and not _is_complete(chosen):
         tried = growth.with_bends(first, PART_SUMS)

@@ -11,6 +11,7 @@ each axis.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import comb
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -128,13 +129,22 @@ def position_means(windows: Windows) -> Floats:
 def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     """
     Return the white noise of the windows of each axis [m/s^2], shape (3,), from second differences
-    of windows, which do not depend on a drift; 0 if no position has three windows.
+    of windows, which do not depend on a linear drift; 0 if no position has three windows.
+
+    In fast ramps the second differences contain the drift; then fourth or sixth differences are
+    much smaller, and taken.
     """
-    inner = windows.inner
-    if not len(inner):
+    position, noises = windows.position, []
+    for order in (2, 4, 6):
+        bend = np.diff(windows.mean / scale, n=order, axis=0)
+        is_within = position[order:] == position[:-order]
+        if is_within.any():
+            size = np.median(np.abs(bend[is_within]), axis=0)
+            noises.append(size / (0.6745 * np.sqrt(comb(2 * order, order))))
+    if not noises:
         return np.zeros(3)
-    bend = np.diff(windows.mean / scale, n=2, axis=0)[inner]
-    return np.asarray(np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0)))
+    smallest = np.min(noises, axis=0)
+    return np.asarray(np.where(smallest < 0.7 * noises[0], smallest, noises[0]))
 
 
 def within_positions(values: Floats, position: Ints) -> Floats:

@@ -102,7 +102,7 @@ class ThermalSide:
         gentle_s = self.correction.gentle_transition(self.config.transition_time_s)
         config = replace(self.config, transition_time_s=gentle_s)
         unit = self.calibration
-        return config, unit.board_lag_s, unit.gradient_range_k or ANY_RANGE
+        return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
         """Continue with another model or configuration; the original of a copy stays unchanged."""

@@ -23,11 +23,10 @@ from .thermometer import Thermometer
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: Time without a reading after which the regime is unknown, as a share of the thermal lag.
 UNWATCHED_SHARE: Final = 0.25
-#: Gradient outside the range of the fit that is claimed as an error of the board temperature [K]:
-#: beyond a change of the unit's self-heating (say, with the air flow) and the gradient of a ramp
-#: in surroundings where the board lags twice as much as in the fit.
+#: Changes of the gradient by which the unit heats itself that are not claimed as an error of the
+#: board temperature, since the air flow changes: in K, and as a share of the gradient in the fit.
 SELF_HEATING_CHANGE_K: Final = 1.0
-RAMP_LAGS: Final = 2.0
+SELF_HEATING_CHANGE: Final = 0.5
 #: A range without limits.
 ANY_RANGE: Final = (-inf, inf)
 
@@ -41,11 +40,11 @@ class ThermalTracker:
         memory: MemorySpec | None = None,
         config: ThermalConfig | None = None,
         board_lag_s: float = USUAL_BOARD_LAG_S,
-        gradient_range_k: tuple[float, float] = ANY_RANGE,
+        rest_gradient_range_k: tuple[float, float] = ANY_RANGE,
     ) -> None:
         self.settings = detector
         self.spec = memory or MemorySpec()
-        self._configure(config or ThermalConfig(), board_lag_s, gradient_range_k)
+        self._configure(config or ThermalConfig(), board_lag_s, rest_gradient_range_k)
         self.board = Thermometer(detector.board)
         beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **beside}
@@ -71,10 +70,10 @@ class ThermalTracker:
         self.lead = LeadCheck(self.case, self.board, self.settings.relaxed_rate_k_min)
 
     def _configure(
-        self, config: ThermalConfig, board_lag_s: float, gradient_range_k: tuple[float, float]
+        self, config: ThermalConfig, board_lag_s: float, rest_gradient_range_k: tuple[float, float]
     ) -> None:
         self.config = config
-        self._gradient_range = gradient_range_k
+        self._rest_gradient_range = rest_gradient_range_k
         #: Lag of the board behind the case [s], for the gradient while the case is lost.
         self._board_lag_s = board_lag_s
         self._case_timeout_s = config.case_timeout_s
@@ -89,14 +88,14 @@ class ThermalTracker:
         self,
         config: ThermalConfig,
         board_lag_s: float,
-        gradient_range_k: tuple[float, float],
+        rest_gradient_range_k: tuple[float, float],
         stamp_ns: int | None,
     ) -> None:
         """Use another configuration from a stamp on, without a step in the weight of the sets."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
-        self._configure(config, board_lag_s, gradient_range_k)
+        self._configure(config, board_lag_s, rest_gradient_range_k)
         # The check is copied, because another tracker may share it.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
@@ -249,10 +248,13 @@ class ThermalTracker:
         leading sensor shows: the thermometer may be loose, or topics may be swapped.
         """
         variance = 0.0
-        lower, upper = self._gradient_range
-        excess = max(gradient - upper, lower - gradient) - SELF_HEATING_CHANGE_K
-        if excess > 0.0:
-            excess = max(excess - RAMP_LAGS * self._board_lag_s * abs(self.board.rate), 0.0)
+        of_ramp = self._board_lag_s * self.board.rate
+        lower, upper = self._rest_gradient_range
+        excess = max(gradient - of_ramp - upper, lower - gradient + of_ramp)
+        if excess > SELF_HEATING_CHANGE_K:
+            usual = max(SELF_HEATING_CHANGE_K, SELF_HEATING_CHANGE * max(-lower, upper))
+            # In other surroundings the board may lag twice as much as in those of the fit.
+            excess = max(excess - usual - abs(of_ramp), 0.0)
             variance += excess * excess
         # If the board leads the case in a ramp, the topics of case and board may be swapped.
         is_reversed = self.lead.is_reversed

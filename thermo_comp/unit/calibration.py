@@ -217,10 +217,10 @@ class Calibration:
         QUANTITIES['time constant'],
         'Lag of T_board behind T_case; while the case is lost, gradient = lag * dT_board/dt.',
     ] = 900.0
-    gradient_range_k: Annotated[
+    rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'T_case - T_board of the fit, first sensor; null: unknown. Beyond it by over 1 K, and not '
-        'by a ramp, an error of T_board is claimed.',
+        'T_case - T_board - lag * dT_board/dt in the bags, first sensor; null: unknown. A value '
+        'far outside is claimed as an error of T_board: a thermometer may be loose.',
     ] = None
     detector: Annotated[
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
@@ -243,8 +243,8 @@ class Calibration:
             raise ValueError(f'`format_version` must be {FORMAT_VERSION}, got {version}')
         self._check_misalignment()
         self._check_sensors()
-        if self.gradient_range_k is not None:
-            check_ranges(self, gradient_range_k=QUANTITIES['temperature span'])
+        if self.rest_gradient_range_k is not None:
+            check_ranges(self, rest_gradient_range_k=QUANTITIES['temperature span'])
         check_reach(self, parameter_layout(self))
         if self.gyroscope is not None:
             self._check_gyroscope()
