@@ -76,6 +76,7 @@ def unit(**changes):
             term('board', (BY_MEMORY,) * 3, tau_s=MEMORY_S),
         ),
         'board_lag_s': BOARD_LAG_S,
+        'rest_gradient_range_k': (-0.1, 0.1),
         'detector': DetectorSettings(
             smallest_ramp_k_min=1.0, relaxed_rate_k_min=0.4, dwell_s=5.0, case=sensor,
             board=replace(sensor, lag_s=BOARD_LAG_S),

@@ -18,8 +18,10 @@ from copy import copy
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
+from ..thermal.memory import BOARD_INPUT
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
+from ..thermal.state import GRADIENT
 from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess, is_sound
@@ -325,6 +327,9 @@ class Compensator:
         timeout_s = self.config.temperature_timeout_s
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
         state = thermal.sample(stamp_ns)
+        loose_k = tracker.loose_k(state[GRADIENT])
+        if loose_k and faults[BOARD_INPUT][0] is Fault.NONE:
+            faults[BOARD_INPUT] = Fault.LOOSE, loose_k
         return CompensatorStatus(
             stamp_ns,
             faults,

@@ -62,6 +62,7 @@ _FAULTS = {
     Fault.STILL: 'stands still to the bit, its uncertainty grows',
     Fault.FROZEN: 'frozen while the other thermometer moves: not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
+    Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
 }
 
 _BEYOND_FORCE = (

@@ -65,6 +65,9 @@ class Fault(Enum):
     FROZEN = 'frozen'
     #: A reading that changed faster than any part of a unit can: it is not used.
     STEP = 'jumped'
+    #: A difference from the case that neither a ramp nor the unit's heat explains: a thermometer
+    #: may be loose. The readings are used, with a larger variance.
+    LOOSE = 'apart'
 
 
 class SensorCheck:

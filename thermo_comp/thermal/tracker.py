@@ -118,7 +118,7 @@ class ThermalTracker:
             board, rate, _ = self.board.at(stamp_ns)
             gradient = sensor.temperature - board
             if bank.taus:
-                leading = self.case.at(stamp_ns)[0] - board
+                leading, _ = self._gradient(self.spec.sensors[0], stamp_ns, board, rate)
                 bank.step(stamp_ns, gradient, sqrt(self._board_error(leading)))
             if self.detector.regime is Regime.STATIC:
                 self._rest_gradients[name] = gradient - self._board_lag_s * rate
@@ -247,18 +247,24 @@ class ThermalTracker:
         Return the variance of an error of the board temperature [K^2] that the gradient of the
         leading sensor shows: the thermometer may be loose, or topics may be swapped.
         """
-        variance = 0.0
+        loose = self.loose_k(gradient)
+        # If the board leads the case in a ramp, the topics of case and board may be swapped.
+        is_reversed = self.lead.is_reversed
+        return loose * loose + (gradient * gradient if is_reversed else self.lead.extra_variance)
+
+    def loose_k(self, gradient: float) -> float:
+        """
+        Return the part of a gradient of the leading sensor [K] that neither a ramp nor the unit's
+        own heat explains; 0 without.
+        """
         of_ramp = self._board_lag_s * self.board.rate
         lower, upper = self._rest_gradient_range
         excess = max(gradient - of_ramp - upper, lower - gradient + of_ramp)
-        if excess > SELF_HEATING_CHANGE_K:
-            usual = max(SELF_HEATING_CHANGE_K, SELF_HEATING_CHANGE * max(-lower, upper))
-            # In other surroundings the board may lag twice as much as in those of the fit.
-            excess = max(excess - usual - abs(of_ramp), 0.0)
-            variance += excess * excess
-        # If the board leads the case in a ramp, the topics of case and board may be swapped.
-        is_reversed = self.lead.is_reversed
-        return variance + (gradient * gradient if is_reversed else self.lead.extra_variance)
+        if excess <= SELF_HEATING_CHANGE_K:
+            return 0.0
+        usual = max(SELF_HEATING_CHANGE_K, SELF_HEATING_CHANGE * max(-lower, upper))
+        # In other surroundings the board may lag twice as much as in those of the fit.
+        return max(excess - usual - abs(of_ramp), 0.0)
 
     def _gradient(
         self, name: str, stamp_ns: int, board: float, rate: float
