@@ -51,6 +51,19 @@ def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
     assert corrected[-1][0] == pytest.approx(corrected[1999][0], abs=0.01)
 
 
+def test_without_its_sensor_from_the_start_the_gradient_is_that_of_the_fit():
+    of_gradient = (term('gradient', (30.0, 0.0, 0.0)),)
+    unit = calibration(response=of_gradient, rest_gradient_range_k=(-1.1, -0.9))
+    compensator = Compensator(unit, UNCHECKED)
+    for second in range(60):
+        stamp = 10**12 + second * SECOND_NS
+        compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
+        row = compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2)
+    # A gradient of -1 K: -30 counts of 300 per m/s^2, within some mK of the board's rate.
+    assert row[0] == pytest.approx(1.1, abs=0.01)
+    assert not compensator.thermal.tracker.loose_k(-1.0)
+
+
 def test_beyond_1_g_the_covariance_has_an_unknown_square():
     # The K2 of a unit that was fitted at rest is unknown: its sd is 100 ug/g^2 from 1.01 g on.
     compensator = Compensator(calibration(), UNCHECKED)

@@ -278,11 +278,14 @@ class ThermalTracker:
 
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
-        Estimate a gradient while its sensor is lost: the last one at rest, by which the unit heats
-        itself, plus that of the board's rate.
+        Estimate a gradient while its sensor is lost: the last one at rest (that of the fit before
+        the first rest), by which the unit heats itself, plus that of the board's rate.
         """
         lag = self._board_lag_s
-        gradient = self._rest_gradients.get(name, 0.0) + lag * rate
+        lower, upper = self._rest_gradient_range
+        is_known = name == self.spec.sensors[0] and upper < inf
+        usual = 0.5 * (lower + upper) if is_known else 0.0
+        gradient = self._rest_gradients.get(name, usual) + lag * rate
         # Largest change of the case temperature since the last board reading [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
