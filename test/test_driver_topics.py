@@ -95,6 +95,7 @@ def test_the_node_finds_the_type_while_it_runs(peer, unit, is_file):
         ('board=/t,case', 'parameter `topics`: expected INPUT=TOPIC, got case'),
         ('/none/drivers.yaml', '/none/drivers.yaml: cannot be read'),
         ('board=/t,case=/t', '/t: one topic for both board and case'),
+        ('counts=/imu/data_raw', '/imu/data_raw: is both input and output: remap imu/data_raw'),
         ('imu=/imu/data_raw', "must be 'm/s^2' (parameter `input` is imu), got 'counts'"),
     ],
 )

@@ -141,7 +141,7 @@ class FitOptions:
         }
         for name, words in allowed.items():
             given = getattr(self, name)
-            for word in given if isinstance(given, tuple) else (given,):
+            for word in given if isinstance(given, tuple | list) else (given,):
                 if word is not None and word not in words:
                     raise ValueError(f'`{name}` must be of {", ".join(words)}, got {word!r}')
 

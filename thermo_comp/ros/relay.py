@@ -70,9 +70,10 @@ class Relay:
             topic = split_field(self._topic(name))[0]
             self._hear(name, topic, LiveField(topic, TEMPERATURE, 'temperature'))
         self._problems: set[str] = set()
-        imu = loop.publisher(Imu, self._names.get('output', IMU_OUT.name), qos_of(IMU_OUT))
+        output = self._names.get('output', IMU_OUT.name)
+        self._check_topics(loop.node.resolve_topic_name(output))
+        imu = loop.publisher(Imu, output, qos_of(IMU_OUT))
         self._publish: Callable[[bytes], None] = imu.handle.publish_raw
-        self._check_topics(imu.topic_name)
         self._flags = [
             (loop.publisher(message_class(flag.type), flag.name, qos_of(flag)).publish, pack)
             for flag, pack in FLAGS.items()

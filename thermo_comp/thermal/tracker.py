@@ -260,11 +260,11 @@ class ThermalTracker:
         of_ramp = self._board_lag_s * self.board.rate
         lower, upper = self._rest_gradient_range
         excess = max(gradient - of_ramp - upper, lower - gradient + of_ramp)
-        if excess <= SELF_HEATING_CHANGE_K:
-            return 0.0
-        usual = max(SELF_HEATING_CHANGE_K, SELF_HEATING_CHANGE * max(-lower, upper))
-        # In other surroundings the board may lag twice as much as in those of the fit.
-        return max(excess - usual - abs(of_ramp), 0.0)
+        if excess > SELF_HEATING_CHANGE_K:
+            usual = max(SELF_HEATING_CHANGE_K, SELF_HEATING_CHANGE * max(-lower, upper))
+            # In other surroundings the board may lag twice as much as in those of the fit.
+            return max(excess - usual - abs(of_ramp), 0.0)
+        return 0.0
 
     def _gradient(
         self, name: str, stamp_ns: int, board: float, rate: float
