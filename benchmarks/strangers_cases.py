@@ -36,6 +36,7 @@ LONG = program(
     20, 25, (35, 1, 60), (5, 2, 60), (25, 0.5, 40), (10, 1, 45), (33, 2, 60), (20, 0.5, 60)
 )
 HALF = program(20, 20, (35, 1, 45), (5, 1, 45), (20, 1, 5))
+FAST = program(20, 2, (5, 1.9, 5), (35, 2.3, 5), (20, 2, 2))
 WHOLE = program(20, 25, (35, 1, 60), (5, 1.5, 60), (20, 0.7, 20), (28, 1, 20))
 POSE = program(20, 40, (35, 1, 90), (5, 1, 100), (28, 0.5, 60), (12, 1.5, 70), (20, 1, 75))
 OTHER = program(12, 25, (31, 0.7, 45), (17, 1.5, 50), (26, 0.6, 40), (7, 1, 45))
@@ -249,6 +250,20 @@ def kink(number: int) -> Iterator[Study]:
     yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
 
 
+def gradient(number: int) -> Iterator[Study]:
+    """Add a bias proportional to the gradient of the case; bags of 40 min with fast ramps."""
+    rng = rng_of('gradient', number)
+    unit = navigation(
+        rng,
+        gradient_bias=signed(rng, 8, 25),
+        part_s=rng.uniform(50, 200, 3),
+        case_s=rng.uniform(20, 50),
+        board_s=rng.uniform(70, 150),
+    )
+    fit = positions(unit, FAST, spread(9, rng), rng)
+    yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
+
+
 def bump(number: int) -> Iterator[Study]:
     """Add a bump of 300 to 600 ug to the bias, 2 K wide."""
     rng = rng_of('bump', number)
@@ -399,6 +414,7 @@ CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'mems': (mems, 8),
     'ageing': (ageing, 3),
     'kink': (kink, 3),
+    'gradient': (gradient, 3),
     'bump': (bump, 3),
     'carry': (carry, 3),
     'support': (support, 3),

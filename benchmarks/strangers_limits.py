@@ -125,6 +125,7 @@ LIMITS = {
     'mems': _TURN_ON,
     'ageing': Limit(),
     'kink': Limit(norm=12.0),
+    'gradient': Limit(norm=12.0),
     'bump': Limit(norm=60.0),
     'carry': Limit(),
     'support': Limit(vector=60.0),

@@ -66,6 +66,8 @@ class Unit:
         Height [ug] of a bell in the bias, its middle [degC] and its full width at half height [K].
     hidden_bias : ndarray, shape (3,)
         Bias per temperature of the hidden node above the board [ug/K].
+    gradient_bias : ndarray, shape (3,)
+        Bias per temperature of the case above the board [ug/K].
     case_s, board_s, part_s, hidden_s : float or ndarray, shape (3,)
         Time constants [s]; a part that lags by 0 s is the board itself.
     case_share : ndarray, shape (3,)
@@ -96,6 +98,7 @@ class Unit:
     bump_c: float = REFERENCE_C
     bump_k: float = 2.0
     hidden_bias: Floats = field(default_factory=_zeros)
+    gradient_bias: Floats = field(default_factory=_zeros)
     case_s: float = 200.0
     board_s: float = 600.0
     part_s: Floats = field(default_factory=_zeros)
@@ -305,6 +308,7 @@ def record(
         force *= GRAVITY / np.linalg.norm(force, axis=1, keepdims=True)
     ideal = unit.sensed(np.atleast_2d(force)) * unit.scale_at(parts)
     bias = unit.bias_at(parts, (nodes[:, HIDDEN] - nodes[:, BOARD])[:, None])
+    bias = bias + unit.gradient_bias * (nodes[:, CASE] - nodes[:, BOARD])[:, None]
     noise = unit.density * np.sqrt(rate_hz) * rng.standard_normal((n, 3))
     samples = ideal + UG * (bias + shift + noise)
     if unit.counts:
