@@ -147,8 +147,8 @@ def test_a_unit_without_lags_gets_none():
 
 
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
-    # WHY: the lags took a part of the effect of the gradient, 223 s for 163 s, and the columns that
-    # made up for it failed in a soak, 167 ug with a claim of 15.
+    # WHY: lags included a part of the effect of the gradient, 223 s for 163 s; the columns that
+    # made up for this failed in a soak, 167 ug with a claim of 15.
     (study,) = gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
