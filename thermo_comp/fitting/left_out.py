@@ -206,8 +206,8 @@ def _gains(before: Score, after: Score) -> list[tuple[float, float] | None]:
 def score_of(regression: Regression, posterior: Posterior) -> Score:
     """Score a model on left-out positions, sections and halves of the program."""
     regression.whiten(posterior.prior.noise)
-    n_sections = regression.windows.n_sections
-    numbers = np.arange(n_sections if n_sections > 1 else 0)
+    last = int(regression.windows.section.max())
+    numbers = np.arange(last + 1 if last else 0)
     positions, norms, force, drift = _by_positions(regression, posterior)
     sections, section_drift = _by_sections(regression, posterior, numbers[:, None])
     halves = np.array_split(numbers, 2) if len(numbers) else []

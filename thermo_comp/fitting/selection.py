@@ -294,7 +294,7 @@ def _grown(
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND] if BEND in growth.free else [])]
         chosen = _best(chosen, trials)
-    if growth.regression.windows.has_part_lags and not _is_complete(chosen):
+    if growth.regression.windows.acts_on is not None and not _is_complete(chosen):
         tried = growth.with_bends(first, PART_SUMS)
         trials += tried
         chosen = _best(chosen, tried)

@@ -84,11 +84,6 @@ class Windows:
         """Number of positions."""
         return int(self.position[-1]) + 1
 
-    @property
-    def has_part_lags(self) -> bool:
-        """Whether the lags are those of the unit's parts."""
-        return self.acts_on is not None
-
     @cached_property
     def share(self) -> Floats:
         """
@@ -103,11 +98,6 @@ class Windows:
         """Whether a column changes within a position."""
         same = self.position[1:] == self.position[:-1]
         return bool(np.diff(self.columns, axis=0)[same].any())
-
-    @property
-    def n_sections(self) -> int:
-        """Number of program sections."""
-        return int(self.section.max()) + 1
 
     @property
     def parts(self) -> Bools:
@@ -178,11 +168,6 @@ class InformativePrior:
 
     mean: Floats
     root: Floats
-
-    @cached_property
-    def precision(self) -> Floats:
-        """Inverse covariance, shape (n_unit, n_unit)."""
-        return np.asarray(self.root.T @ self.root)
 
 
 @dataclass(frozen=True)
@@ -258,12 +243,12 @@ class State:
 
     @cached_property
     def inverse(self) -> Floats:
-        """Return the inverse of M."""
+        """The inverse of M."""
         return inverse_misalignment(self.misalignment)
 
     @cached_property
     def tangents(self) -> Floats:
-        """Return two unit vectors perpendicular to each attitude, shape (n, 3, 2)."""
+        """Two unit vectors perpendicular to each attitude, shape (n, 3, 2)."""
         return tangent_basis(self.up)
 
 
@@ -334,8 +319,8 @@ class Layout:
     def of_axis(self) -> Ints:
         """The unknowns of a position that each axis has, as places in `own`, shape (3, k)."""
         first = self.up.shape[1] + self.stretch.shape[1]
-        common = [*range(first)], [*range(first + 3, self.own.shape[1])]
-        return np.array([[*common[0], first + axis, *common[1]] for axis in range(3)])
+        before, after = range(first), range(first + 3, self.own.shape[1])
+        return np.array([[*before, first + axis, *after] for axis in range(3)])
 
     @cached_property
     def used(self) -> Bools:
