@@ -135,9 +135,7 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """
-    Name the case thermometer, then all other thermometers, except the board's, that every bag has.
-    """
+    """Name the case thermometer, then the other thermometers, but the board's, of every bag."""
     seen = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

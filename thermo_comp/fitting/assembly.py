@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the conversion of a posterior into the Calibration that the compensator applies.
-"""
+"""Owns the conversion of a posterior into the Calibration that the compensator applies."""
 
 from __future__ import annotations
 

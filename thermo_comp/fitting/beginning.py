@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the initial state and the prior of the regression, with or without a prior calibration.
-"""
+"""Owns the initial state and the prior of the regression, with or without a prior calibration."""
 
 from __future__ import annotations
 

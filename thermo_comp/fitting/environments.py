@@ -35,9 +35,7 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """
-    Whether the RMS of a drift exceeds five times the usual RMS, both given as mean squares.
-    """
+    """Whether the RMS of a drift exceeds five times the usual RMS, both given as mean squares."""
     return np.asarray(square > 5.0**2 * usual)
 
 

@@ -230,9 +230,7 @@ class Equations(Series):
         return result
 
     def misfit(self, state: State, base: Base) -> Floats:
-        """
-        Measured minus predicted readings as combinations of the base, (n_positions, 3, n_base).
-        """
+        """Return the residual as combinations of the base series, (n_positions, 3, n_base)."""
         force, across, read, (_, bend_by_t), _ = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size))

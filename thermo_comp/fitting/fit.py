@@ -83,9 +83,7 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """
-    Reduce a source to its sufficient statistics; FitError if the source has no still interval.
-    """
+    """Reduce a source to its sufficient statistics; FitError if it has no still interval."""
     bag = reduce_source(
         source,
         min_rest_s=options.min_rest_s,
@@ -161,9 +159,7 @@ def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def about(calibration: Calibration, offset: Floats) -> Calibration:
-    """
-    Convert a calibration for codes less their offset into a calibration for the codes themselves.
-    """
+    """Convert a calibration of codes less their offset into a calibration of the codes."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
@@ -286,9 +282,7 @@ def _offset_sd(known: Calibration | None) -> float:
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """
-    Return the bags without thermometers that copy the board's, and findings about the raw data.
-    """
+    """Return the bags without copies of the board's thermometer, and findings about raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name

@@ -81,9 +81,7 @@ class KnownForce:
         return size.spin**2 / size.norm(gravity) * self.radius_sd / self.radius
 
     def of(self, start_ns: int, end_ns: int, first_ns: int) -> Magnitude:
-        """
-        Return |f| of a rest, given the rest's stamps and the stamp of the bag's first sample.
-        """
+        """Return |f| of a rest, given its stamps and the stamp of the bag's first sample."""
         if self.stamp_ns is None or self.rate is None:
             middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
             for section in self.sections:
@@ -196,9 +194,7 @@ def _numbers(words: list[str]) -> list[float]:
 
 
 def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
-    """
-    Read |f| as a value with unit, or as a table from a file; a line may begin with a bag's name.
-    """
+    """Read |f| as a value with unit, or from a table whose lines may begin with a bag's name."""
     table = Path(text)
     if not table.is_file():
         return (_section(0.0, math.inf, parse_acceleration(text)),)

@@ -140,9 +140,7 @@ class Score:
 
     @property
     def rms(self) -> float:
-        """
-        RMS of the left-out drift: the larger of the RMS of positions and the RMS of sections.
-        """
+        """RMS of the left-out drift: the larger of those of positions and of sections."""
         known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
         return max(known, default=float('nan'))
 
@@ -267,12 +265,9 @@ def _is_determined(by_others: float, by_all: float) -> bool:
 
 
 def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
-    """
-    Whether a fit without a position determines the position's drift; `root` as in `Posterior`.
-    """
-    regression, layout, sigma = point.regression, point.layout, point.prior.sigma
-    in_bias, in_scale = layout.used
-    if not in_bias.any():
+    """Whether a fit without a position determines its drift; `root` as in `Posterior`."""
+    regression, sigma = point.regression, point.prior.sigma
+    if not point.layout.used[0].any():
         return True
     # Every n-th window of the position is used: 50 windows are sufficient for the variance.
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
@@ -280,9 +275,7 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
     p = regression.windows.position[rows.start]
     force = regression.along_axes(point.state)[p]
     by_others = by_all = 0.0
-    for axis in range(3):
-        along = np.hstack((some[:, in_bias], force[axis] * some[:, in_scale]))
-        at = layout.axis[axis, 2 : 2 + along.shape[1]]
+    for along, at in point.layout.by_weights(some, force):
         by_others += float(np.sum((along @ root[at]) ** 2))
         by_all += float(np.sum((along @ posterior.root[at]) ** 2))
     noise = float(np.sum(sigma**2)) * len(some)
@@ -290,9 +283,7 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
 
 
 def _is_norm_determined(point: Point, posterior: Posterior, root: Floats, p: int) -> bool:
-    """
-    Whether a fit without a position determines the position's norm; `root` as in `Posterior`.
-    """
+    """Whether a fit without a position determines its norm; `root` as in `Posterior`."""
     if not point.regression.gravity:
         return False
     along = point.norms_by_unit[p]

@@ -60,9 +60,7 @@ class Forces:
     radius_sd: float = 0.0
 
     def norms(self, radius: Floats, stretch: Floats) -> Floats:
-        """
-        Return |f| of each position, given the relative errors of the radius and of the stated |f|.
-        """
+        """Return |f| of each position, given relative errors of the radius and of |f|."""
         turned = self.spin * (1.0 + radius.sum())
         return np.asarray(np.hypot(self.still, turned) * (1.0 + stretch.sum(axis=1)))
 
@@ -114,8 +112,7 @@ def with_forces(
     The windows stay unchanged if |f| is within 1e-3 of gravity in all positions, and neither the
     options nor the prior have nonlinear terms.
     """
-    still, spin, sd = np.full((3, windows.data.n_positions), 0.0)
-    still[:] = options.gravity
+    still, spin, sd = np.outer((options.gravity, 0.0, 0.0), np.ones(windows.data.n_positions))
     for p, (bag, rest) in enumerate(windows.rests):
         if (known := bag.source.force) is not None:
             first_ns = bag.start_ns - round(bag.since_s * 1e9)
@@ -154,9 +151,7 @@ def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
 
 
 def starting_sd(forces: Forces, options: FitOptions) -> Floats:
-    """
-    Return the prior sd of the initial nonlinear terms: square and cube; 0 for the odd square.
-    """
+    """Return the initial prior sd of the nonlinear terms: 0 for the odd square, (2 k,)."""
     is_initial = np.array([kind != 'odd_square' for kind in forces.kinds])
     return np.asarray(prior_sd(forces.kinds, options) * np.tile(is_initial, 2))
 
@@ -179,9 +174,7 @@ class _TermFits:
         return score_of(self._regression, self.posterior(used))
 
     def term(self, kind: int) -> _Active:
-        """
-        Return the indices of a term's coefficients: at the reference temperature, and per kelvin.
-        """
+        """Return the indices of a term's coefficients: at the reference, and per kelvin."""
         return frozenset((kind, self._n_kinds + kind))
 
     def loss(self, used: _Active, gone: _Active) -> float:

@@ -251,9 +251,7 @@ class _PartCurves:
         return Part(tau, 0.0, sensor_share) if square(tau) < square(0.0) else Part(0.0)
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
-        """
-        Whether time constants larger or smaller by the ratio `_STEP` add 5 % to the RMS residual.
-        """
+        """Whether time constants longer or shorter by `_STEP` add 5 % to the RMS residual."""
         tau, second, share = lag
         others = [Part(ratio * tau, ratio * second, share) for ratio in (1.0 / _STEP, _STEP)]
         if not tau:
@@ -304,9 +302,7 @@ class _PartCurves:
         return self._centred(np.hstack((bias, stress, scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """
-        Subtract the weighted mean over each position from values; multiply by the weights' roots.
-        """
+        """Subtract the weighted mean over each position; multiply by the weights' roots."""
         weighted = np.hstack((values, np.ones_like(self._weight))) * self._weight
         sums = np.add.reduceat(weighted, self._first, axis=0)
         level = sums[:, :-1] / sums[:, -1:]

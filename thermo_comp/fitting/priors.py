@@ -279,9 +279,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 def _relative_to(
     calibration: Calibration, like: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
-    """
-    Return a unit's parameters and covariance in the layout of `like`, for the mean scale factor.
-    """
+    """Return a unit's parameters and covariance in the layout of `like`, relative to `mean_K`."""
     if calibration.posterior is None:
         raise FitError(
             f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '

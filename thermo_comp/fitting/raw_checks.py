@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the checks of the raw data of a fit: serial numbers, samples and readings.
-"""
+"""Owns the checks of the raw data of a fit: serial numbers, samples and readings."""
 
 from __future__ import annotations
 
@@ -23,9 +21,7 @@ from .reduction import ReducedBag
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """
-    Refuse a prior of another unit: the small uncertainties of a unit do not apply to another.
-    """
+    """Refuse a prior of another unit: a unit's small uncertainties do not apply to another."""
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:

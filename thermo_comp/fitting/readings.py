@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the readings of one thermometer over a bag, without implausible readings.
-"""
+"""Owns the readings of one thermometer over a bag, without implausible readings."""
 
 from __future__ import annotations
 

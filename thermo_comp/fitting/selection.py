@@ -55,6 +55,11 @@ class Trial:
     is_chosen: bool = False
     is_near: bool = False
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether noise explains the left-out drift."""
+        return self.score.rms <= 2.0 * float(self.posterior.prior.sigma.mean())
+
 
 @dataclass(frozen=True)
 class Selected:
@@ -82,11 +87,6 @@ class Fit(NamedTuple):
     def posterior(self) -> Posterior:
         """The fit of the chosen model."""
         return self.selected.posterior
-
-
-def _is_complete(trial: Trial) -> bool:
-    """Whether noise explains the left-out drift of a model."""
-    return trial.score.rms <= 2.0 * float(trial.posterior.prior.sigma.mean())
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
@@ -133,9 +133,7 @@ class Growth:
         trials: list[Trial] = []
         part = 1.0
         while True:
-            larger = self.trials(
-                chosen, [group for group in self.free if group not in chosen.groups]
-            )
+            larger = self.trials(chosen, self.free)
             trials += larger
             better = [trial for trial in larger if is_better(chosen.score, trial.score)]
             part *= 0.6
@@ -149,7 +147,7 @@ class Growth:
         added = tuple(group for group in groups if group in self.free)
         typical = self._typical(before, added, self._candidates.typical)
         smooth = self.extended(before, added, typical)
-        return [smooth, *(self.trials(smooth, [BEND]) if BEND in self.free else [])]
+        return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
         """
@@ -160,20 +158,19 @@ class Growth:
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
         typical, state = self._candidates.typical, constants.posterior.state
         number = np.cumsum(self._names == CURVE)
-        curves = [
-            self.fit(
-                (*constants.groups, CURVE), state, prior, np.where(number <= degree, typical, 0.0)
-            )
+        groups = *constants.groups, CURVE
+        chosen, *larger = (
+            self.fit(groups, state, prior, np.where(number <= degree, typical, 0.0))
             for degree in range(1, int(number[-1]) + 1)
-        ]
-        chosen = curves[0]
-        for curve in curves[1:]:
+        )
+        for curve in larger:
             if log_density(curve.posterior) - log_density(chosen.posterior) > TRIAL_GAIN:
                 chosen = curve
         return chosen
 
-    def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
-        """Fit the chosen model plus each group with a large possible gain in log evidence."""
+    def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
+        """Fit the chosen model plus each free group of a large possible gain in log evidence."""
+        absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
         typical = self._candidates.typical
@@ -286,22 +283,19 @@ def select(
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
 ) -> tuple[Trial, list[Trial]]:
-    """
-    Add groups to the curve, or to the curves of parts; return the best model and all that were
-    tried.
-    """
+    """Add groups to the curve, or to the curves of parts; return the best model and all tried."""
     chosen, trials = first, []
     if parts is not None:
-        trials = [parts, *growth.trials(parts, [BEND] if BEND in growth.free else [])]
+        trials = [parts, *growth.trials(parts, [BEND])]
         chosen = _best(chosen, trials)
-    if growth.regression.windows.acts_on is not None and not _is_complete(chosen):
+    if growth.regression.windows.acts_on is not None and not chosen.is_complete:
         tried = growth.with_bends(first, PART_SUMS)
         trials += tried
         chosen = _best(chosen, tried)
     chosen, tried = growth.added(chosen, progress)
     trials += tried
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
-    if is_without_bends and not _is_complete(chosen):
+    if is_without_bends and not chosen.is_complete:
         # A change of slope of a part is visible only in a model with the lag of this part, not in
         # a model whose products and squares approximate the lag. A model of bends is continued if
         # its drift is less than three times that of the chosen model.

@@ -42,9 +42,7 @@ class Course:
 
     @property
     def least_ramp(self) -> float:
-        """
-        Smallest rate that counts as a ramp [K/s]: 5 standard deviations of the noise of the rate.
-        """
+        """Smallest rate that counts as a ramp [K/s]: 5 sd of the noise of the rate."""
         return 5.0 * self.rate_sd
 
     @property
@@ -105,9 +103,7 @@ def learn_thermometer(
 
 
 def quantum_of(values: Floats) -> float:
-    """
-    Find the quantum of a sensor's readings, shape (n,) [K]; 0 if the readings are not rounded.
-    """
+    """Find the quantum of a sensor's readings, shape (n,) [K]; 0 if they are not rounded."""
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -132,9 +128,7 @@ def _noise_of(values: Sequence[Floats], quantum: float) -> float:
 
 
 def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
-    """
-    Return the temperature rates of the bags with at least 30 readings and 6 intervals of the rate.
-    """
+    """Return the rates in bags with at least 30 readings and 6 intervals of the rate."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -26,11 +27,9 @@ MISALIGNMENT_SD = 1e-3
 
 def misalignment_scale(noise: float) -> float:
     """
-    Return the built-in prior sd of an element of the misalignment [rad], for a sensor with this
-    noise in 1 Hz [m/s^2].
-
-    The sd is 1 mrad up to 10 ug, as of single sensors of navigation grade on machined faces, and
-    proportional to the noise above, up to 1 %, the cross-axis sensitivity of consumer MEMS.
+    Return the built-in prior sd of an element of the misalignment [rad], by the noise in 1 Hz
+    [m/s^2]: 1 mrad up to 10 ug, as of single sensors of navigation grade on machined faces, above
+    proportional to the noise, up to 1 %, the cross-axis sensitivity of consumer MEMS.
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
 
@@ -86,10 +85,7 @@ class Windows:
 
     @cached_property
     def share(self) -> Floats:
-        """
-        Prior sd of the weights of each axis over that of their column, shape (3, m); 1e-6 for a
-        weight that the column does not have.
-        """
+        """Prior sd of each axis's weights over that of the column, 1e-6 if it has none, (3, m)."""
         acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(acts.T, 1.0, 1e-6)
 
@@ -326,6 +322,16 @@ class Layout:
     def used(self) -> Bools:
         """Active columns of bias and scale, shape (2, m)."""
         return np.asarray(self.weights[:, 0] >= 0)
+
+    def by_weights(self, columns: Floats, force: Floats) -> Iterator[tuple[Floats, Ints]]:
+        """
+        Yield the derivatives of readings by the weights of each axis, and the weights' places,
+        given columns, shape (n, m), and the force along the axes, shape (n, 3) or (3,).
+        """
+        in_bias, in_scale = self.used
+        for axis in range(3):
+            along = np.hstack((columns[:, in_bias], force[..., [axis]] * columns[:, in_scale]))
+            yield along, self.axis[axis, 2 : 2 + along.shape[1]]
 
 
 def lay_out(
