@@ -19,8 +19,7 @@ import numpy as np
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats
-from .readings import Readings
-from .reduction import ReducedBag
+from .reduction import Readings, ReducedBag
 
 # Interval of the grid of rates [s], and number of intervals on each side in a central difference.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6
