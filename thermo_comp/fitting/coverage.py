@@ -153,14 +153,11 @@ def best_rests(candidates: list[Floats]) -> int:
     thresholds; if no set has six attitudes, the first set of all is taken.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
-    enough = [len(distinct_directions(up)) for up in ups]
-    n_most = max(enough, default=0)
-    costs = np.full(len(candidates), np.inf)
-    for number, means in enumerate(candidates):
-        if enough[number] >= 6:
-            costs[number] = _cost(means, n_most >= 12)
-    if not np.isfinite(costs).any():
-        return 0
+    counts = [len(distinct_directions(up)) for up in ups]
+    costs = np.array([
+        _cost(means, max(counts) >= 12) if n >= 6 else np.inf
+        for means, n in zip(candidates, counts, strict=True)
+    ])  # fmt: skip
     return int(np.argmax(costs <= 1.02 * np.min(costs)))
 
 

@@ -82,11 +82,9 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
         what = 'no change of temperature was read'
         if not any(len(bag.board.value) for bag in used_bags):
             is_read = any(len(of.value) for bag in used_bags for of in bag.temperatures.values())
-            what = 'the bags have no thermometer'
-            what = 'the bags have no thermometer of the board' if is_read else what
-        yield advice(
-            'temperature', f'{what}: the calibration holds at the temperature of the test'
-        )
+            what = 'the bags have no thermometer' + ' of the board' * is_read
+        text = f'{what}: the calibration holds at the temperature of the test'
+        yield advice('temperature', text)
         return
     yield from _judge_unmeasured(windows, used_bags)
     span = float(np.ptp(windows.temperature))
@@ -327,10 +325,10 @@ def judge_result(
     noise: white noise of a window [m/s^2]
     """
     overall = rows[-1]
-    raw, fitted = overall.raw.rms / MICRO_G, overall.fitted.rms / MICRO_G
-    others = ''
-    if overall.left_out.n:
-        others = f'{overall.left_out.rms / MICRO_G:.1f} ug on data left out, '
+    raw, fitted, left_out = (
+        row.rms / MICRO_G for row in (overall.raw, overall.fitted, overall.left_out)
+    )
+    others = f'{left_out:.1f} ug on data left out, ' if overall.left_out.n else ''
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
     if span > 0.0 and is_slow and overall.fitted.rms > _NOISE * noise:

@@ -36,7 +36,7 @@ from .environments import (
     is_better_without,
     with_excluded_error,
 )
-from .evidence import PositionReport, ResidualRow, drift_of, position_reports, residual_rows
+from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
@@ -45,6 +45,7 @@ from .reduction import ReducedBag, reduce_source
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
+from .start import within_positions
 from .windows import FEWEST_WINDOWS
 
 Progress = Callable[[float], None]
@@ -236,13 +237,14 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     claim = claim_of(
         *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known))
     )
-    residuals, left_out = residual_rows(fit)
+    residuals, in_sample, left_out = residual_rows(fit)
+    drift = within_positions(in_sample[:, None], fit.windows.data.position)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
     K = fit.posterior.state.kappa * start.scale
     findings += data_checks.judge_result(
         *(K, residuals, claim.offset_sd, options),
         span=float(np.ptp(fit.windows.temperature)),
-        drift=drift_of(fit),
+        drift=float(np.sqrt(np.mean(drift**2))),
         noise=fit.selected.score.noise,
     )
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
@@ -265,7 +267,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         calibration=with_notes(calibration, unseen),
         fit=fit,
         residuals=residuals,
-        positions=position_reports(fit, left_out),
+        positions=position_reports(fit, in_sample, left_out),
         findings=(*findings, *unseen),
         least_known=least,
         bags=tuple(bags),

@@ -24,7 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..typing import Floats, Ints
+from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
@@ -96,7 +96,7 @@ def _near(
     """Collect the samples beside each gap: time, reading, angular rate or NaN, shape (n, 7)."""
     parts = [[np.zeros((0, 7))] for _ in gaps]
     for block in bag.source.blocks() if gaps else ():
-        time, rate = _seconds(block.accel_stamp_ns, bag.start_ns), angular_velocity(block)
+        time, rate = (block.accel_stamp_ns - bag.start_ns) * 1e-9, angular_velocity(block)
         rate = np.full(block.accel.shape, np.nan) if rate is None else rate
         for part, (begin, end), margin in zip(parts, gaps, margins, strict=True):
             use = (time >= begin - margin) & (time <= end + margin)
@@ -113,11 +113,6 @@ def _margin(near: Floats, quiet_sd: Floats) -> float:
     _, r = _place_and_colour(time, accel, quiet_sd)
     tau = -float(np.median(np.diff(time))) / np.log(r) if r else 0.0
     return float(np.clip(60.0 * tau, _MARGIN_S, 100.0))
-
-
-def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
-    since: Floats = (stamp_ns - start_ns).astype(np.float64) * 1e-9
-    return since
 
 
 def _examine(
@@ -194,7 +189,7 @@ def _correlation(residual: Floats, sd: Floats) -> Floats:
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
     """Estimate the step of the board's readings at the time of a jump, and its sd [K]."""
-    time = _seconds(bag.board.stamp_ns, bag.start_ns)
+    time = np.asarray(bag.board.stamp_ns - bag.start_ns, dtype=np.float64) * 1e-9
     use = (time >= begin) & (time <= end)
     time, value = time[use], bag.board.value[use]
     if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
@@ -271,9 +266,6 @@ def _trend(time: Floats, r: float = 0.0) -> Floats:
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
     """Return the angle of rotation within 1 s of the step, about the level on each side [rad]."""
-    levels = (np.median(gyro[:at], axis=0), np.median(gyro[at:], axis=0))
-    dt = np.diff(time)
-    angle = np.zeros(3)
-    for i in np.flatnonzero(np.abs(time[1:] - time[at]) <= 1.0):
-        angle += (gyro[i + 1] - levels[int(i + 1 >= at)]) * dt[i]
-    return float(np.linalg.norm(angle))
+    about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
+    turned = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
+    return float(np.linalg.norm(turned[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))
