@@ -33,9 +33,6 @@ from .windows import CURVE, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-#: Prior sd of an element of the misalignment [rad] for the estimate from faces: the cross-axis
-#: sensitivity of good consumer MEMS.
-FACES_MISALIGNMENT_SD = 2.5e-3
 
 
 @dataclass(frozen=True)
@@ -160,12 +157,12 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     second order. The sd for the estimate is therefore smaller than that in the covariance.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    sd = prior.misalignment_scale
+    # Sd for the estimate [rad]: the cross-axis sensitivity of good consumer MEMS.
+    of_faces, sd = 2.5e-3, prior.misalignment_scale
     # Faces that are set by hand, a few degrees off, are below 0.1; the edges of a cube have 0.3.
-    is_near = float(np.sqrt(np.mean(by_element**2))) < 0.1
-    if not is_near or sd <= FACES_MISALIGNMENT_SD:
+    if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= of_faces:
         return prior
-    return replace(prior, misalignment_sd=FACES_MISALIGNMENT_SD, unseen_misalignment_sd=sd)
+    return replace(prior, misalignment_sd=of_faces, unseen_misalignment_sd=sd)
 
 
 def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:
@@ -211,10 +208,7 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 
 def _mounting_scale(noise: float) -> float:
-    """
-    Return the scale of the prior of mounting offsets [m/s^2]: three times the noise in 1 Hz,
-    within bounds.
-    """
+    """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
     # Bounds: 30 ug, as of sensors of navigation grade, and 0.5 mg, as of consumer MEMS; the tail
     # of the Student prior allows for more.
     least, most = 3e-4, 5e-3

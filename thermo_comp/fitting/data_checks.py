@@ -34,14 +34,8 @@ if TYPE_CHECKING:
 #: Smallest numbers of positions that determine bias and scale factor (six constants), the
 #: misalignment (three more constants), and by their norms the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
-#: Number of recordings whose turn-ons show how well turn-ons repeat, if they hold all positions:
-#: the bias of the first recording is that of the unit, the others differ from it.
-RECORDINGS_FOR_TURN_ONS = 4
 #: Smallest span of the board temperature that shows whether the bias depends on temperature [K].
 LEAST_SPAN_K = 3.0
-#: Ratio of an RMS residual to white noise up to which noise explains the residual, and from which
-#: it is far above the noise.
-_NOISE, _FAR_ABOVE_NOISE = 2.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -153,7 +147,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
     norm = np.linalg.norm(data.mean, axis=1, keepdims=True)
     drift = float(np.sqrt(np.mean(within_positions(norm, data.position) ** 2)))
     noise = float(np.sqrt(np.mean(white_noise_of(data, np.ones(3)) ** 2)))
-    return drift > _FAR_ABOVE_NOISE * noise > 0.0
+    return drift > 10.0 * noise > 0.0
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
@@ -254,12 +248,15 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
     assumed = f'the uncertainty assumes {spoken(offset_sd)}: state --mounting-sd'
-    if n_bags < min(n, RECORDINGS_FOR_TURN_ONS):
+    # The bias of the first recording is that of the unit; those of three others show how well
+    # turn-ons repeat.
+    needed = 4
+    if n_bags < min(n, needed):
         yield advice(
             'mountings',
             f'{n} rests in {counted(n_bags, "recording")} have {counted(n_bags, "turn-on")}, too '
             f'few to show how well the bias repeats after the unit is switched on again; {assumed}'
-            f', or switch the unit off between {RECORDINGS_FOR_TURN_ONS} recordings or more',
+            f', or switch the unit off between {needed} recordings or more',
         )
     elif n < POSITIONS_FOR_MOUNTINGS:
         yield advice(
@@ -331,9 +328,10 @@ def judge_result(
     others = f'{left_out:.1f} ug on data left out, ' if overall.left_out.n else ''
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
-    if span > 0.0 and is_slow and overall.fitted.rms > _NOISE * noise:
+    # Up to twice the white noise, noise explains a residual.
+    if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:
         why = 'temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
-        if drift <= max(_NOISE * noise, 0.3 * overall.fitted.rms):
+        if drift <= max(2.0 * noise, 0.3 * overall.fitted.rms):
             why = (
                 'the positions differ, while temperature explains the drift within them: the bias '
                 'does not repeat after the unit is mounted or switched on again'

@@ -41,9 +41,6 @@ from .unknowns import State
 _FEWEST_WINDOWS = 8
 # Logarithms of mean square errors that differ by less than this count as equal: 5 % of an RMS.
 _EQUAL = 0.1
-# Ratio of an RMS drift to white noise up to which noise explains the drift. In a soak, changes of
-# the temperature by hundredths of a kelvin, whose lag is not known, add to the white noise.
-_NOISE = 1.7
 
 
 @dataclass(frozen=True)
@@ -107,7 +104,9 @@ class Folds:
         """Whether white noise explains the errors in the folds that another model has as well."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
-        return bool(square <= (_NOISE * noise) ** 2)
+        # Up to 1.7 times the noise: in a soak, changes of the temperature by hundredths of a
+        # kelvin, whose lag is not known, add to the white noise.
+        return bool(square <= (1.7 * noise) ** 2)
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,12 @@ COUNTS_FULL_SCALE = 32767.0
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
 #: Groups of columns that the fit selects: the curve, the difference of the two sets, the curves
 #: over the temperatures of parts, the groups of the thermal response.
-_BANK = bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))
-GROUPS = tuple(dict.fromkeys(('curve', 'set', 'part', *(column.group for column in _BANK))))
+GROUPS = (
+    'curve',
+    'set',
+    'part',
+    *dict.fromkeys(column.group for column in bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))),
+)
 #: Names of the refusals of data that a user can allow.
 REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
 

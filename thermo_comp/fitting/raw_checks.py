@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -35,7 +34,12 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
     """Check the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
-    part = sum(bag.n_saturated for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
+
+    def total(name: str) -> int:
+        return sum(getattr(bag, name) for bag in bags)
+
+    n_samples = max(total('n_samples'), 1)
+    part = total('n_saturated') / n_samples
     if part > 0.001:
         yield Finding(
             'saturation',
@@ -43,24 +47,20 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
             'it can measure, or --full-scale is wrong',
         )
-    n_samples = max(sum(bag.n_samples for bag in bags), 1)
-    n_dropped, n_repeated = (
-        sum(getattr(bag, name) for bag in bags) for name in ('n_dropped', 'n_repeated')
-    )
+    n_dropped = total('n_dropped')
     if n_dropped > 0.01 * n_samples:
+        why = 'was a clock set back?'
+        if 2 * total('n_repeated') > n_dropped:
+            why = 'does the driver send several samples with one stamp?'
         share = f'{100.0 * n_dropped / n_samples:.0f} % of the samples'
-        text = f'{share} are not finite, or have a stamp that does not rise, and are left out: '
-        if 2 * n_repeated > n_dropped:
-            text += 'does the driver send several samples with one stamp?'
-        else:
-            text += 'was a clock set back?'
-        yield advice('dropped', text)
-    if n := sum(bag.n_glitches for bag in bags):
+        text = f'{share} are not finite, or have a stamp that does not rise, and are left out'
+        yield advice('dropped', f'{text}: {why}')
+    if n := total('n_glitches'):
         yield advice(
             'glitches',
             f'{counted(n, "sample")} far from both neighbours, left out: does the bus lose bits?',
         )
-    still = sum(bag.n_still_cells for bag in bags) / max(sum(bag.n_cells for bag in bags), 1)
+    still = total('n_still_cells') / max(total('n_cells'), 1)
     if still < 0.5:
         yield advice(
             'motion',
@@ -81,7 +81,8 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             )
         text = '; '.join(axis.text for axis in dead)
         yield Finding('stuck', 'refusal', f'{text}: {why}')
-    size = _typical_size(bags)
+    means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
+    size = float(np.median(np.linalg.norm(means, axis=1)))
     yield from _judge_thermometers(bags)
     yield from _judge_units(bags, size, options)
     jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
@@ -98,25 +99,17 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         yield advice('rate', text)
 
 
-def _typical_size(bags: Sequence[ReducedBag]) -> float:
-    """Return the median norm of the mean readings at rest [input units]."""
-    means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
-    return float(np.median(np.linalg.norm(means, axis=1)))
-
-
 def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
     """Check the readings of the thermometers."""
-    n_spikes: Counter[str] = Counter()
-    for bag in bags:
-        n_spikes.update(bag.n_spikes)
-    for name, n in sorted(n_spikes.items()):
-        if n:
+    names = sorted({name for bag in bags for name in bag.temperatures})
+    for name in names:
+        if n := sum(bag.n_spikes.get(name, 0) for bag in bags):
             yield advice(
                 'spikes',
                 f'temperature/{name}: {counted(n, "reading")} more than 10 K from the readings '
                 'before and after, left out: does the thermometer lose contact?',
             )
-    for name in sorted({name for bag in bags for name in bag.temperatures}):
+    for name in names:
         read = [b.temperatures[name].value for b in bags if name in b.temperatures]
         celsius = np.concatenate(read)
         if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
@@ -128,22 +121,22 @@ def _judge_units(
     bags: Sequence[ReducedBag], size: float, options: FitOptions
 ) -> Iterator[Finding]:
     """Check whether samples with this norm at rest are counts; `size`: [input units]."""
-    if options.input == 'counts' and not all(bag.is_integer for bag in bags):
-        for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
-            if abs(size / one_g - 1.0) < 0.1:
-                yield Finding(
-                    'units',
-                    'refusal',
-                    f'the samples have norm {size:.3g} and are no whole numbers: they look like '
-                    f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2',
-                )
-                break
-        else:
-            yield advice(
-                'compensated',
-                'the samples are no whole numbers: scaled or compensated before they were '
-                'recorded? A calibration made from scaled samples is valid for that scaling only',
+    if options.input != 'counts' or all(bag.is_integer for bag in bags):
+        return
+    for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
+        if abs(size / one_g - 1.0) < 0.1:
+            yield Finding(
+                'units',
+                'refusal',
+                f'the samples have norm {size:.3g} and are no whole numbers: they look like '
+                f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2',
             )
+            return
+    yield advice(
+        'compensated',
+        'the samples are no whole numbers: scaled or compensated before they were recorded? A '
+        'calibration made from scaled samples is valid for that scaling only',
+    )
 
 
 class _DeadAxis(NamedTuple):
