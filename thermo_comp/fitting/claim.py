@@ -310,7 +310,7 @@ def drift_variance(
     """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
     position = regression.windows.position
     columns = within_positions(regression.columns, position)
-    by_weights = layout.by_weights(columns, regression.along_axes(state)[position])
+    by_weights = layout.by_weights(columns, regression.effects(state).force[position])
     variances = [
         np.sum((along @ covariance[np.ix_(at, at)]) * along, axis=1) for along, at in by_weights
     ]

@@ -272,7 +272,7 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
-    force = regression.along_axes(point.state)[p]
+    force = regression.effects(point.state).force[p]
     by_others = by_all = 0.0
     for along, at in point.layout.by_weights(some, force):
         by_others += float(np.sum((along @ root[at]) ** 2))

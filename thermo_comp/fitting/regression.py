@@ -316,7 +316,7 @@ class Regression(Equations):
         columns, at = np.unique(column, return_inverse=True)
         among, beside = self.products_of(columns, base)
         # Derivative of the reading by a unit of a column's effect on the bias and on the scale.
-        acts = np.stack((np.ones_like(state.up), state.kappa * self.along_axes(state)))
+        acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
         acts /= sigma
         rows = point.tangent.of(self.at_starts(beside, state, base))[:, :, at]
         rows *= (acts[part] / sigma).transpose(1, 2, 0)[..., None]
