@@ -80,12 +80,11 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     narrow = prior
     if n_directions < POSITIONS_NEEDED:
         narrow = _narrowed(prior, regression, state, options)
-
-    def report(part: float) -> None:
-        problem.progress(0.7 + 0.25 * part)
-
     without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
-    selected = select(regression, state, narrow, without_slow, report)
+    selected = select(
+        *(regression, state, narrow, without_slow),
+        progress=lambda part: problem.progress(0.7 + 0.25 * part),
+    )
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
@@ -101,12 +100,9 @@ def _has_soaks_only(windows: ThermalWindows) -> bool:
 
 
 def _at_rest(data: Windows) -> Windows:
-    """
-    Return the windows with columns that are constant in each position.
-
-    A lag of unknown size changes the readings of a soak by as much as the remaining drift of the
-    temperature does: the norms of the positions determine the curve, drifts within soaks do not.
-    """
+    """Return the windows with columns that are constant in each position."""
+    # A lag of unknown size changes the readings of a soak by as much as the remaining drift of the
+    # temperature does: norms of positions determine the curve, drifts within soaks do not.
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
     return replace(data, columns=means[data.position], start=np.zeros_like(data.start))
 
@@ -151,10 +147,9 @@ def _initial_prior(
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior for a noisy sensor near the six faces, which hardly show the misalignment.
-
-    The other errors of such a sensor would be explained by misalignments of some degrees, to
-    second order. The sd for the estimate is therefore smaller than that in the covariance.
+    Return the prior for a noisy sensor near the six faces, which hardly show the misalignment:
+    misalignments of some degrees would explain its other errors, to second order, so the sd for
+    the estimate is smaller than that in the covariance.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Sd for the estimate [rad]: the cross-axis sensitivity of good consumer MEMS.
@@ -167,11 +162,9 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 
 def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:
     """
-    Return the prior of the constants during the selection of the columns.
-
-    Few attitudes do not determine all constants, and an incomplete model would change the
-    undetermined constants by large amounts. The sd of the constants is therefore five times the
-    largest error of a norm, at least 5 % and at most 100 % of the prior's sd.
+    Return the prior of the constants during the selection of the columns: five times the largest
+    error of a norm, at least 5 % and at most 100 % of the prior's sd. In an incomplete model,
+    constants that few attitudes do not determine would change by large amounts.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())
@@ -186,13 +179,10 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
-    The effect of a slow lag is nearly collinear with the curve, and its final value would be
-    extrapolated. No model uses slow columns; those linear in temperature enter the covariance, see
-    `claim`.
+    Their effect is nearly collinear with the curve, and its final value would be extrapolated. No
+    model uses slow columns; those linear in temperature enter the covariance, see `claim`.
     """
-    data = windows.data
-    longest_s = float(data.age.max())
-    model = windows.model
+    model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])
     of_part = ((model.part_curves.sums != 0.0) * taus).max(axis=1, initial=0.0)
     return np.asarray(np.append(taus, of_part) > longest_s / np.log(10.0))
@@ -200,22 +190,19 @@ def _is_slow(windows: ThermalWindows) -> Bools:
 
 def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
     """Return the noise of the samples in 1 Hz [m/s^2], the median of the axes; 0 if unknown."""
-    data = windows.data
-    if not len(data.inner):
+    data, inner = windows.data, windows.data.inner
+    if not len(inner):
         return 0.0
-    sigma = float(np.median(white_noise_of(data, scale)))
-    return float(sigma * np.sqrt(np.median(np.diff(data.time)[data.inner])))
+    step_s = np.median(np.diff(data.time)[inner])
+    return float(np.median(white_noise_of(data, scale)) * np.sqrt(step_s))
 
 
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
     # Bounds: 30 ug, as of sensors of navigation grade, and 0.5 mg, as of consumer MEMS; the tail
-    # of the Student prior allows for more.
-    least, most = 3e-4, 5e-3
-    # Readings with almost no noise have a smaller lower bound: an offset 1e6 times as large as the
-    # noise cannot be estimated in double precision. 1e-6 m/s^2: 0.1 ug, better than navigation
-    # grade.
-    least = max(min(least, 100.0 * noise), 1e-6)
+    # of the Student prior allows for more. The lower bound is smaller for almost no noise, because
+    # an offset 1e6 times as large as the noise cannot be estimated in double precision.
+    least, most = max(min(3e-4, 100.0 * noise), 1e-6), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 
 
@@ -286,10 +273,8 @@ def _steepness(windows: ThermalWindows, start: ConstantCalibration, options: Fit
 
 def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
     """Return the known |f| of each position, shape (n_positions,) [m/s^2]."""
-    forces = windows.data.forces
-    if forces is None:
-        return np.full(windows.data.n_positions, options.gravity)
-    return forces.sizes
+    data = windows.data
+    return data.forces.sizes if data.forces else np.full(data.n_positions, options.gravity)
 
 
 def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:

@@ -39,9 +39,9 @@ def _is_far_above(square: Floats | float, usual: float) -> Bools:
     return np.asarray(square > 5.0**2 * usual)
 
 
-def contradicting_bag(fit: Fit) -> int | None:
+def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Find the bag that may be of another environment; None if no bag is suspect.
+    Find the bag that may be of another environment: a list of one bag, or of none.
 
     A bag is suspect if its left-out drift is far above the median of all bags, and above the white
     noise of a window. A bag is also suspect if its drift is the only one that the other bags do
@@ -51,12 +51,12 @@ def contradicting_bag(fit: Fit) -> int | None:
     known = np.isfinite(square)
     if known.sum() < 4:
         # At least four bags are needed to decide that one bag contradicts the majority.
-        return None
+        return []
     usual, noise = float(np.median(square[known])), float(np.mean(fit.posterior.prior.sigma**2))
     if (~known).sum() == 1 and _is_far_above(usual, noise):
-        return int(np.argmin(known))
+        return [int(np.argmin(known))]
     worst = int(np.nanargmax(square))
-    return worst if _is_far_above(square[worst], max(usual, noise)) else None
+    return [worst] if _is_far_above(square[worst], max(usual, noise)) else []
 
 
 def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:

@@ -149,10 +149,9 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
 
 def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
     """Subtract the codes at zero force from a bag and from the blocks of its source."""
-    blocks = bag.source.blocks
 
     def moved() -> Iterator[Any]:
-        for block in blocks():
+        for block in bag.source.blocks():
             yield replace(cast(Any, block), accel=block.accel - offset)
 
     intervals = tuple(replace(interval, mean=interval.mean - offset) for interval in bag.intervals)
@@ -188,8 +187,7 @@ def _fit_one_environment(
     known = options.prior
     excluded: list[int] = []
     if known is None:
-        bag = contradicting_bag(first.fit)
-        excluded = [] if bag is None else [bag]
+        excluded = contradicting_bag(first.fit)
     elif known.unit.serial == first.calibration.unit.serial and not first.fit.windows.data.forces:
         excluded = bags_contradicting_prior(first.fit.windows, known, options)
     if not excluded:
@@ -204,10 +202,8 @@ def _fit_one_environment(
         # If all bags contradict the prior, no bag can update the prior.
         provenance = first.calibration.provenance
         refit = replace(first, calibration=replace(known, provenance=provenance))
-    others = 'the other bags' if known is None else 'the prior'
-    calibration, finding = with_excluded_error(
-        refit.calibration, [bags[k] for k in excluded], others
-    )
+    others, gone = 'the other bags' if known is None else 'the prior', [bags[k] for k in excluded]
+    calibration, finding = with_excluded_error(refit.calibration, gone, others)
     return replace(
         refit,
         calibration=with_notes(calibration, [finding]),
@@ -326,8 +322,7 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
         full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
     if full_scale is None:
-        # The full scale is the smallest usual full scale of sensors in m/s^2 that contains the
-        # data.
+        # The smallest usual full scale of sensors in m/s^2 that contains the data.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))

@@ -157,11 +157,8 @@ def parse_sections(text: str) -> tuple[Section, ...]:
     Read a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, in seconds since the first
     sample and m/s^2. A semicolon also ends a line of the text; a # begins a comment.
     """
-    lines = [
-        line.split('#')[0].replace(',', ' ').split()
-        for line in text.replace(';', '\n').split('\n')
-    ]
-    rows = [_numbers(line) for line in lines if line]
+    lines = text.replace(',', ' ').replace(';', '\n').split('\n')
+    rows = [_numbers(words) for line in lines if (words := line.split('#')[0].split())]
     if len(rows) == 1 and len(rows[0]) < 3:
         return (_section(0.0, math.inf, *rows[0]),)
     if not rows or not all(len(row) in (3, 4) for row in rows):
@@ -184,12 +181,13 @@ def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Sect
 
 
 def _numbers(words: list[str]) -> list[float]:
+    text = repr(' '.join(words)[:60])
     try:
         values = [float(word) for word in words]
     except ValueError as error:
-        raise ValueError(f'expected numbers, got {" ".join(words)[:60]!r}') from error
+        raise ValueError(f'expected numbers, got {text}') from error
     if not all(map(math.isfinite, values)):
-        raise ValueError(f'expected finite numbers, got {" ".join(words)[:60]!r}')
+        raise ValueError(f'expected finite numbers, got {text}')
     return values
 
 
@@ -205,8 +203,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     mine: list[str] = []
     for line in content.splitlines():
         first, _, rest = line.strip().replace(',', ' ').partition(' ')
-        is_named = bool(first) and first[0] != '#' and not first[0].isdigit() and first[0] != '.'
-        if not is_named:
+        if not first or first[0] in '#.' or first[0].isdigit():
             mine.append(line)
         elif fnmatch(path.name, first):
             mine.append(rest)
@@ -236,6 +233,5 @@ def _rotating(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForce:
     stamp_ns, rate = np.concatenate(stamps), np.concatenate(rates)
     if not len(rate) or not np.isfinite(rate).all():
         raise ValueError(f'{names[0]} has no messages, or a rate that is not finite')
-    return KnownForce(
-        *(str(path), (), stamp_ns, rate), *(asked.radius or 0.0, asked.radius_sd or 0.0)
-    )
+    radius, radius_sd = asked.radius or 0.0, asked.radius_sd or 0.0
+    return KnownForce(str(path), (), stamp_ns, rate, radius, radius_sd)
