@@ -243,8 +243,7 @@ def _norm_evidence(
     Return the log evidence of the mean norms of the mountings, for each sd of the offsets of
     mountings, or with `of_bags` of the offsets that the mountings of a bag share, (k,).
 
-    `by_drifts`: root of the unit's covariance without information from the norms; the covariance
-        of the thermal weights is taken from it
+    `by_drifts`: root of the covariance without the norms, for the thermal weights
     """
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     point, first = regression.at(state, prior), regression.windows.edges[:-1]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -152,14 +151,12 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,); 0 where the mean temperature
-    changes by less than half of this rate from one window to the next, because such a rate is
-    noise.
+    Return the rate of the board temperature [K/min], shape (n,); 0 where it is noise: the mean
+    temperature changes by less than half of it from one window to the next.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
-    for begin, end in pairwise(edges.tolist()):
-        if end - begin > 1:
-            rows = slice(begin, end)
+    for rows in map(slice, edges[:-1], edges[1:]):
+        if rows.stop - rows.start > 1:
             change = 60.0 * np.gradient(windows.temperature[rows], windows.data.time[rows])
             rate[rows] *= change * np.sign(rate[rows]) > 0.5 * np.abs(rate[rows])
     return np.asarray(rate)

@@ -69,9 +69,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     # A slow log has long gaps, because the end of a rest is found only to some twenty samples.
     longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
-    means = [
-        np.average(interval.mean, axis=0, weights=interval.count) for interval in bag.intervals
-    ]
+    means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
     ups = [mean / np.linalg.norm(mean) for mean in means]
     gaps = [
         ((before.end_ns - bag.start_ns) * 1e-9, (after.start_ns - bag.start_ns) * 1e-9)
@@ -81,11 +79,9 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     near = _near(bag, gaps, [margin_s] * len(gaps))
     # If the noise is correlated, the level beside a gap is the mean over a time above `margin_s`.
-    margins = [_margin(part, quiet_sd) for part in near]
-    slow = [place for place, margin in enumerate(margins) if margin > margin_s]
-    wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
-    for place, part in zip(slow, wider, strict=True):
-        near[place] = part
+    margins = [max(_margin(part, quiet_sd), margin_s) for part in near]
+    if max(margins, default=0.0) > margin_s:
+        near = _near(bag, gaps, margins)
     jumps = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(near, gaps, strict=True))
     return tuple(jump for jump in jumps if jump is not None)
 
@@ -142,8 +138,7 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # The noise is estimated from differences of neighbouring samples, which do not depend on a
-    # drift.
+    # Differences of neighbouring samples do not depend on a drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -159,24 +154,16 @@ def _examine(
     # If the unit is handled, the samples scatter far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
-    warmed, warmed_sd = _temperature_step(bag, time[0], time[at], time[-1])
     x, y, z = step.tolist()
-    return Jump(
-        time=float(time[at]),
-        duration_s=float(time[at] - time[at - 1]),
-        step=(x, y, z),
-        along=along,
-        temperature_change=warmed,
-        temperature_change_sd=warmed_sd,
-    )
+    duration_s = float(time[at] - time[at - 1])
+    warmed = _temperature_step(bag, time[0], time[at], time[-1])
+    return Jump(float(time[at]), duration_s, (x, y, z), along, *warmed)
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """
-    Return the sd of a mean over that for white noise of `sd`, for each axis, at least 1. The
-    residuals, shape (n, 3), are averaged to 40 pieces, whose variance is multiplied by (1 + r) /
-    (1 - r), r being their lag-1 correlation.
-    """
+    """Return the sd of a mean over that for white noise of `sd`, for each axis, at least 1."""
+    # The variance of 40 pieces' means is multiplied by (1 + r) / (1 - r), r being their lag-1
+    # correlation.
     size = max(len(residual) // 40, 1)
     n = len(residual) // size
     means = residual[: n * size].reshape(n, size, 3).mean(axis=1)

@@ -89,8 +89,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The scatter of a single fold is unknown: the smallest difference that counts is taken
-            # as its error.
+            # The scatter of a single fold is unknown: the smallest difference that counts.
             return of_sums, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
@@ -146,9 +145,8 @@ class Score:
 
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
     """
-    Whether the second model is better on left-out data by more than the standard error. Halves of
-    the program limit the number of columns, so `by_halves` is false for models of the same
-    columns.
+    Whether the second model is better on left-out data by more than the standard error;
+    `by_halves`: false for models of the same columns, whose number the halves limit.
     """
     return gain(before, after, by_halves=by_halves) > 0.0
 
@@ -245,14 +243,10 @@ def _by_positions(
 
 
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
-    """
-    Return, to first order, the state of a fit with other normal equations, and the root of the
-    state's covariance, see `Posterior`.
-    """
+    """Return a fit's state to first order, and its root, see `Posterior`, by other equations."""
     step, factor = point.unit_step(matrix)
-    full_step = np.zeros(point.layout.n)
-    full_step[: point.layout.n_unit] = step
-    return point.moved(full_step).state, inverse_root(factor)
+    step = np.pad(step, (0, point.layout.n - point.layout.n_unit))
+    return point.moved(step).state, inverse_root(factor)
 
 
 def _is_determined(by_others: float, by_all: float) -> bool:
@@ -309,13 +303,11 @@ def _by_sections(
     squares, counts = np.full(len(folds), np.nan), np.zeros(len(folds))
     for k, fold in enumerate(folds):
         point = regression.at(posterior.state, posterior.prior, products.without(fold))
-        # Two Gauss-Newton steps from the fit of all data are sufficient for the fit without a
-        # section.
+        # Two Gauss-Newton steps from the fit of all data suffice.
         for _ in range(2):
             point = point.moved(point.solution[0])
         force = regression.force(point.state)
-        gone = np.isin(windows.section, fold)
-        judged = gone
+        judged = gone = np.isin(windows.section, fold)
         if is_within:
             t = windows.columns[:, 0]
             judged = gone & (t >= t[~gone].min()) & (t <= t[~gone].max())
