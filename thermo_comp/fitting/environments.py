@@ -24,6 +24,7 @@ from ..unit.gravity import MICRO_G
 from .beginning import initial_state
 from .claim import drift_variance
 from .data_checks import Finding
+from .left_out import Folds
 from .options import FitOptions
 from .priors import constants_of, informative_priors, prior_model, with_calibration
 from .reduction import ReducedBag
@@ -70,10 +71,7 @@ def _square_of_bags(fit: Fit) -> Floats:
     """Mean square of the left-out drift of each bag, shape (n_bags,), NaN where it is unknown."""
     data, folds = fit.windows.data, fit.selected.score.positions
     bag = data.bag_of_position[np.flatnonzero(np.diff(data.mounting, prepend=-1))]
-    count = np.where(np.isfinite(folds.square), folds.windows, 0.0)
-    weighted = np.bincount(bag, np.where(count > 0.0, folds.square, 0.0) * count)
-    total = np.bincount(bag, count)
-    return np.where(total > 0.0, weighted / np.maximum(total, 1.0), np.nan)
+    return Folds.of(folds.square, folds.windows, bag).square
 
 
 def bags_contradicting_prior(

@@ -61,8 +61,7 @@ class Folds:
         known = np.isfinite(square)
         count = np.bincount(fold, np.where(known, windows, 0.0))
         total = np.bincount(fold, np.where(known, square * windows, 0.0))
-        with np.errstate(invalid='ignore'):
-            square = total / np.where(count > 0.0, count, np.nan)
+        square = total / np.where(count > 0.0, count, np.nan)
         return cls(square, np.bincount(fold, windows).astype(np.float64))
 
     @property
@@ -70,7 +69,7 @@ class Folds:
         """RMS error over all windows of the folds [m/s^2]; NaN without folds."""
         known = np.isfinite(self.square)
         if not known.any():
-            return float('nan')
+            return np.nan
         return float(np.sqrt(np.average(self.square[known], weights=self.windows[known])))
 
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
