@@ -121,10 +121,15 @@ class Growth:
         return Trial(groups, score_of(self.regression, posterior), posterior, typical)
 
     def extended(
-        self, before: Trial, groups: tuple[str, ...] = (), typical: Floats | None = None
+        self, before: Trial, groups: tuple[str, ...] = (), most: Floats | None = None
     ) -> Trial:
-        """Fit a model with further groups, from the fit of the model without them."""
-        typical = before.typical if typical is None else typical
+        """
+        Fit a model with further groups, from the fit of the model without them.
+
+        `most`: largest typical prior sd of the new columns, shape (2, m), see `_typical`; None if
+        `before` has a typical sd of these columns
+        """
+        typical = before.typical if most is None else self._typical(before, groups, most)
         posterior = before.posterior
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
@@ -145,8 +150,7 @@ class Growth:
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
         """Fit a model with further groups, and then the same model with bends."""
         added = tuple(group for group in groups if group in self.free)
-        typical = self._typical(before, added, self._candidates.typical)
-        smooth = self.extended(before, added, typical)
+        smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
@@ -194,16 +198,12 @@ class Growth:
         tried = likely[:3]
         if chosen.groups == (CURVE,) and (SET,) in likely[3:]:
             tried.append((SET,))
-        return [
-            self.extended(chosen, groups, self._typical(chosen, groups, typical))
-            for groups in tried
-        ]
+        return [self.extended(chosen, groups, typical) for groups in tried]
 
     def _typical(self, chosen: Trial, groups: tuple[str, ...], most: Floats) -> Floats:
         """
-        Return the typical prior sd of a model with further groups.
-
-        The sd of a new column corresponds to the RMS residual of the chosen model, up to `most`.
+        Return the typical prior sd of a model with further groups: that of a new column
+        corresponds to the RMS residual of the chosen model, up to `most`.
         """
         regression, posterior = self.regression, chosen.posterior
         kelvins = regression.windows.kelvins
@@ -221,13 +221,10 @@ def better_beginning(fits: Sequence[Trial]) -> Trial:
     offsets and misalignments explain the norms of few positions equally well, but only
     misalignments predict the norm of another position.
     """
-    small, *others = fits
-    for large in others:
-        evidence_gain = log_density(large.posterior) - log_density(small.posterior)
-        is_likelier = evidence_gain > TRIAL_GAIN and not is_better(large.score, small.score)
-        if is_likelier or is_better(small.score, large.score):
-            return large
-    return small
+    small, large = fits[0], fits[-1]
+    evidence_gain = log_density(large.posterior) - log_density(small.posterior)
+    is_likelier = evidence_gain > TRIAL_GAIN and not is_better(large.score, small.score)
+    return large if is_likelier or is_better(small.score, large.score) else small
 
 
 def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
