@@ -71,16 +71,8 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         text = 'at rest all samples are equal: does the sensor repeat one reading?'
         yield advice('stuck', text)
     if dead := list(_dead_axes(bags)):
-        why = 'the axis is dead there, leave out a bag with a dead axis'
-        if top := _full_scale(bags, dead):
-            # A limit below the clipped reading, so that rounding does not exclude the reading.
-            limit = f'--full-scale {top * (1.0 - 1e-4):.5g}'
-            why = (
-                'the largest reading of the bags, with both signs or on several axes, is the full '
-                f'scale: leave out a clipped bag, or the clipped rests of a bag with {limit}'
-            )
         text = '; '.join(axis.text for axis in dead)
-        yield Finding('stuck', 'refusal', f'{text}: {why}')
+        yield Finding('stuck', 'refusal', f'{text}: {_why_dead(bags, dead)}')
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
     size = float(np.median(np.linalg.norm(means, axis=1)))
     yield from _judge_thermometers(bags)
@@ -147,16 +139,20 @@ class _DeadAxis(NamedTuple):
     text: str
 
 
-def _full_scale(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> float:
-    """
-    Return the magnitude of the dead axes' readings if it is the largest of all rests and occurs
-    with both signs or on several axes, as at the full scale; else 0.
-    """
+def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
+    """Explain constant readings: clipped, if they are the largest at several ends, or dead."""
     largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
     # The limits of a two's complement differ by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
-    return largest if is_at_top.all() and len(ends) > 1 else 0.0
+    if not largest or not is_at_top.all() or len(ends) == 1:
+        return 'the axis is dead there, leave out a bag with a dead axis'
+    # A limit below the clipped reading, so that rounding does not exclude the reading.
+    limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
+    return (
+        'the largest reading of the bags, with both signs or on several axes, is the full scale: '
+        f'leave out a clipped bag, or the clipped rests of a bag with {limit}'
+    )
 
 
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:

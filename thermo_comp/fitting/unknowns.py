@@ -343,10 +343,8 @@ def lay_out(
     forces: Forces | None = None,
 ) -> Layout:
     """
-    Assign a place to every unknown.
-
-    `used`, `active`: active columns of bias and scale, shape (2, m), and active nonlinear
-    coefficients, shape (2 k,)
+    Assign a place to every unknown, given the active columns of bias and scale, shape (2, m), and
+    the active nonlinear coefficients, shape (2 k,).
     """
     n = 0
 
