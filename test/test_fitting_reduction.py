@@ -11,8 +11,7 @@ from builders import ArrayBlock
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, normal_gravity
 from thermo_comp.fitting.raw_checks import judge_bags
-from thermo_comp.fitting.readings import Readings, is_spike
-from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.reduction import Readings, is_spike, reduce_source
 from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
 from thermo_comp.recording.stillness import CellAccumulator
 from thermo_comp.simulation.campaign import positions

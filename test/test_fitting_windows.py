@@ -13,7 +13,7 @@ from triads import triad
 from thermo_comp.fitting import FitOptions, fit_bags, reduce_bag
 from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.options import sets_of
-from thermo_comp.fitting.readings import Readings
+from thermo_comp.fitting.reduction import Readings
 from thermo_comp.fitting.windows import N_SECTIONS, Model, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
 from thermo_comp.simulation.run import arrays

@@ -104,12 +104,11 @@ def test_a_fit_starts_with_the_widest_prior(monkeypatch):
     monkeypatch.setattr('thermo_comp.fitting.beginning.fit_all', fitted_with)
     few = [source(record) for record in test_of(9, 0, 1)]
     fit(few, replace(OPTIONS, serial='unit-9', prior=population(siblings())))
-    *tried, begun = seen
+    *tried, widest = (prior.root.T @ prior.root for prior in seen)
     assert len(tried) > 2
-    widest = begun.precision
     root = np.sqrt(np.diag(widest))
-    for trial in tried:
-        narrower = (trial.precision - widest) / np.outer(root, root)
+    for precision in tried:
+        narrower = (precision - widest) / np.outer(root, root)
         assert np.linalg.eigvalsh(narrower).min() > -1e-6
 
 

@@ -15,7 +15,7 @@ from simulation_helpers import ideal_regime
 
 from thermo_comp import __version__
 from thermo_comp.errors import OutputError
-from thermo_comp.fitting.readings import Readings
+from thermo_comp.fitting.reduction import Readings
 from thermo_comp.judging.evaluation import open_bags
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.report.evidence import LEFT_OUT, evidence_of_bags

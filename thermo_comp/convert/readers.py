@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the choice of a log's reader by the file name: table, autopilot's log or bag.
-"""
+"""Owns the choice of a log's reader by the file name: table, autopilot's log or bag."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

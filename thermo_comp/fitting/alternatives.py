@@ -88,8 +88,7 @@ def windows_of(
     """
     Return the windows of bags, with the known |f| of each position.
 
-    `tracks`: thermal states of the bags, if they were computed before
-    `undisturbed`: factors of the weights of the windows, see `Parts`
+    `tracks`: as in `thermal_windows`; `undisturbed`: factors of the weights, see `Parts`
     """
     windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
@@ -97,10 +96,8 @@ def windows_of(
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with one lag per axis, or with a bank of time constants.
-
-    The bank is fitted if no lag per axis is found, or if the left-out drift with the lags exceeds
-    noise. The bank replaces the lags per axis if it is better on left-out data.
+    Fit the windows with one lag per axis; or with a bank of time constants, if no lags are found,
+    or if their left-out drift exceeds noise and the bank is better on left-out data.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -120,10 +117,8 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the chosen model has two sets, or a model with two sets is similarly good.
-
-    A model is similarly good if its left-out error is within one standard error of the chosen
-    model's error, and its white noise is less than 80 % of the chosen model's noise on every axis.
+    Whether the chosen model has two sets, or a similarly good model has: its left-out error is
+    within one standard error, its white noise below 80 % of the chosen model's on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -135,9 +130,7 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """
-    Name the case thermometer, then all other thermometers, except the board's, that every bag has.
-    """
+    """Name the case thermometer, then the other thermometers, but the board's, of every bag."""
     seen = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

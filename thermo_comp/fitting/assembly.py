@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the conversion of a posterior into the Calibration that the compensator applies.
-"""
+"""Owns the conversion of a posterior into the Calibration that the compensator applies."""
 
 from __future__ import annotations
 
@@ -69,6 +67,7 @@ def build_calibration(
     static, dynamic = _regime_sets(fit, claim, known)
     columns = _valid_columns(windows, state, used, known)
     lag_s = known.board_lag_s if known else _board_lag(windows)
+    sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     blank = Calibration(
         format_version=FORMAT_VERSION,
@@ -80,11 +79,7 @@ def build_calibration(
         dynamic=dynamic,
         noise_density_m_s2_sqrt_hz=_triple(np.maximum(prior.sigma * np.sqrt(window_s), 1e-9)),
         slow_noise_m_s2_sqrt_h=_triple(prior.sigma * prior.noise.rate * np.sqrt(3600.0)),
-        sensors=tuple(
-            name
-            for k, name in enumerate(model.sensors)
-            if not k or any(name == column.sensor for column in columns)
-        ),
+        sensors=tuple(name for name in model.sensors if name in sensors),
         response=blank_terms(columns),
         board_lag_s=lag_s,
         rest_gradient_range_k=_rest_gradient_range(windows, lag_s, known),
@@ -98,11 +93,9 @@ def build_calibration(
 
 
 def _temperature_range(windows: ThermalWindows) -> Range:
-    """
-    Return the valid range of board temperatures. The calibration of a test at one temperature is
-    valid within 0.5 K of this temperature. Without a thermometer the range has a margin of 50 K,
-    and the covariance of the slope covers the unknown curve.
-    """
+    """Return the valid range of board temperatures."""
+    # The calibration of a test at one temperature is valid within 0.5 K. Without a thermometer the
+    # covariance of the slope covers the unknown curve.
     return _range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 
@@ -119,15 +112,12 @@ def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[Regi
         zero = (0.0,) * family.n_free
         bias, scale = (family.with_free(zero, reference) for reference in (0.0, 1.0))
         x, y, z = (AxisSet(bias, scale, residual_sd_m_s2=sd) for sd in slow)
-        regime = RegimeSet(temperatures, rates, x, y, z, lack_of_fit=lack)
-        if known is not None:
-            earlier = known.regime_sets()[k]
-            regime = replace(
-                regime,
-                temperature_range_c=union((temperatures, earlier.temperature_range_c)),
-                rate_range_k_min=union((rates, earlier.rate_range_k_min)),
-            )
-        result.append(regime)
+        earlier = [known.regime_sets()[k]] if known else []
+        ranges = (
+            union((temperatures, *(regime.temperature_range_c for regime in earlier))),
+            union((rates, *(regime.rate_range_k_min for regime in earlier))),
+        )
+        result.append(RegimeSet(*ranges, x, y, z, lack_of_fit=lack))
     return result
 
 
@@ -230,45 +220,36 @@ def with_parameters(
     `values`: parameters in the order of the posterior; the levels of the scale are not used
     """
     layout = parameter_layout(calibration)
+    levels = values[[bias.static for bias in layout.bias]]
     regimes = []
     for k, regime in enumerate(calibration.regime_sets()):
-        x, y, z = (
-            replace(
-                axis,
-                bias_function=axis.bias_function.with_free(
-                    _numbers(values[bias[k] + 1 : bias[k + 1]]), 0.0
-                ),
-                scale_function=axis.scale_function.with_free(
-                    _numbers(values[scale[k] + 1 : scale[k + 1]]), 1.0
-                ),
-                delta=float(values[bias[k]] - values[bias.static]),
+        axes = []
+        for axis, bias, scale in zip(regime.axes(), layout.bias, layout.scale, strict=True):
+            of_bias, of_scale = (_numbers(values[at[k] : at[k + 1]]) for at in (bias, scale))
+            axes.append(
+                replace(
+                    axis,
+                    bias_function=axis.bias_function.with_free(of_bias[1:], 0.0),
+                    scale_function=axis.scale_function.with_free(of_scale[1:], 1.0),
+                    delta=float(values[bias[k]] - values[bias.static]),
+                )
             )
-            for axis, bias, scale in zip(regime.axes(), layout.bias, layout.scale, strict=True)
-        )
+        x, y, z = axes
         regimes.append(replace(regime, x=x, y=y, z=z))
     a, b, c = _triple(values[-3:])
     biases, scales = (np.array([block.response for block in part]) for part in layout[:2])
     nonlinearity = calibration.nonlinearity
     if nonlinearity is not None:
-        each = values[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
-        nonlinearity = replace(
-            nonlinearity,
-            terms=tuple(
-                replace(
-                    term, coefficient=_triple(each[:, 0, k]), per_kelvin=_triple(each[:, 1, k])
-                )
-                for k, term in enumerate(nonlinearity.terms)
-            ),
+        each = values[layout.nonlinear : layout.misalignment].reshape(3, 2, -1).transpose(2, 1, 0)
+        terms = (
+            replace(term, coefficient=_triple(at_reference), per_kelvin=_triple(per_kelvin))
+            for term, (at_reference, per_kelvin) in zip(nonlinearity.terms, each, strict=True)
         )
+        nonlinearity = replace(nonlinearity, terms=tuple(terms))
     return replace(
         calibration,
         nonlinearity=nonlinearity,
-        axes=Axes(
-            *(
-                AxisReference(float(K), float(values[bias.static]))
-                for K, bias in zip(scale_factor, layout.bias, strict=True)
-            )
-        ),
+        axes=Axes(*map(AxisReference, scale_factor.tolist(), levels.tolist())),
         static=regimes[0],
         dynamic=regimes[1],
         misalignment=((1.0, 0.0, 0.0), (a, 1.0, 0.0), (b, c, 1.0)),

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the initial state and the prior of the regression, with or without a prior calibration.
-"""
+"""Owns the initial state and the prior of the regression, with or without a prior calibration."""
 
 from __future__ import annotations
 
@@ -35,9 +33,6 @@ from .windows import CURVE, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-#: Prior sd of an element of the misalignment [rad] for the estimate from faces: the cross-axis
-#: sensitivity of good consumer MEMS.
-FACES_MISALIGNMENT_SD = 2.5e-3
 
 
 @dataclass(frozen=True)
@@ -85,12 +80,11 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     narrow = prior
     if n_directions < POSITIONS_NEEDED:
         narrow = _narrowed(prior, regression, state, options)
-
-    def report(part: float) -> None:
-        problem.progress(0.7 + 0.25 * part)
-
     without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
-    selected = select(regression, state, narrow, without_slow, report)
+    selected = select(
+        *(regression, state, narrow, without_slow),
+        progress=lambda part: problem.progress(0.7 + 0.25 * part),
+    )
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
@@ -106,12 +100,9 @@ def _has_soaks_only(windows: ThermalWindows) -> bool:
 
 
 def _at_rest(data: Windows) -> Windows:
-    """
-    Return the windows with columns that are constant in each position.
-
-    A lag of unknown size changes the readings of a soak by as much as the remaining drift of the
-    temperature does: the norms of the positions determine the curve, drifts within soaks do not.
-    """
+    """Return the windows with columns that are constant in each position."""
+    # A lag of unknown size changes the readings of a soak by as much as the remaining drift of the
+    # temperature does: norms of positions determine the curve, drifts within soaks do not.
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
     return replace(data, columns=means[data.position], start=np.zeros_like(data.start))
 
@@ -156,27 +147,24 @@ def _initial_prior(
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior for a noisy sensor near the six faces, which hardly show the misalignment.
-
-    The other errors of such a sensor would be explained by misalignments of some degrees, to
-    second order. The sd for the estimate is therefore smaller than that in the covariance.
+    Return the prior for a noisy sensor near the six faces, which hardly show the misalignment:
+    misalignments of some degrees would explain its other errors, to second order, so the sd for
+    the estimate is smaller than that in the covariance.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    sd = prior.misalignment_scale
+    # Sd for the estimate [rad]: the cross-axis sensitivity of good consumer MEMS.
+    of_faces, sd = 2.5e-3, prior.misalignment_scale
     # Faces that are set by hand, a few degrees off, are below 0.1; the edges of a cube have 0.3.
-    is_near = float(np.sqrt(np.mean(by_element**2))) < 0.1
-    if not is_near or sd <= FACES_MISALIGNMENT_SD:
+    if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= of_faces:
         return prior
-    return replace(prior, misalignment_sd=FACES_MISALIGNMENT_SD, unseen_misalignment_sd=sd)
+    return replace(prior, misalignment_sd=of_faces, unseen_misalignment_sd=sd)
 
 
 def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:
     """
-    Return the prior of the constants during the selection of the columns.
-
-    Few attitudes do not determine all constants, and an incomplete model would change the
-    undetermined constants by large amounts. The sd of the constants is therefore five times the
-    largest error of a norm, at least 5 % and at most 100 % of the prior's sd.
+    Return the prior of the constants during the selection of the columns: five times the largest
+    error of a norm, at least 5 % and at most 100 % of the prior's sd. In an incomplete model,
+    constants that few attitudes do not determine would change by large amounts.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())
@@ -191,13 +179,10 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
-    The effect of a slow lag is nearly collinear with the curve, and its final value would be
-    extrapolated. No model uses slow columns; those linear in temperature enter the covariance, see
-    `claim`.
+    Their effect is nearly collinear with the curve, and its final value would be extrapolated. No
+    model uses slow columns; those linear in temperature enter the covariance, see `claim`.
     """
-    data = windows.data
-    longest_s = float(data.age.max())
-    model = windows.model
+    model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])
     of_part = ((model.part_curves.sums != 0.0) * taus).max(axis=1, initial=0.0)
     return np.asarray(np.append(taus, of_part) > longest_s / np.log(10.0))
@@ -205,25 +190,19 @@ def _is_slow(windows: ThermalWindows) -> Bools:
 
 def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
     """Return the noise of the samples in 1 Hz [m/s^2], the median of the axes; 0 if unknown."""
-    data = windows.data
-    if not len(data.inner):
+    data, inner = windows.data, windows.data.inner
+    if not len(inner):
         return 0.0
-    sigma = float(np.median(white_noise_of(data, scale)))
-    return float(sigma * np.sqrt(np.median(np.diff(data.time)[data.inner])))
+    step_s = np.median(np.diff(data.time)[inner])
+    return float(np.median(white_noise_of(data, scale)) * np.sqrt(step_s))
 
 
 def _mounting_scale(noise: float) -> float:
-    """
-    Return the scale of the prior of mounting offsets [m/s^2]: three times the noise in 1 Hz,
-    within bounds.
-    """
+    """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
     # Bounds: 30 ug, as of sensors of navigation grade, and 0.5 mg, as of consumer MEMS; the tail
-    # of the Student prior allows for more.
-    least, most = 3e-4, 5e-3
-    # Readings with almost no noise have a smaller lower bound: an offset 1e6 times as large as the
-    # noise cannot be estimated in double precision. 1e-6 m/s^2: 0.1 ug, better than navigation
-    # grade.
-    least = max(min(least, 100.0 * noise), 1e-6)
+    # of the Student prior allows for more. The lower bound is smaller for almost no noise, because
+    # an offset 1e6 times as large as the noise cannot be estimated in double precision.
+    least, most = max(min(3e-4, 100.0 * noise), 1e-6), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 
 
@@ -294,10 +273,8 @@ def _steepness(windows: ThermalWindows, start: ConstantCalibration, options: Fit
 
 def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
     """Return the known |f| of each position, shape (n_positions,) [m/s^2]."""
-    forces = windows.data.forces
-    if forces is None:
-        return np.full(windows.data.n_positions, options.gravity)
-    return forces.sizes
+    data = windows.data
+    return data.forces.sizes if data.forces else np.full(data.n_positions, options.gravity)
 
 
 def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:

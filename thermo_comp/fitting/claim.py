@@ -43,6 +43,10 @@ from .windows import CURVE, PART
 #: Grid of the standard deviation of offsets, relative to the scale of its prior, in steps of a
 #: quarter decade, over which the log evidence is smooth.
 _GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
+#: Log prior density on the grid, per step of the logarithm: flat below the scale, a Student's tail
+#: above, and falling to 0 below a hundredth of the scale, which few mountings reach.
+_LOG_DENSITY = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_GRID**2 / STUDENT_NU)
+_LOG_DENSITY += np.log(np.minimum(_GRID / 0.01, 1.0))
 
 
 @dataclass(frozen=True)
@@ -118,12 +122,9 @@ def claim_of(
 def _places(layout: Layout, wider: Layout) -> Ints:
     """Return the places of the unit's unknowns in a layout with more columns, (n_unit,)."""
     places = np.empty(layout.n_unit, dtype=np.int64)
-    is_used = layout.weights >= 0
-    places[layout.axis[:, :2]] = wider.axis[:, :2]
-    places[layout.weights[is_used]] = wider.weights[is_used]
-    places[layout.shared] = wider.shared
-    is_used = layout.nonlinear >= 0
-    places[layout.nonlinear[is_used]] = wider.nonlinear[is_used]
+    for name in ('kappa', 'bias', 'weights', 'nonlinear', 'shared'):
+        at = getattr(layout, name)
+        places[at[at >= 0]] = getattr(wider, name)[at >= 0]
     return places
 
 
@@ -179,8 +180,7 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     """Return covariance and offset sd of the mixture of fits over the mounting's sd."""
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
-    grid = _GRID
-    tried = prior.offset_scale * grid
+    tried = prior.offset_scale * _GRID
 
     def solved(offset_sd: Floats) -> list[Posterior]:
         return [
@@ -189,21 +189,19 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
         ]
 
     fits = solved(tried)
-    density = _log_density(grid)
     # A large mounting sd leaves the attitudes free to absorb errors of the model. Therefore the
     # drifts may increase the log evidence of an sd, over that of the mode, by at most
     # `TRIAL_GAIN`.
-    evidence = np.array([
-        [fit.log_evidence for fit in fits],
-        _norm_evidence(regression, posterior, tried, fits[-1].root),
-    ])  # fmt: skip
+    of_data = np.array([fit.log_evidence for fit in fits])
+    of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
-    of_data, of_norms = evidence - evidence[:, [nearest]]
+    of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
     weight = np.minimum(of_data, of_norms + TRIAL_GAIN)
     if n_rests > 1.0:
         # All rests of a mounting agree: only the mountings show how well they repeat.
         fits, weight = solved(n_rests**0.5 * tried), of_norms
-    weight = np.exp(weight + density - (weight + density).max())
+    weight = weight + _LOG_DENSITY
+    weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
     mode = as_vector(posterior.state, posterior.layout)[:n]
@@ -212,16 +210,6 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
         difference = as_vector(fit.state, fit.layout)[:n] - mode
         covariance += share * (fit.covariance + np.outer(difference, difference))
     return covariance, float(np.sqrt(weight @ tried**2))
-
-
-def _log_density(grid: Floats) -> Floats:
-    """
-    Return the log prior density of an sd of offsets per step of its logarithm: flat below the
-    scale, a Student's tail above the scale, and falling to 0 below a hundredth of the scale, which
-    few mountings reach.
-    """
-    tail = -0.5 * (STUDENT_NU + 1.0) * np.log1p(grid**2 / STUDENT_NU)
-    return np.asarray(tail + np.log(np.minimum(grid / 0.01, 1.0)))
 
 
 def _turn_on_sd(regression: Regression, posterior: Posterior) -> float:
@@ -237,8 +225,8 @@ def _turn_on_sd(regression: Regression, posterior: Posterior) -> float:
     tried = posterior.prior.offset_scale * _GRID
     without_norms = replace(posterior.prior, offset_sd=float(tried[-1]))
     by_drifts = regression.solve(posterior.state, without_norms, n_steps=1).root
-    weight = _norm_evidence(regression, posterior, tried, by_drifts, of_bags=True)
-    weight += _log_density(_GRID)
+    evidence = _norm_evidence(regression, posterior, tried, by_drifts, of_bags=True)
+    weight = evidence + _LOG_DENSITY
     weight = np.exp(weight - weight.max())
     return float(np.sqrt(weight @ tried**2 / weight.sum()))
 
@@ -255,8 +243,7 @@ def _norm_evidence(
     Return the log evidence of the mean norms of the mountings, for each sd of the offsets of
     mountings, or with `of_bags` of the offsets that the mountings of a bag share, (k,).
 
-    `by_drifts`: root of the unit's covariance without information from the norms; the covariance
-        of the thermal weights is taken from it
+    `by_drifts`: root of the covariance without the norms, for the thermal weights
     """
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     point, first = regression.at(state, prior), regression.windows.edges[:-1]
@@ -306,12 +293,9 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
     noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.ratio)
     claimed = drift_variance(regression, state, claim.layout, claim.covariance)
     excess = selected.score.drift**2 - noise - claimed
-    drift = within_positions(regression.force(state), position)
-    model_error = np.zeros_like(drift)
-    for trial in selected.trials:
-        if trial.is_near:
-            other_drift = within_positions(regression.force(trial.posterior.state), position)
-            model_error = np.maximum(model_error, 0.5 * (other_drift - drift) ** 2)
+    near = [trial.posterior.state for trial in selected.trials if trial.is_near]
+    drifts = [within_positions(regression.force(other), position) for other in (state, *near)]
+    model_error = 0.5 * np.max((np.array(drifts) - drifts[0]) ** 2, axis=0)
     static, dynamic = (
         _points(windows.temperature, excess, model_error, rows & np.isfinite(excess[:, 0]))
         for rows in (~windows.is_dynamic, windows.is_dynamic)
@@ -323,19 +307,13 @@ def drift_variance(
     regression: Regression, state: State, layout: Layout, covariance: Floats
 ) -> Floats:
     """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
-    in_bias, in_scale = (np.flatnonzero(mask) for mask in layout.used)
-    on_bias, on_scale = (
-        within_positions(regression.columns[:, column], regression.windows.position)
-        for column in (in_bias, in_scale)
-    )
-    force = regression.along_axes(state)
-    result = np.zeros((len(on_bias), 3))
-    for axis in range(3):
-        a = force[regression.windows.position, axis][:, None]
-        along = np.hstack((on_bias, a * on_scale))
-        at = layout.axis[axis, 2 : 2 + along.shape[1]]
-        result[:, axis] = np.sum((along @ covariance[np.ix_(at, at)]) * along, axis=1)
-    return result
+    position = regression.windows.position
+    columns = within_positions(regression.columns, position)
+    by_weights = layout.by_weights(columns, regression.effects(state).force[position])
+    variances = [
+        np.sum((along @ covariance[np.ix_(at, at)]) * along, axis=1) for along, at in by_weights
+    ]
+    return np.column_stack(variances)
 
 
 def _points(
@@ -345,9 +323,9 @@ def _points(
     n_bins = min(5, int(rows.sum()) // 10)
     if not n_bins:
         return ()
-    temperature, excess, model_error = temperature[rows], excess[rows], model_error[rows]
     points: list[LackOfFit] = []
-    for part in np.array_split(np.argsort(temperature, kind='stable'), n_bins):
+    order = np.argsort(temperature, kind='stable')
+    for part in np.array_split(order[rows[order]], n_bins):
         mean = excess[part].mean(axis=0)
         # Errors of neighbouring windows are correlated: ten windows count as one observation. An
         # excess below two standard errors is set to 0.

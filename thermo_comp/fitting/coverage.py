@@ -55,9 +55,7 @@ def constants_covariance(
 
 
 def worst_sd(covariance: Floats) -> float:
-    """
-    Largest standard deviation of the force over all attitudes and directions of its error [g].
-    """
+    """Return the largest sd of the force over all attitudes and directions of its error [g]."""
     columns = force_columns(_SPHERE)
     return math.sqrt(np.max(np.linalg.eigvalsh(columns @ covariance @ columns.transpose(0, 2, 1))))
 
@@ -102,9 +100,7 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """
-    Return the directions of mean readings (n, 3) from a centre; NaN for a reading at the centre.
-    """
+    """Return the directions of mean readings (n, 3) from a centre; NaN at the centre."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
@@ -140,9 +136,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """
-    Return the largest sd of a triad's constant per unit of noise of |f|, for directions (n, 3).
-    """
+    """Return the largest sd of a constant per unit of noise of |f|, for directions (n, 3)."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -159,21 +153,16 @@ def best_rests(candidates: list[Floats]) -> int:
     thresholds; if no set has six attitudes, the first set of all is taken.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
-    enough = [len(distinct_directions(up)) for up in ups]
-    n_most = max(enough, default=0)
-    costs = np.full(len(candidates), np.inf)
-    for number, means in enumerate(candidates):
-        if enough[number] >= 6:
-            costs[number] = _cost(means, n_most >= 12)
-    if not np.isfinite(costs).any():
-        return 0
+    counts = [len(distinct_directions(up)) for up in ups]
+    costs = np.array([
+        _cost(means, max(counts) >= 12) if n >= 6 else np.inf
+        for means, n in zip(candidates, counts, strict=True)
+    ])  # fmt: skip
     return int(np.argmax(costs <= 1.02 * np.min(costs)))
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """
-    Return the largest sd of a constant of a triad, given the scatter of the rests' norms [g].
-    """
+    """Return the largest sd of a triad's constant by the scatter of the rests' norms [g]."""
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf
@@ -207,9 +196,7 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """
-    Find the attitude with the largest sd of |f|, given positions (n, 3); None without covariance.
-    """
+    """Find the attitude of the largest sd of |f| by positions (n, 3); None without covariance."""
     if calibration.posterior is None:
         return None
     layout, axes = parameter_layout(calibration), calibration.axes
@@ -235,9 +222,7 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
 
 
 def spoken_direction(up: Floats) -> str:
-    """
-    Describe an attitude to a user: the axes that point up, and the readings of the axes in g.
-    """
+    """Describe an attitude to a user: the axes that point up, and the axes' readings in g."""
     signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
     size = np.abs(up)
     axes = [sign for sign, share in zip(signs, size, strict=True) if share > 0.1]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -34,14 +33,8 @@ if TYPE_CHECKING:
 #: Smallest numbers of positions that determine bias and scale factor (six constants), the
 #: misalignment (three more constants), and by their norms the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
-#: Number of recordings whose turn-ons show how well turn-ons repeat, if they hold all positions:
-#: the bias of the first recording is that of the unit, the others differ from it.
-RECORDINGS_FOR_TURN_ONS = 4
 #: Smallest span of the board temperature that shows whether the bias depends on temperature [K].
 LEAST_SPAN_K = 3.0
-#: Ratio of an RMS residual to white noise up to which noise explains the residual, and from which
-#: it is far above the noise.
-_NOISE, _FAR_ABOVE_NOISE = 2.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -82,11 +75,9 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
         what = 'no change of temperature was read'
         if not any(len(bag.board.value) for bag in used_bags):
             is_read = any(len(of.value) for bag in used_bags for of in bag.temperatures.values())
-            what = 'the bags have no thermometer'
-            what = 'the bags have no thermometer of the board' if is_read else what
-        yield advice(
-            'temperature', f'{what}: the calibration holds at the temperature of the test'
-        )
+            what = 'the bags have no thermometer' + ' of the board' * is_read
+        text = f'{what}: the calibration holds at the temperature of the test'
+        yield advice('temperature', text)
         return
     yield from _judge_unmeasured(windows, used_bags)
     span = float(np.ptp(windows.temperature))
@@ -155,19 +146,17 @@ def _has_drift(windows: ThermalWindows) -> bool:
     norm = np.linalg.norm(data.mean, axis=1, keepdims=True)
     drift = float(np.sqrt(np.mean(within_positions(norm, data.position) ** 2)))
     noise = float(np.sqrt(np.mean(white_noise_of(data, np.ones(3)) ** 2)))
-    return drift > _FAR_ABOVE_NOISE * noise > 0.0
+    return drift > 10.0 * noise > 0.0
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,); 0 where the mean temperature
-    changes by less than half of this rate from one window to the next, because such a rate is
-    noise.
+    Return the rate of the board temperature [K/min], shape (n,); 0 where it is noise: the mean
+    temperature changes by less than half of it from one window to the next.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
-    for begin, end in pairwise(edges.tolist()):
-        if end - begin > 1:
-            rows = slice(begin, end)
+    for rows in map(slice, edges[:-1], edges[1:]):
+        if rows.stop - rows.start > 1:
             change = 60.0 * np.gradient(windows.temperature[rows], windows.data.time[rows])
             rate[rows] *= change * np.sign(rate[rows]) > 0.5 * np.abs(rate[rows])
     return np.asarray(rate)
@@ -256,12 +245,15 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
     assumed = f'the uncertainty assumes {spoken(offset_sd)}: state --mounting-sd'
-    if n_bags < min(n, RECORDINGS_FOR_TURN_ONS):
+    # The bias of the first recording is that of the unit; those of three others show how well
+    # turn-ons repeat.
+    needed = 4
+    if n_bags < min(n, needed):
         yield advice(
             'mountings',
             f'{n} rests in {counted(n_bags, "recording")} have {counted(n_bags, "turn-on")}, too '
             f'few to show how well the bias repeats after the unit is switched on again; {assumed}'
-            f', or switch the unit off between {RECORDINGS_FOR_TURN_ONS} recordings or more',
+            f', or switch the unit off between {needed} recordings or more',
         )
     elif n < POSITIONS_FOR_MOUNTINGS:
         yield advice(
@@ -327,15 +319,16 @@ def judge_result(
     noise: white noise of a window [m/s^2]
     """
     overall = rows[-1]
-    raw, fitted = overall.raw.rms / MICRO_G, overall.fitted.rms / MICRO_G
-    others = ''
-    if overall.left_out.n:
-        others = f'{overall.left_out.rms / MICRO_G:.1f} ug on data left out, '
+    raw, fitted, left_out = (
+        row.rms / MICRO_G for row in (overall.raw, overall.fitted, overall.left_out)
+    )
+    others = f'{left_out:.1f} ug on data left out, ' if overall.left_out.n else ''
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
-    if span > 0.0 and is_slow and overall.fitted.rms > _NOISE * noise:
+    # Up to twice the white noise, noise explains a residual.
+    if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:
         why = 'temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
-        if drift <= max(_NOISE * noise, 0.3 * overall.fitted.rms):
+        if drift <= max(2.0 * noise, 0.3 * overall.fitted.rms):
             why = (
                 'the positions differ, while temperature explains the drift within them: the bias '
                 'does not repeat after the unit is mounted or switched on again'

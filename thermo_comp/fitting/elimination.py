@@ -43,8 +43,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
-                # The matrices are factored one by one, because only some matrices need more
-                # jitter.
+                # Only some of the matrices need more jitter.
                 return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise
@@ -60,10 +59,7 @@ def solved(factor: Floats, right: Floats) -> Floats:
 
 
 def inverse_root(factor: Floats) -> Floats:
-    """
-    Return the upper triangular root of the inverse of a matrix, ``root @ root.T``, given the lower
-    Cholesky factor of the matrix, shape (n, n).
-    """
+    """Return the upper triangular root of the inverse of a matrix, given its lower factor."""
     return np.asarray(dtrtri(factor.T)[0])
 
 
@@ -83,9 +79,8 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower, because it does not use that the
-        # factors are triangular.
-        root = np.stack([dtrtri(factor.T)[0].T for factor in factored(block, diagonal)])
+        # `numpy.linalg.inv` of all factors at once is slower: it does not know triangles.
+        root = np.stack([inverse_root(factor).T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
     @cached_property
@@ -137,22 +132,18 @@ class Reduced:
     @property
     def log_determinant(self) -> float:
         """Sum of the log determinants of all eliminated blocks."""
-        blocks = [self.positions, self.bags, *([self.common] if self.common else [])]
-        return sum(block.log_determinant for block in blocks)
+        blocks = self.positions, self.bags, self.common
+        return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """
-        Add the prior, with mean 0, of the sum of the initial lag states, which is now `total`.
-        """
+        """Add the prior of the sum of the initial lag states, which is now `total`; mean 0."""
         cross = self.bags.solved.sum(axis=0, keepdims=True)
         cross[..., -1] += total
         block = self.bags.inverse.sum(axis=0, keepdims=True) + variance * np.eye(len(total))
         return replace(self, common=Blocks.of(block, cross))
 
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
-        """
-        Return the steps of the unknowns of positions and bags, given that of the unit's unknowns.
-        """
+        """Return the steps of the unknowns of positions and bags, given the unit's step."""
         r, solved = len(self.bags.root[0]), self.positions.solved
         starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
         if self.common is not None:
@@ -165,8 +156,7 @@ class Reduced:
     def variances(self, root: Floats) -> tuple[Floats, Floats]:
         """
         Return the variances of the unknowns of positions and bags, without the prior on the sum of
-        the initial lag states; `root`: upper triangular root of the covariance of the unit's
-        unknowns.
+        the initial lag states; `root`: upper triangular, of the covariance of the unit's unknowns.
         """
         bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
         by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]
@@ -177,9 +167,7 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """
-        Return `whole` without some positions of one bag, given the normal equations of these.
-        """
+        """Return `whole` without some positions of one bag, given their normal equations."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = bag[places[0]]
         others = (bag == at) & ~np.isin(np.arange(len(bag)), places)

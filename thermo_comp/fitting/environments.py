@@ -24,6 +24,7 @@ from ..unit.gravity import MICRO_G
 from .beginning import initial_state
 from .claim import drift_variance
 from .data_checks import Finding
+from .left_out import Folds
 from .options import FitOptions
 from .priors import constants_of, informative_priors, prior_model, with_calibration
 from .reduction import ReducedBag
@@ -35,15 +36,13 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """
-    Whether the RMS of a drift exceeds five times the usual RMS, both given as mean squares.
-    """
+    """Whether the RMS of a drift exceeds five times the usual RMS, both given as mean squares."""
     return np.asarray(square > 5.0**2 * usual)
 
 
-def contradicting_bag(fit: Fit) -> int | None:
+def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Find the bag that may be of another environment; None if no bag is suspect.
+    Find the bag that may be of another environment: a list of one bag, or of none.
 
     A bag is suspect if its left-out drift is far above the median of all bags, and above the white
     noise of a window. A bag is also suspect if its drift is the only one that the other bags do
@@ -53,12 +52,12 @@ def contradicting_bag(fit: Fit) -> int | None:
     known = np.isfinite(square)
     if known.sum() < 4:
         # At least four bags are needed to decide that one bag contradicts the majority.
-        return None
+        return []
     usual, noise = float(np.median(square[known])), float(np.mean(fit.posterior.prior.sigma**2))
     if (~known).sum() == 1 and _is_far_above(usual, noise):
-        return int(np.argmin(known))
+        return [int(np.argmin(known))]
     worst = int(np.nanargmax(square))
-    return worst if _is_far_above(square[worst], max(usual, noise)) else None
+    return [worst] if _is_far_above(square[worst], max(usual, noise)) else []
 
 
 def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
@@ -72,10 +71,7 @@ def _square_of_bags(fit: Fit) -> Floats:
     """Mean square of the left-out drift of each bag, shape (n_bags,), NaN where it is unknown."""
     data, folds = fit.windows.data, fit.selected.score.positions
     bag = data.bag_of_position[np.flatnonzero(np.diff(data.mounting, prepend=-1))]
-    count = np.where(np.isfinite(folds.square), folds.windows, 0.0)
-    weighted = np.bincount(bag, np.where(count > 0.0, folds.square, 0.0) * count)
-    total = np.bincount(bag, count)
-    return np.where(total > 0.0, weighted / np.maximum(total, 1.0), np.nan)
+    return Folds.of(folds.square, folds.windows, bag).square
 
 
 def bags_contradicting_prior(

@@ -81,6 +81,7 @@ class Equations(Series):
     def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:
         self.gravity = gravity
         self.forces = windows.forces if gravity else None
+        self.n_coefficients = 2 * len(self.forces.kinds) if self.forces else 0
         t = np.zeros((len(windows.time), 0)) if self.forces is None else self.forces.t[:, None]
         super().__init__(windows, nominal_scale, t)
         self._layouts: dict[bytes, Layout] = {}
@@ -96,7 +97,7 @@ class Equations(Series):
             offset=np.zeros((len(up), 3)),
             tilt=np.zeros((len(up), self.windows.tilt.shape[1], 2)),
             start=np.zeros((self.n_bags, self.start_root.shape[1])),
-            nonlinear=np.zeros((3, 2 * len(self.forces.kinds) if self.forces else 0)),
+            nonlinear=np.zeros((3, self.n_coefficients)),
             radius=np.zeros(1),
             stretch=np.zeros((len(up), 1)),
         )
@@ -106,10 +107,6 @@ class Equations(Series):
         if self.forces is None:
             return np.full(self.windows.n_positions, self.gravity)
         return self.forces.norms(state.radius, np.zeros_like(state.stretch))
-
-    def along_axes(self, state: State) -> Floats:
-        """Return the specific force along each axis in each position, shape (n_positions, 3)."""
-        return self.effects(state).force
 
     def _norm(self, state: State) -> float | Floats:
         if self.forces is None:
@@ -124,12 +121,11 @@ class Equations(Series):
         coefficients, shape (2 k,); None for all
         """
         if nonlinear is None or self.forces is None:
-            nonlinear = np.ones(2 * len(self.forces.kinds) if self.forces else 0, dtype=bool)
+            nonlinear = np.ones(self.n_coefficients, dtype=bool)
         key = used.tobytes() + nonlinear.tobytes()
         if key not in self._layouts:
             moved = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
-            n_starts = self.start_root.shape[1] if moved else 0
-            n_tilts = self.windows.tilt.shape[1]
+            n_tilts, n_starts = self.windows.tilt.shape[1], self.start_root.shape[1] * moved
             self._layouts[key] = lay_out(
                 used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces
             )
@@ -216,23 +212,21 @@ class Equations(Series):
         if self.forces is None or not len(active):
             return active, 1.0
         k = len(self.forces.kinds)
-        value, _ = self.forces.terms(self.along_axes(state))
+        value, _ = self.forces.terms(self.effects(state).force)
         place = np.where(active < k, scaled, base.t[0])
         return place, state.kappa[:, None] * value[..., active % k]
 
     def _by_misalignment(self, state: State) -> Floats:
         """Differentiate the force along each axis by the misalignment, times kappa, (n, 3, 3)."""
         result = np.zeros((len(state.up), 3, 3))
-        turned = self._norm(state) * state.up
-        # Row and column of each element of the inverse of M.
-        for k, (row, source) in enumerate(((1, 0), (2, 0), (2, 1))):
-            result[:, row, k] = state.kappa[row] * turned[:, source]
+        # Rows and columns of the elements of the inverse of M.
+        rows, columns = [1, 2, 2], [0, 0, 1]
+        turned = (self._norm(state) * state.up)[:, columns]
+        result[:, rows, [0, 1, 2]] = state.kappa[rows] * turned
         return result
 
     def misfit(self, state: State, base: Base) -> Floats:
-        """
-        Measured minus predicted readings as combinations of the base, (n_positions, 3, n_base).
-        """
+        """Return the residual as combinations of the base series, (n_positions, 3, n_base)."""
         force, across, read, (_, bend_by_t), _ = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size))

@@ -24,7 +24,6 @@ from .gains import log_bayes_factors
 from .left_out import Score
 from .regression import Posterior, Regression
 from .selection import Fit
-from .start import within_positions
 from .unknowns import Noise, State
 from .windows import CURVE, SET
 
@@ -72,8 +71,11 @@ class ResidualRow:
     left_out: ResidualStatistics
 
 
-def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats]:
-    """Return residuals of the steps of the model, and left-out errors of all windows [m/s^2]."""
+def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
+    """
+    Return residuals of the steps of the model, and ``|f| - g`` in sample and the left-out error of
+    each window [m/s^2], shape (n,).
+    """
     (windows, regression, selected, _), state = fit, fit.posterior.state
     steps = [
         replace(state, weights=np.zeros_like(state.weights)),
@@ -90,7 +92,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats]:
         ResidualRow(section, *(table[section] for table in tables))
         for section in ('static', 'dynamic', 'all')
     )
-    return rows, left_out
+    return rows, residuals[-1], left_out
 
 
 def tables_of(
@@ -129,22 +131,9 @@ def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...
     return regression.solve(chosen.state, prior).state
 
 
-def _residual_of(fit: Fit) -> Floats:
-    """Return ``|f| - g`` of the windows in sample [m/s^2], shape (n,)."""
-    (_, regression, *_), state = fit, fit.posterior.state
-    sizes = regression.norms(state)[regression.windows.position]
-    return norm_residual(regression.force(state), sizes)
-
-
-def drift_of(fit: Fit) -> float:
-    """Return the RMS of the residuals in sample about their means in the positions [m/s^2]."""
-    residual = _residual_of(fit)[:, None]
-    return float(np.sqrt(np.mean(within_positions(residual, fit.windows.data.position) ** 2)))
-
-
-def position_reports(fit: Fit, left_out: Floats) -> tuple[PositionReport, ...]:
-    """List the positions with their RMS residuals in sample and left out."""
-    windows, state, residual = fit.windows, fit.posterior.state, _residual_of(fit)
+def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[PositionReport, ...]:
+    """List the positions with their RMS residuals in sample and left out, see `residual_rows`."""
+    windows, state = fit.windows, fit.posterior.state
     result = []
     for number, (bag, interval) in enumerate(windows.rests):
         rows = windows.data.position == number

@@ -36,7 +36,7 @@ from .environments import (
     is_better_without,
     with_excluded_error,
 )
-from .evidence import PositionReport, ResidualRow, drift_of, position_reports, residual_rows
+from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
@@ -45,6 +45,7 @@ from .reduction import ReducedBag, reduce_source
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
+from .start import within_positions
 from .windows import FEWEST_WINDOWS
 
 Progress = Callable[[float], None]
@@ -83,9 +84,7 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """
-    Reduce a source to its sufficient statistics; FitError if the source has no still interval.
-    """
+    """Reduce a source to its sufficient statistics; FitError if it has no still interval."""
     bag = reduce_source(
         source,
         min_rest_s=options.min_rest_s,
@@ -150,10 +149,9 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
 
 def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
     """Subtract the codes at zero force from a bag and from the blocks of its source."""
-    blocks = bag.source.blocks
 
     def moved() -> Iterator[Any]:
-        for block in blocks():
+        for block in bag.source.blocks():
             yield replace(cast(Any, block), accel=block.accel - offset)
 
     intervals = tuple(replace(interval, mean=interval.mean - offset) for interval in bag.intervals)
@@ -161,9 +159,7 @@ def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def about(calibration: Calibration, offset: Floats) -> Calibration:
-    """
-    Convert a calibration for codes less their offset into a calibration for the codes themselves.
-    """
+    """Convert a calibration of codes less their offset into a calibration of the codes."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
@@ -191,8 +187,7 @@ def _fit_one_environment(
     known = options.prior
     excluded: list[int] = []
     if known is None:
-        bag = contradicting_bag(first.fit)
-        excluded = [] if bag is None else [bag]
+        excluded = contradicting_bag(first.fit)
     elif known.unit.serial == first.calibration.unit.serial and not first.fit.windows.data.forces:
         excluded = bags_contradicting_prior(first.fit.windows, known, options)
     if not excluded:
@@ -207,10 +202,8 @@ def _fit_one_environment(
         # If all bags contradict the prior, no bag can update the prior.
         provenance = first.calibration.provenance
         refit = replace(first, calibration=replace(known, provenance=provenance))
-    others = 'the other bags' if known is None else 'the prior'
-    calibration, finding = with_excluded_error(
-        refit.calibration, [bags[k] for k in excluded], others
-    )
+    others, gone = 'the other bags' if known is None else 'the prior', [bags[k] for k in excluded]
+    calibration, finding = with_excluded_error(refit.calibration, gone, others)
     return replace(
         refit,
         calibration=with_notes(calibration, [finding]),
@@ -240,13 +233,14 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     claim = claim_of(
         *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known))
     )
-    residuals, left_out = residual_rows(fit)
+    residuals, in_sample, left_out = residual_rows(fit)
+    drift = within_positions(in_sample[:, None], fit.windows.data.position)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
     K = fit.posterior.state.kappa * start.scale
     findings += data_checks.judge_result(
         *(K, residuals, claim.offset_sd, options),
         span=float(np.ptp(fit.windows.temperature)),
-        drift=drift_of(fit),
+        drift=float(np.sqrt(np.mean(drift**2))),
         noise=fit.selected.score.noise,
     )
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
@@ -269,7 +263,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         calibration=with_notes(calibration, unseen),
         fit=fit,
         residuals=residuals,
-        positions=position_reports(fit, left_out),
+        positions=position_reports(fit, in_sample, left_out),
         findings=(*findings, *unseen),
         least_known=least,
         bags=tuple(bags),
@@ -286,9 +280,7 @@ def _offset_sd(known: Calibration | None) -> float:
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """
-    Return the bags without thermometers that copy the board's, and findings about the raw data.
-    """
+    """Return the bags without copies of the board's thermometer, and findings about raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name
@@ -330,8 +322,7 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
         full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
     if full_scale is None:
-        # The full scale is the smallest usual full scale of sensors in m/s^2 that contains the
-        # data.
+        # The smallest usual full scale of sensors in m/s^2 that contains the data.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))

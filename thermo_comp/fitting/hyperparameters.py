@@ -24,6 +24,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
+from .equations import as_vector
 from .gains import log_bayes_factors
 from .regression import Posterior, Regression
 from .start import white_noise_of
@@ -209,14 +210,10 @@ def with_slow_noise(
     step = 3.0
     while step > 3.0**0.2:
         ratio, time_s = best.prior.noise
+        factors = (step, 1.0), (1.0 / step, 1.0), (1.0, step), (1.0, 1.0 / step)
         around = [
             with_noise(Noise(ratio * by_ratio, time_s * by_time))
-            for by_ratio, by_time in (
-                (step, 1.0),
-                (1.0 / step, 1.0),
-                (1.0, step),
-                (1.0, 1.0 / step),
-            )
+            for by_ratio, by_time in factors
             if regression.whitener.shows(time_s * by_time)
         ]
         nearby = max(around, key=lambda posterior: posterior.log_evidence)
@@ -246,11 +243,8 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
     Drop columns with a log Bayes factor below `LEAST_GAIN`, one at a time, the smallest first;
     after each the factors of the other columns are calculated again.
     """
-    state, layout, prior = posterior.state, posterior.layout, posterior.prior
-    covariance = posterior.covariance.copy()
-    mode = np.zeros(len(covariance))
-    is_active = layout.weights >= 0
-    mode[layout.weights[is_active]] = state.weights[is_active]
+    layout, prior, covariance = posterior.layout, posterior.prior, posterior.covariance.copy()
+    mode = as_vector(posterior.state, layout)[: layout.n_unit]
     is_kept = candidates.fixed | candidates.forced
     droppable = np.argwhere((prior.column_sd > 0.0) & ~is_kept).tolist()
     column_sd, weight_sd = prior.column_sd.copy(), regression.weight_sd(prior)

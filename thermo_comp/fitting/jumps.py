@@ -24,7 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..typing import Floats, Ints
+from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
@@ -69,9 +69,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     # A slow log has long gaps, because the end of a rest is found only to some twenty samples.
     longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
-    means = [
-        np.average(interval.mean, axis=0, weights=interval.count) for interval in bag.intervals
-    ]
+    means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
     ups = [mean / np.linalg.norm(mean) for mean in means]
     gaps = [
         ((before.end_ns - bag.start_ns) * 1e-9, (after.start_ns - bag.start_ns) * 1e-9)
@@ -81,11 +79,9 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     near = _near(bag, gaps, [margin_s] * len(gaps))
     # If the noise is correlated, the level beside a gap is the mean over a time above `margin_s`.
-    margins = [_margin(part, quiet_sd) for part in near]
-    slow = [place for place, margin in enumerate(margins) if margin > margin_s]
-    wider = _near(bag, [gaps[place] for place in slow], [margins[place] for place in slow])
-    for place, part in zip(slow, wider, strict=True):
-        near[place] = part
+    margins = [max(_margin(part, quiet_sd), margin_s) for part in near]
+    if max(margins, default=0.0) > margin_s:
+        near = _near(bag, gaps, margins)
     jumps = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(near, gaps, strict=True))
     return tuple(jump for jump in jumps if jump is not None)
 
@@ -96,7 +92,7 @@ def _near(
     """Collect the samples beside each gap: time, reading, angular rate or NaN, shape (n, 7)."""
     parts = [[np.zeros((0, 7))] for _ in gaps]
     for block in bag.source.blocks() if gaps else ():
-        time, rate = _seconds(block.accel_stamp_ns, bag.start_ns), angular_velocity(block)
+        time, rate = (block.accel_stamp_ns - bag.start_ns) * 1e-9, angular_velocity(block)
         rate = np.full(block.accel.shape, np.nan) if rate is None else rate
         for part, (begin, end), margin in zip(parts, gaps, margins, strict=True):
             use = (time >= begin - margin) & (time <= end + margin)
@@ -113,11 +109,6 @@ def _margin(near: Floats, quiet_sd: Floats) -> float:
     _, r = _place_and_colour(time, accel, quiet_sd)
     tau = -float(np.median(np.diff(time))) / np.log(r) if r else 0.0
     return float(np.clip(60.0 * tau, _MARGIN_S, 100.0))
-
-
-def _seconds(stamp_ns: Ints, start_ns: int) -> Floats:
-    since: Floats = (stamp_ns - start_ns).astype(np.float64) * 1e-9
-    return since
 
 
 def _examine(
@@ -147,8 +138,7 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # The noise is estimated from differences of neighbouring samples, which do not depend on a
-    # drift.
+    # Differences of neighbouring samples do not depend on a drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -164,24 +154,16 @@ def _examine(
     # If the unit is handled, the samples scatter far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
-    warmed, warmed_sd = _temperature_step(bag, time[0], time[at], time[-1])
     x, y, z = step.tolist()
-    return Jump(
-        time=float(time[at]),
-        duration_s=float(time[at] - time[at - 1]),
-        step=(x, y, z),
-        along=along,
-        temperature_change=warmed,
-        temperature_change_sd=warmed_sd,
-    )
+    duration_s = float(time[at] - time[at - 1])
+    warmed = _temperature_step(bag, time[0], time[at], time[-1])
+    return Jump(float(time[at]), duration_s, (x, y, z), along, *warmed)
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """
-    Return the sd of a mean over that for white noise of `sd`, for each axis, at least 1. The
-    residuals, shape (n, 3), are averaged to 40 pieces, whose variance is multiplied by (1 + r) /
-    (1 - r), r being their lag-1 correlation.
-    """
+    """Return the sd of a mean over that for white noise of `sd`, for each axis, at least 1."""
+    # The variance of 40 pieces' means is multiplied by (1 + r) / (1 - r), r being their lag-1
+    # correlation.
     size = max(len(residual) // 40, 1)
     n = len(residual) // size
     means = residual[: n * size].reshape(n, size, 3).mean(axis=1)
@@ -194,7 +176,7 @@ def _correlation(residual: Floats, sd: Floats) -> Floats:
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
     """Estimate the step of the board's readings at the time of a jump, and its sd [K]."""
-    time = _seconds(bag.board.stamp_ns, bag.start_ns)
+    time = np.asarray(bag.board.stamp_ns - bag.start_ns, dtype=np.float64) * 1e-9
     use = (time >= begin) & (time <= end)
     time, value = time[use], bag.board.value[use]
     if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
@@ -271,9 +253,6 @@ def _trend(time: Floats, r: float = 0.0) -> Floats:
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
     """Return the angle of rotation within 1 s of the step, about the level on each side [rad]."""
-    levels = (np.median(gyro[:at], axis=0), np.median(gyro[at:], axis=0))
-    dt = np.diff(time)
-    angle = np.zeros(3)
-    for i in np.flatnonzero(np.abs(time[1:] - time[at]) <= 1.0):
-        angle += (gyro[i + 1] - levels[int(i + 1 >= at)]) * dt[i]
-    return float(np.linalg.norm(angle))
+    about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
+    turned = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
+    return float(np.linalg.norm(turned[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

@@ -81,9 +81,7 @@ class KnownForce:
         return size.spin**2 / size.norm(gravity) * self.radius_sd / self.radius
 
     def of(self, start_ns: int, end_ns: int, first_ns: int) -> Magnitude:
-        """
-        Return |f| of a rest, given the rest's stamps and the stamp of the bag's first sample.
-        """
+        """Return |f| of a rest, given its stamps and the stamp of the bag's first sample."""
         if self.stamp_ns is None or self.rate is None:
             middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
             for section in self.sections:
@@ -159,11 +157,8 @@ def parse_sections(text: str) -> tuple[Section, ...]:
     Read a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, in seconds since the first
     sample and m/s^2. A semicolon also ends a line of the text; a # begins a comment.
     """
-    lines = [
-        line.split('#')[0].replace(',', ' ').split()
-        for line in text.replace(';', '\n').split('\n')
-    ]
-    rows = [_numbers(line) for line in lines if line]
+    lines = text.replace(',', ' ').replace(';', '\n').split('\n')
+    rows = [_numbers(words) for line in lines if (words := line.split('#')[0].split())]
     if len(rows) == 1 and len(rows[0]) < 3:
         return (_section(0.0, math.inf, *rows[0]),)
     if not rows or not all(len(row) in (3, 4) for row in rows):
@@ -186,19 +181,18 @@ def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Sect
 
 
 def _numbers(words: list[str]) -> list[float]:
+    text = repr(' '.join(words)[:60])
     try:
         values = [float(word) for word in words]
     except ValueError as error:
-        raise ValueError(f'expected numbers, got {" ".join(words)[:60]!r}') from error
+        raise ValueError(f'expected numbers, got {text}') from error
     if not all(map(math.isfinite, values)):
-        raise ValueError(f'expected finite numbers, got {" ".join(words)[:60]!r}')
+        raise ValueError(f'expected finite numbers, got {text}')
     return values
 
 
 def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
-    """
-    Read |f| as a value with unit, or as a table from a file; a line may begin with a bag's name.
-    """
+    """Read |f| as a value with unit, or from a table whose lines may begin with a bag's name."""
     table = Path(text)
     if not table.is_file():
         return (_section(0.0, math.inf, parse_acceleration(text)),)
@@ -209,8 +203,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     mine: list[str] = []
     for line in content.splitlines():
         first, _, rest = line.strip().replace(',', ' ').partition(' ')
-        is_named = bool(first) and first[0] != '#' and not first[0].isdigit() and first[0] != '.'
-        if not is_named:
+        if not first or first[0] in '#.' or first[0].isdigit():
             mine.append(line)
         elif fnmatch(path.name, first):
             mine.append(rest)
@@ -240,6 +233,5 @@ def _rotating(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForce:
     stamp_ns, rate = np.concatenate(stamps), np.concatenate(rates)
     if not len(rate) or not np.isfinite(rate).all():
         raise ValueError(f'{names[0]} has no messages, or a rate that is not finite')
-    return KnownForce(
-        *(str(path), (), stamp_ns, rate), *(asked.radius or 0.0, asked.radius_sd or 0.0)
-    )
+    radius, radius_sd = asked.radius or 0.0, asked.radius_sd or 0.0
+    return KnownForce(str(path), (), stamp_ns, rate, radius, radius_sd)

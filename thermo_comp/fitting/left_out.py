@@ -41,9 +41,6 @@ from .unknowns import State
 _FEWEST_WINDOWS = 8
 # Logarithms of mean square errors that differ by less than this count as equal: 5 % of an RMS.
 _EQUAL = 0.1
-# Ratio of an RMS drift to white noise up to which noise explains the drift. In a soak, changes of
-# the temperature by hundredths of a kelvin, whose lag is not known, add to the white noise.
-_NOISE = 1.7
 
 
 @dataclass(frozen=True)
@@ -64,8 +61,7 @@ class Folds:
         known = np.isfinite(square)
         count = np.bincount(fold, np.where(known, windows, 0.0))
         total = np.bincount(fold, np.where(known, square * windows, 0.0))
-        with np.errstate(invalid='ignore'):
-            square = total / np.where(count > 0.0, count, np.nan)
+        square = total / np.where(count > 0.0, count, np.nan)
         return cls(square, np.bincount(fold, windows).astype(np.float64))
 
     @property
@@ -73,7 +69,7 @@ class Folds:
         """RMS error over all windows of the folds [m/s^2]; NaN without folds."""
         known = np.isfinite(self.square)
         if not known.any():
-            return float('nan')
+            return np.nan
         return float(np.sqrt(np.average(self.square[known], weights=self.windows[known])))
 
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
@@ -92,8 +88,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The scatter of a single fold is unknown: the smallest difference that counts is taken
-            # as its error.
+            # The scatter of a single fold is unknown: the smallest difference that counts.
             return of_sums, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
@@ -107,7 +102,9 @@ class Folds:
         """Whether white noise explains the errors in the folds that another model has as well."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
-        return bool(square <= (_NOISE * noise) ** 2)
+        # Up to 1.7 times the noise: in a soak, changes of the temperature by hundredths of a
+        # kelvin, whose lag is not known, add to the white noise.
+        return bool(square <= (1.7 * noise) ** 2)
 
 
 @dataclass(frozen=True)
@@ -140,18 +137,15 @@ class Score:
 
     @property
     def rms(self) -> float:
-        """
-        RMS of the left-out drift: the larger of the RMS of positions and the RMS of sections.
-        """
+        """RMS of the left-out drift: the larger of those of positions and of sections."""
         known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
         return max(known, default=float('nan'))
 
 
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
     """
-    Whether the second model is better on left-out data by more than the standard error. Halves of
-    the program limit the number of columns, so `by_halves` is false for models of the same
-    columns.
+    Whether the second model is better on left-out data by more than the standard error;
+    `by_halves`: false for models of the same columns, whose number the halves limit.
     """
     return gain(before, after, by_halves=by_halves) > 0.0
 
@@ -206,8 +200,8 @@ def _gains(before: Score, after: Score) -> list[tuple[float, float] | None]:
 def score_of(regression: Regression, posterior: Posterior) -> Score:
     """Score a model on left-out positions, sections and halves of the program."""
     regression.whiten(posterior.prior.noise)
-    n_sections = regression.windows.n_sections
-    numbers = np.arange(n_sections if n_sections > 1 else 0)
+    last = int(regression.windows.section.max())
+    numbers = np.arange(last + 1 if last else 0)
     positions, norms, force, drift = _by_positions(regression, posterior)
     sections, section_drift = _by_sections(regression, posterior, numbers[:, None])
     halves = np.array_split(numbers, 2) if len(numbers) else []
@@ -248,14 +242,10 @@ def _by_positions(
 
 
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
-    """
-    Return, to first order, the state of a fit with other normal equations, and the root of the
-    state's covariance, see `Posterior`.
-    """
+    """Return a fit's state to first order, and its root, see `Posterior`, by other equations."""
     step, factor = point.unit_step(matrix)
-    full_step = np.zeros(point.layout.n)
-    full_step[: point.layout.n_unit] = step
-    return point.moved(full_step).state, inverse_root(factor)
+    step = np.pad(step, (0, point.layout.n - point.layout.n_unit))
+    return point.moved(step).state, inverse_root(factor)
 
 
 def _is_determined(by_others: float, by_all: float) -> bool:
@@ -267,22 +257,17 @@ def _is_determined(by_others: float, by_all: float) -> bool:
 
 
 def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
-    """
-    Whether a fit without a position determines the position's drift; `root` as in `Posterior`.
-    """
-    regression, layout, sigma = point.regression, point.layout, point.prior.sigma
-    in_bias, in_scale = layout.used
-    if not in_bias.any():
+    """Whether a fit without a position determines its drift; `root` as in `Posterior`."""
+    regression, sigma = point.regression, point.prior.sigma
+    if not point.layout.used[0].any():
         return True
     # Every n-th window of the position is used: 50 windows are sufficient for the variance.
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
-    force = regression.along_axes(point.state)[p]
+    force = regression.effects(point.state).force[p]
     by_others = by_all = 0.0
-    for axis in range(3):
-        along = np.hstack((some[:, in_bias], force[axis] * some[:, in_scale]))
-        at = layout.axis[axis, 2 : 2 + along.shape[1]]
+    for along, at in point.layout.by_weights(some, force):
         by_others += float(np.sum((along @ root[at]) ** 2))
         by_all += float(np.sum((along @ posterior.root[at]) ** 2))
     noise = float(np.sum(sigma**2)) * len(some)
@@ -290,9 +275,7 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
 
 
 def _is_norm_determined(point: Point, posterior: Posterior, root: Floats, p: int) -> bool:
-    """
-    Whether a fit without a position determines the position's norm; `root` as in `Posterior`.
-    """
+    """Whether a fit without a position determines its norm; `root` as in `Posterior`."""
     if not point.regression.gravity:
         return False
     along = point.norms_by_unit[p]
@@ -319,13 +302,11 @@ def _by_sections(
     squares, counts = np.full(len(folds), np.nan), np.zeros(len(folds))
     for k, fold in enumerate(folds):
         point = regression.at(posterior.state, posterior.prior, products.without(fold))
-        # Two Gauss-Newton steps from the fit of all data are sufficient for the fit without a
-        # section.
+        # Two Gauss-Newton steps from the fit of all data suffice.
         for _ in range(2):
             point = point.moved(point.solution[0])
         force = regression.force(point.state)
-        gone = np.isin(windows.section, fold)
-        judged = gone
+        judged = gone = np.isin(windows.section, fold)
         if is_within:
             t = windows.columns[:, 0]
             judged = gone & (t >= t[~gone].min()) & (t <= t[~gone].max())

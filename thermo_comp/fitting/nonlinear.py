@@ -10,7 +10,7 @@ the prior sd.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -21,7 +21,7 @@ from ..typing import Floats
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.nonlinearity import POWERS, Kind, Nonlinearity, NonlinearTerm, linearised, unit_of
 from ..unit.posterior import Posterior as FilePosterior
-from .data_checks import Finding
+from .data_checks import Finding, advice
 from .hyperparameters import LEAST_GAIN
 from .left_out import Score, score_of
 from .options import FitOptions
@@ -60,9 +60,7 @@ class Forces:
     radius_sd: float = 0.0
 
     def norms(self, radius: Floats, stretch: Floats) -> Floats:
-        """
-        Return |f| of each position, given the relative errors of the radius and of the stated |f|.
-        """
+        """Return |f| of each position, given relative errors of the radius and of |f|."""
         turned = self.spin * (1.0 + radius.sum())
         return np.asarray(np.hypot(self.still, turned) * (1.0 + stretch.sum(axis=1)))
 
@@ -114,8 +112,7 @@ def with_forces(
     The windows stay unchanged if |f| is within 1e-3 of gravity in all positions, and neither the
     options nor the prior have nonlinear terms.
     """
-    still, spin, sd = np.full((3, windows.data.n_positions), 0.0)
-    still[:] = options.gravity
+    still, spin, sd = np.outer((options.gravity, 0.0, 0.0), np.ones(windows.data.n_positions))
     for p, (bag, rest) in enumerate(windows.rests):
         if (known := bag.source.force) is not None:
             first_ns = bag.start_ns - round(bag.since_s * 1e9)
@@ -154,11 +151,9 @@ def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
 
 
 def starting_sd(forces: Forces, options: FitOptions) -> Floats:
-    """
-    Return the prior sd of the initial nonlinear terms: square and cube; 0 for the odd square.
-    """
-    is_initial = np.array([kind != 'odd_square' for kind in forces.kinds])
-    return np.asarray(prior_sd(forces.kinds, options) * np.tile(is_initial, 2))
+    """Return the initial prior sd of the nonlinear terms: 0 for the odd square, (2 k,)."""
+    is_initial = np.array([kind != 'odd_square' for kind in forces.kinds] * 2)
+    return np.asarray(prior_sd(forces.kinds, options) * is_initial)
 
 
 class _TermFits:
@@ -179,9 +174,7 @@ class _TermFits:
         return score_of(self._regression, self.posterior(used))
 
     def term(self, kind: int) -> _Active:
-        """
-        Return the indices of a term's coefficients: at the reference temperature, and per kelvin.
-        """
+        """Return the indices of a term's coefficients: at the reference, and per kelvin."""
         return frozenset((kind, self._n_kinds + kind))
 
     def loss(self, used: _Active, gone: _Active) -> float:
@@ -263,7 +256,8 @@ def of_file(
     # The file's range of |f| is 1 % wider at either end than the range of the positions.
     low, high = 0.99 * float(sizes.min()), 1.01 * float(sizes.max())
     if known:
-        low, high = min(low, known.force_range_m_s2[0]), max(high, known.force_range_m_s2[1])
+        lower, upper = known.force_range_m_s2
+        low, high = min(low, lower), max(high, upper)
     sd = known.beyond_sd_g_g2 if known else options.nonlinear_sd('square')
     kept = known.terms if known else terms
     blank = (replace(term, coefficient=(0.0,) * 3, per_kelvin=(0.0,) * 3) for term in kept)
@@ -289,12 +283,10 @@ def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
     factor = np.insert(posterior.matrix, [at] * len(sd), 0.0, axis=0)
     variances = np.insert(posterior.variances, [at] * len(sd), sd**2)
     terms = tuple(blank_term(kind, options.nonlinear_sd(kind)) for kind in kinds)
-    gravity = calibration.gravity_m_s2
+    near = 0.99 * calibration.gravity_m_s2, 1.01 * calibration.gravity_m_s2
     return replace(
         calibration,
-        nonlinearity=Nonlinearity(
-            (0.99 * gravity, 1.01 * gravity), options.nonlinear_sd('square'), terms
-        ),
+        nonlinearity=Nonlinearity(near, options.nonlinear_sd('square'), terms),
         posterior=FilePosterior.of(factor, variances),
     )
 
@@ -309,20 +301,17 @@ def without_terms(calibration: Calibration) -> Calibration:
     return replace(calibration, nonlinearity=None, posterior=posterior)
 
 
-def judge_terms(calibration: Calibration) -> list[Finding]:
+def judge_terms(calibration: Calibration) -> Iterator[Finding]:
     """Advise more positions if the data do not determine some nonlinear terms."""
-    nonlinearity = calibration.nonlinearity
-    if nonlinearity is None:
-        return []
-    undetermined = [
+    terms = calibration.nonlinearity.terms if calibration.nonlinearity else ()
+    undetermined = ', '.join(
         f'{term.kind} (effective parameters {term.effective_parameters:.1f} of 6)'
-        for term in nonlinearity.terms
+        for term in terms
         if term.effective_parameters < 3.0 * _DETERMINED
-    ]
-    if not undetermined:
-        return []
-    text = (
-        f'the positions do not determine the nonlinearity: {", ".join(undetermined)} stays near '
-        'its prior; positions at several |f| above 1 g determine it'
     )
-    return [Finding('nonlinearity', 'advice', text)]
+    if undetermined:
+        yield advice(
+            'nonlinearity',
+            f'the positions do not determine the nonlinearity: {undetermined} stays near its '
+            'prior; positions at several |f| above 1 g determine it',
+        )

@@ -39,15 +39,11 @@ COUNTS_FULL_SCALE = 32767.0
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
 #: Groups of columns that the fit selects: the curve, the difference of the two sets, the curves
 #: over the temperatures of parts, the groups of the thermal response.
-GROUPS = tuple(
-    dict.fromkeys(
-        (
-            'curve',
-            'set',
-            'part',
-            *(column.group for column in bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))),
-        )
-    )
+GROUPS = (
+    'curve',
+    'set',
+    'part',
+    *dict.fromkeys(column.group for column in bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))),
 )
 #: Names of the refusals of data that a user can allow.
 REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
@@ -162,12 +158,12 @@ class FitOptions:
 
 def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
     """Choose the families of curves of the two sets."""
-    readings = [bag.board.value for bag in bags if len(bag.board.value)]
-    if not readings:
+    celsius = np.concatenate([bag.board.value for bag in bags])
+    if not len(celsius):
         line = _family('linear', 0.0, 0.0)
         return Sets(line, line)
-    span = (min(float(r.min()) for r in readings), max(float(r.max()) for r in readings))
-    lower, upper = (edge - options.reference_temperature for edge in span)
+    edges = float(celsius.min()), float(celsius.max())
+    lower, upper = (edge - options.reference_temperature for edge in edges)
     is_paper = options.model == 'golovach'
     static = options.static_curve or ('linear' if is_paper else 'cubic')
     dynamic = options.dynamic_curve or ('quadratic' if is_paper else None)

@@ -22,8 +22,6 @@ from ..unit.columns import Column, Part
 
 #: Highest power in the curves of x, the temperature of a part.
 ORDER = 3
-#: Kinds of the columns of the powers m, m^2 and m^3 of a part's lag m.
-_OF_LAG = 'board', 'square', 'cube'
 
 
 class PartCurves(NamedTuple):
@@ -56,19 +54,21 @@ def curves_of(parts: Sequence[Part], columns: Sequence[Column], n_curves: int) -
     places = {
         (column.kind, column.power, column.part): n_curves + k for k, column in enumerate(columns)
     }
+    # Kinds of the columns of the powers m, m^2 and m^3 of a part's lag m.
+    kinds = 'board', 'square', 'cube'
+    powers = np.arange(1, ORDER + 1)
     rows = []
     for part in parts:
-        for power in range(1, ORDER + 1):
+        for power in powers.tolist():
             row = np.zeros(n_curves + len(columns))
             row[power - 1] = 1.0
-            for k, kind in enumerate(_OF_LAG[:power] if part.tau_s else (), 1):
+            for k, kind in enumerate(kinds[:power] if part.tau_s else (), 1):
                 if (place := places.get((kind, power - k, part))) is None:
                     return curves_of((), columns, n_curves)
                 row[place] = math.comb(power, k) * (-1.0) ** k
             rows.append(row)
-    axes, powers = range(len(parts)), range(1, ORDER + 1)
     return PartCurves(
-        np.repeat(np.array(axes, np.int64), ORDER),
-        np.tile(np.array(powers, np.int64), len(parts)),
+        np.repeat(np.arange(len(parts)), ORDER),
+        np.tile(powers, len(parts)),
         np.array(rows).reshape(-1, n_curves + len(columns)),
     )

@@ -89,17 +89,12 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     for shape in _SHAPES:
         if shape.has_gradient and not windows.gradient.any():
             continue
-
-        def curves(n_windows: int, *, shape: _Shape = shape) -> _PartCurves:
-            rows = slice(None, None, max(len(data.time) // n_windows, 1))
-            return _PartCurves(windows, start, rows, shape)
-
-        # Every k-th window is used: 500 windows are sufficient for the search, 3000 for its
-        # result.
-        searched = curves(500).lags(noise)
+        # 500 windows are sufficient for the search, 3000 for its result.
+        searched = _PartCurves(windows, start, shape, 500).lags(noise)
         if searched is None:
             continue
-        subset, full = curves(3000), curves(len(data.time))
+        sizes = 3000, len(data.time)
+        subset, full = (_PartCurves(windows, start, shape, n) for n in sizes)
         lags = [subset.near(lag, axis) for axis, lag in enumerate(searched)]
         residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
@@ -120,15 +115,15 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
-
-    `rows`: the windows that the search uses
+    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags,
+    in every k-th window, so that `n_windows` or more are used.
     """
 
     def __init__(
-        self, windows: ThermalWindows, start: ConstantCalibration, rows: slice, shape: _Shape
+        self, windows: ThermalWindows, start: ConstantCalibration, shape: _Shape, n_windows: int
     ) -> None:
         data, columns = windows.data, windows.model.columns
+        rows = slice(None, None, max(len(data.time) // n_windows, 1))
         of_board = [k for k, column in enumerate(columns) if column.group == 'board']
         _, self._first, self._position = np.unique(
             data.position[rows], return_index=True, return_inverse=True
@@ -217,11 +212,10 @@ class _PartCurves:
         self, axis: int, first: Part, steps: tuple[float, float, float], accuracy: float = 0.01
     ) -> Part:
         """
-        Return the lag of the smallest RMS residual by the simplex method.
+        Return the lag of the smallest RMS residual by the simplex method, begun at `first`.
 
-        `steps`: first steps of the logarithms of the time constants, and of the share of the
-        gradient; 0 for a value that remains that of the lag `first`
-        `accuracy`: of these values
+        `steps`: first steps of the logarithms of the time constants and of the share; 0 to keep
+        the value of `first`; `accuracy`: of these values
         """
         start = np.array([np.log(first.tau_s), np.log(first.second_tau_s or 1.0), first[2]])
         free = np.flatnonzero(steps)
@@ -261,9 +255,7 @@ class _PartCurves:
         return Part(tau, 0.0, sensor_share) if square(tau) < square(0.0) else Part(0.0)
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
-        """
-        Whether time constants larger or smaller by the ratio `_STEP` add 5 % to the RMS residual.
-        """
+        """Whether time constants longer or shorter by `_STEP` add 5 % to the RMS residual."""
         tau, second, share = lag
         others = [Part(ratio * tau, ratio * second, share) for ratio in (1.0 / _STEP, _STEP)]
         if not tau:
@@ -277,15 +269,17 @@ class _PartCurves:
 
     def residual(self, lag: Part, axis: int) -> Floats:
         """Return the residuals of one axis in all windows, shape (n,) [m/s^2]."""
-        series = self._series(lag, axis)
-        left = self._measured[:, axis] - series @ _solved(series, self._measured[:, axis])
-        return np.asarray(left / np.sqrt(self._weight[:, 0]))
+        return np.asarray(self._weighted(lag, axis) / np.sqrt(self._weight[:, 0]))
 
     def _square(self, lag: Part, axis: int) -> float:
         """Return the weighted sum of squared residuals of an axis."""
-        series, measured = self._series(lag, axis), self._measured[:, axis]
-        left = measured - series @ _solved(series, measured)
+        left = self._weighted(lag, axis)
         return max(float(left @ left), 1e-30)
+
+    def _weighted(self, lag: Part, axis: int) -> Floats:
+        """Return the residuals of one axis times the roots of the weights, shape (n,)."""
+        series, measured = self._series(lag, axis), self._measured[:, axis]
+        return np.asarray(measured - series @ _solved(series, measured))
 
     def _series(self, lag: Part, axis: int) -> Floats:
         """Return the weighted regressors of bias, scale factor and initial lags, shape (n, k)."""
@@ -304,21 +298,18 @@ class _PartCurves:
         inner = np.linspace(low, low + span, n_nodes)
         knots = np.pad(inner, 3, mode='edge')
         bias = BSpline.design_matrix(np.clip(x, low, low + span), knots, 3).toarray()
-        rows = np.arange(len(x))
         u = (x / span)[:, None]
         stress = (self._t - x)[:, None] * u ** np.arange(2.0 * self._shape.has_stress)
         if self._shape.has_gradient:
             bias = np.hstack((bias, self._case[:, None]))
         scale = self._force[:, [axis]] * np.hstack((u ** np.arange(1, 4), stress))
         # The lag of the part at the start of each bag is unknown and decays.
-        begin = np.zeros((len(x), int(self._bag[-1]) + 1))
-        begin[rows, self._bag] = np.exp(-self._age / max(lag[0], 1.0))
+        is_of_bag = self._bag[:, None] == np.arange(self._bag[-1] + 1)
+        begin = is_of_bag * np.exp(-self._age / max(lag.tau_s, 1.0))[:, None]
         return self._centred(np.hstack((bias, stress, scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """
-        Subtract the weighted mean over each position from values; multiply by the weights' roots.
-        """
+        """Subtract the weighted mean over each position; multiply by the weights' roots."""
         weighted = np.hstack((values, np.ones_like(self._weight))) * self._weight
         sums = np.add.reduceat(weighted, self._first, axis=0)
         level = sums[:, :-1] / sums[:, -1:]

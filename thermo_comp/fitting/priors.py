@@ -164,12 +164,10 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     # Nonlinear terms are left out: most units have none, because a centrifuge is needed to
     # determine them.
     calibrations = [
-        without_terms(calibration) if calibration.nonlinearity else calibration
-        for calibration in calibrations
+        each if each.nonlinearity is None else without_terms(each) for each in calibrations
     ]
     first = calibrations[0]
-    serials = {calibration.unit.serial for calibration in calibrations}
-    if len(serials) < len(calibrations):
+    if len({calibration.unit.serial for calibration in calibrations}) < len(calibrations):
         raise FitError('two of the calibrations are of one unit: give one of each unit')
     for calibration in calibrations:
         serial, unit = calibration.unit.serial, calibration.unit
@@ -234,25 +232,25 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return _on_common_lags(
             replace(column, tau_s=tau + second, second_tau_s=0.0, sensor_share=0.0)
         )
+    summands: list[tuple[Column, float]] = []
     if column.sensor_share:
         of_board = replace(column, sensor_share=0.0)
         of_sensor = replace(of_board, group='gradient_lag', kind='gradient_lag')
-        return [
-            (common, factor * part)
-            for each, factor in ((of_board, 1.0), (of_sensor, -column.sensor_share))
-            for common, part in _on_common_lags(each)
-        ]
-    if second and isinstance(lag, Lag):
+        summands = [(of_board, 1.0), (of_sensor, -column.sensor_share)]
+    elif second and isinstance(lag, Lag):
+        stages = (replace(column, tau_s=tau_s, second_tau_s=0.0) for tau_s in (tau, second))
+        summands = list(zip(stages, lag.shares, strict=True))
+    if summands:
         return [
             (common, share * part)
-            for tau_s, share in zip((tau, second), lag.shares, strict=True)
-            for common, part in _on_common_lags(replace(column, tau_s=tau_s, second_tau_s=0.0))
+            for summand, share in summands
+            for common, part in _on_common_lags(summand)
         ]
     if not isinstance(lag, Lag) or tau in FINE_TAUS:
         return [(column, 1.0)]
-    at = bisect(FINE_TAUS, column.tau_s)
+    at = bisect(FINE_TAUS, tau)
     if not at:
-        share = column.tau_s / FINE_TAUS[0]
+        share = tau / FINE_TAUS[0]
         shortest = replace(column, tau_s=FINE_TAUS[0])
         if column.term.is_temperature:
             return [(replace(column, tau_s=0.0), 1.0 - share), (shortest, share)]
@@ -263,25 +261,18 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     # polynomials.
     first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
     near = FINE_TAUS[first : first + 4]
-    return [
-        (
-            replace(column, tau_s=tau),
-            math.prod(
-                math.log(column.tau_s / other) / math.log(tau / other)
-                for other in near
-                if other != tau
-            ),
-        )
-        for tau in near
-    ]
+    result = []
+    for tau_s in near:
+        others = [other for other in near if other != tau_s]
+        share = math.prod(math.log(tau / other) / math.log(tau_s / other) for other in others)
+        result.append((replace(column, tau_s=tau_s), share))
+    return result
 
 
 def _relative_to(
     calibration: Calibration, like: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
-    """
-    Return a unit's parameters and covariance in the layout of `like`, for the mean scale factor.
-    """
+    """Return a unit's parameters and covariance in the layout of `like`, relative to `mean_K`."""
     if calibration.posterior is None:
         raise FitError(
             f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '
@@ -303,12 +294,11 @@ def _relative_to(
     others = np.arange(layout.nonlinear, len(values))
     placed[others - len(values) + into.n_parameters, others] = 1.0
     blocks = zip((*layout.bias, *layout.scale), (*into.bias, *into.scale), strict=True)
-    for block_of_unit, block in blocks:
-        n = block_of_unit.response - block_of_unit.static
-        placed[block.static : block.response, block_of_unit.static : block_of_unit.response] = (
-            np.eye(n)
+    for old, new in blocks:
+        placed[new.static : new.response, old.static : old.response] = np.eye(
+            old.response - old.static
         )
-        placed[block.response : block.end, block_of_unit.response : block_of_unit.end] = terms
+        placed[new.response : new.end, old.response : old.end] = terms
     placed = placed * factor
     return placed @ values, placed @ calibration.posterior.covariance() @ placed.T
 
@@ -325,20 +315,16 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
     """Return a calibration with the union of the ranges and the given columns, all weights 0."""
     first = calibrations[0]
-    slow = [
-        [axis.residual_sd_m_s2 for axis in calibration.static.axes()]
-        for calibration in calibrations
-    ]
+    slow = [[axis.residual_sd_m_s2 for axis in each.static.axes()] for each in calibrations]
+    usual = np.median(slow, axis=0).tolist()
     regimes = []
-    for k, regime in enumerate(first.regime_sets()):
-        each = [calibration.regime_sets()[k] for calibration in calibrations]
+    for each in zip(*(calibration.regime_sets() for calibration in calibrations), strict=True):
         x, y, z = (
-            replace(axis, residual_sd_m_s2=float(sd))
-            for axis, sd in zip(regime.axes(), np.median(slow, axis=0), strict=True)
+            replace(axis, residual_sd_m_s2=sd)
+            for axis, sd in zip(each[0].axes(), usual, strict=True)
         )
-        temperatures = union([regime.temperature_range_c for regime in each])
-        rates = union([regime.rate_range_k_min for regime in each])
-        regimes.append(RegimeSet(temperatures, rates, x, y, z))
+        temperatures = union(regime.temperature_range_c for regime in each)
+        regimes.append(RegimeSet(temperatures, union(r.rate_range_k_min for r in each), x, y, z))
     return replace(
         first,
         unit=replace(first.unit, serial=POPULATION),

@@ -1,12 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the checks of the raw data of a fit: serial numbers, samples and readings.
-"""
+"""Owns the checks of the raw data of a fit: serial numbers, samples and readings."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -23,9 +20,7 @@ from .reduction import ReducedBag
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """
-    Refuse a prior of another unit: the small uncertainties of a unit do not apply to another.
-    """
+    """Refuse a prior of another unit: a unit's small uncertainties do not apply to another."""
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:
@@ -39,7 +34,12 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
     """Check the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
-    part = sum(bag.n_saturated for bag in bags) / max(sum(bag.n_samples for bag in bags), 1)
+
+    def total(name: str) -> int:
+        return sum(getattr(bag, name) for bag in bags)
+
+    n_samples = max(total('n_samples'), 1)
+    part = total('n_saturated') / n_samples
     if part > 0.001:
         yield Finding(
             'saturation',
@@ -47,24 +47,20 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
             'it can measure, or --full-scale is wrong',
         )
-    n_samples = max(sum(bag.n_samples for bag in bags), 1)
-    n_dropped, n_repeated = (
-        sum(getattr(bag, name) for bag in bags) for name in ('n_dropped', 'n_repeated')
-    )
+    n_dropped = total('n_dropped')
     if n_dropped > 0.01 * n_samples:
+        why = 'was a clock set back?'
+        if 2 * total('n_repeated') > n_dropped:
+            why = 'does the driver send several samples with one stamp?'
         share = f'{100.0 * n_dropped / n_samples:.0f} % of the samples'
-        text = f'{share} are not finite, or have a stamp that does not rise, and are left out: '
-        if 2 * n_repeated > n_dropped:
-            text += 'does the driver send several samples with one stamp?'
-        else:
-            text += 'was a clock set back?'
-        yield advice('dropped', text)
-    if n := sum(bag.n_glitches for bag in bags):
+        text = f'{share} are not finite, or have a stamp that does not rise, and are left out'
+        yield advice('dropped', f'{text}: {why}')
+    if n := total('n_glitches'):
         yield advice(
             'glitches',
             f'{counted(n, "sample")} far from both neighbours, left out: does the bus lose bits?',
         )
-    still = sum(bag.n_still_cells for bag in bags) / max(sum(bag.n_cells for bag in bags), 1)
+    still = total('n_still_cells') / max(total('n_cells'), 1)
     if still < 0.5:
         yield advice(
             'motion',
@@ -75,17 +71,10 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         text = 'at rest all samples are equal: does the sensor repeat one reading?'
         yield advice('stuck', text)
     if dead := list(_dead_axes(bags)):
-        why = 'the axis is dead there, leave out a bag with a dead axis'
-        if top := _full_scale(bags, dead):
-            # A limit below the clipped reading, so that rounding does not exclude the reading.
-            limit = f'--full-scale {top * (1.0 - 1e-4):.5g}'
-            why = (
-                'the largest reading of the bags, with both signs or on several axes, is the full '
-                f'scale: leave out a clipped bag, or the clipped rests of a bag with {limit}'
-            )
         text = '; '.join(axis.text for axis in dead)
-        yield Finding('stuck', 'refusal', f'{text}: {why}')
-    size = _typical_size(bags)
+        yield Finding('stuck', 'refusal', f'{text}: {_why_dead(bags, dead)}')
+    means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
+    size = float(np.median(np.linalg.norm(means, axis=1)))
     yield from _judge_thermometers(bags)
     yield from _judge_units(bags, size, options)
     jumps = [(bag, event) for bag in bags for event in find_jumps(bag)]
@@ -102,25 +91,17 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         yield advice('rate', text)
 
 
-def _typical_size(bags: Sequence[ReducedBag]) -> float:
-    """Return the median norm of the mean readings at rest [input units]."""
-    means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
-    return float(np.median(np.linalg.norm(means, axis=1)))
-
-
 def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
     """Check the readings of the thermometers."""
-    n_spikes: Counter[str] = Counter()
-    for bag in bags:
-        n_spikes.update(bag.n_spikes)
-    for name, n in sorted(n_spikes.items()):
-        if n:
+    names = sorted({name for bag in bags for name in bag.temperatures})
+    for name in names:
+        if n := sum(bag.n_spikes.get(name, 0) for bag in bags):
             yield advice(
                 'spikes',
                 f'temperature/{name}: {counted(n, "reading")} more than 10 K from the readings '
                 'before and after, left out: does the thermometer lose contact?',
             )
-    for name in sorted({name for bag in bags for name in bag.temperatures}):
+    for name in names:
         read = [b.temperatures[name].value for b in bags if name in b.temperatures]
         celsius = np.concatenate(read)
         if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
@@ -132,22 +113,22 @@ def _judge_units(
     bags: Sequence[ReducedBag], size: float, options: FitOptions
 ) -> Iterator[Finding]:
     """Check whether samples with this norm at rest are counts; `size`: [input units]."""
-    if options.input == 'counts' and not all(bag.is_integer for bag in bags):
-        for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
-            if abs(size / one_g - 1.0) < 0.1:
-                yield Finding(
-                    'units',
-                    'refusal',
-                    f'the samples have norm {size:.3g} and are no whole numbers: they look like '
-                    f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2',
-                )
-                break
-        else:
-            yield advice(
-                'compensated',
-                'the samples are no whole numbers: scaled or compensated before they were '
-                'recorded? A calibration made from scaled samples is valid for that scaling only',
+    if options.input != 'counts' or all(bag.is_integer for bag in bags):
+        return
+    for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
+        if abs(size / one_g - 1.0) < 0.1:
+            yield Finding(
+                'units',
+                'refusal',
+                f'the samples have norm {size:.3g} and are no whole numbers: they look like '
+                f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2',
             )
+            return
+    yield advice(
+        'compensated',
+        'the samples are no whole numbers: scaled or compensated before they were recorded? A '
+        'calibration made from scaled samples is valid for that scaling only',
+    )
 
 
 class _DeadAxis(NamedTuple):
@@ -158,16 +139,20 @@ class _DeadAxis(NamedTuple):
     text: str
 
 
-def _full_scale(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> float:
-    """
-    Return the magnitude of the dead axes' readings if it is the largest of all rests and occurs
-    with both signs or on several axes, as at the full scale; else 0.
-    """
+def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
+    """Explain constant readings: clipped, if they are the largest at several ends, or dead."""
     largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
     # The limits of a two's complement differ by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
-    return largest if is_at_top.all() and len(ends) > 1 else 0.0
+    if not largest or not is_at_top.all() or len(ends) == 1:
+        return 'the axis is dead there, leave out a bag with a dead axis'
+    # A limit below the clipped reading, so that rounding does not exclude the reading.
+    limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
+    return (
+        'the largest reading of the bags, with both signs or on several axes, is the full scale: '
+        f'leave out a clipped bag, or the clipped rests of a bag with {limit}'
+    )
 
 
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:

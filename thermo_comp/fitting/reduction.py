@@ -14,27 +14,34 @@ scatter of its samples implies.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ..errors import FitError
 from ..recording import stillness
 from ..recording.blocks import RecordingInfo
 from ..recording.causes import CauseCounter
 from ..recording.stillness import CellAccumulator, Cells
-from ..thermal.thermometer import HOTTEST
-from ..typing import Floats
+from ..thermal.thermometer import COLDEST, HOTTEST
+from ..typing import Bools, Floats, Ints
 from .coverage import best_rests, directions, distinct_directions, rough_centre
-from .readings import Readings, is_spike, thinned
 from .sources import FitSource, angular_velocity
+from .start import block_means
 
 #: Default length of a window of the fit [s].
 WINDOW_S = 10.0
+
+
+class Readings(NamedTuple):
+    """One thermometer's readings over a bag: rising stamps [ns] and temperatures [degC], (n,)."""
+
+    stamp_ns: Ints = np.empty(0, np.int64)
+    value: Floats = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,7 @@ class ReducedBag:
     since_s: start of the part of the bag that was read [s]
     restless: reason why the bag has no rests
     angular_rate: part of the bag that has finite angular rates
-    n_spikes: number of readings of each thermometer that are spikes, see `readings`
+    n_spikes: number of readings of each thermometer that are spikes, see `is_spike`
     n_glitches: number of single samples far from their neighbours, which are left out
     n_repeated: number of samples with the stamp of the sample before, among the dropped samples
     """
@@ -117,13 +124,8 @@ class ReducedBag:
 
 class _Pass:
     """
-    The result of one pass over the blocks of a source.
-
-    cells: statistics of the samples
-    temperatures: readings of each thermometer
-    n_spikes: number of readings of each thermometer that are spikes, see `readings`
-    causes: counters of causes that can explain the lack of a rest
-    has_rate: whether all blocks have a finite angular rate
+    One pass over the blocks of a source: cells of the samples, readings, causes that can explain
+    the lack of a rest; `has_rate`: whether all blocks have a finite angular rate.
     """
 
     def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
@@ -168,54 +170,61 @@ def reduce_source(
     still_sd: float = stillness.STILL_SD,
     full_scale: float | None,
     fewest_windows: int = 1,
-    least: int = stillness.MIN_SAMPLES,
 ) -> ReducedBag:
     """
     Read one source in blocks and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
-    is chosen in the same way. A cell has `least` samples; slow samples get shorter cells, of 10 or
-    5 samples, if longer cells interrupt or lose rests.
+    is chosen in the same way. Slow samples make cells so long that a bias which changes within
+    minutes looks like a motion, and that short rests are lost; they get shorter cells, of 10 or 5
+    samples, if these interrupt or lose fewer rests.
     """
-    reading = _Pass(source, CellAccumulator(min(cell_s, window_s), full_scale, window_s, least))
-    # The norms at rest are used to choose the thresholds only if |f| at rest is gravity.
-    cells = reading.cells if source.force is None else stillness.without_rotation(reading.cells)
+
+    def reduced(least: int) -> tuple[ReducedBag, float]:
+        accumulator = CellAccumulator(min(cell_s, window_s), full_scale, window_s, least)
+        return _reduced(source, accumulator, window_s, min_rest_s, still_sd, fewest_windows)
+
+    usual, usual_cell_s = reduced(stillness.MIN_SAMPLES)
+    if usual_cell_s <= 3.0:
+        return usual
+    share = usual.n_still_cells / usual.n_cells
+    if share < 0.95 and source.force is None:
+        # If rests are interrupted, shorter cells are used if these add 5 % of the bag to the
+        # rests.
+        shorter, _ = reduced(10)
+        if shorter.n_still_cells / shorter.n_cells > share + 0.05:
+            return shorter
+    if share < 0.5:
+        # If rests are short, shorter cells are used if these show six attitudes.
+        shorter, _ = reduced(5)
+        means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
+        means = means.reshape(-1, 3)
+        if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
+            return shorter
+    return usual
+
+
+def _reduced(
+    source: FitSource,
+    accumulator: CellAccumulator,
+    window_s: float,
+    min_rest_s: float | None,
+    still_sd: float,
+    fewest_windows: int,
+) -> tuple[ReducedBag, float]:
+    """Reduce a source with one length of the cells; return also this length [s]."""
+    reading = _Pass(source, accumulator)
+    cells = reading.cells
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
+        # The norms at rest are used to choose the thresholds only if |f| at rest is gravity.
+        cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
-    if least == stillness.MIN_SAMPLES and cells.cell_s > 3.0:
-        in_shorter_cells = partial(
-            reduce_source,
-            source,
-            window_s=window_s,
-            cell_s=cell_s,
-            min_rest_s=min_rest_s,
-            still_sd=still_sd,
-            full_scale=full_scale,
-            fewest_windows=fewest_windows,
-        )
-        still_part = sum(b - a for a, b in ranges) / len(cells.count)
-        shorter = _with_shorter_cells(source, still_part, in_shorter_cells)
-        if shorter is not None:
-            return shorter
     restless = reading.causes.cause(cells, still_sd)
     if not ranges and not restless:
         restless = f'no still interval: {_why_restless(cells, reading.n_samples, still_sd)}'
-    return _bag(source, reading, cells, ranges, window_s, fewest_windows, restless)
-
-
-def _bag(
-    source: FitSource,
-    reading: _Pass,
-    cells: Cells,
-    ranges: Sequence[tuple[int, int]],
-    window_s: float,
-    fewest_windows: int,
-    restless: str,
-) -> ReducedBag:
-    """Make the statistics of a bag from its cells and its rests, given as ranges of cells."""
     per_window = max(1, round(window_s / cells.cell_s)) if cells.cell_s else 1
     sizes = [min(per_window, max(1, (b - a) // fewest_windows)) for a, b in ranges]
     bag = ReducedBag(
@@ -235,8 +244,7 @@ def _bag(
         n_repeated=cells.n_repeated,
         n_cells=len(cells.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
-        # A bag without a usable sample has no cells; the length of its windows is that of the
-        # options.
+        # A bag without cells, that is, without a usable sample, has the windows of the options.
         window_s=round(per_window * cells.cell_s, 6) or window_s,
         cycle_s=cells.cell_s / float(np.median(cells.count)) if len(cells.count) else np.nan,
         is_integer=cells.is_integer,
@@ -245,34 +253,45 @@ def _bag(
         restless=restless,
         angular_rate='whole' if reading.has_rate else 'part' if cells.rate.any() else 'none',
     )
-    reader = source.reader()
-    return bag if reader is None else replace(bag, info=reader.info, since_s=reader.since_s)
+    if (reader := source.reader()) is not None:
+        bag = replace(bag, info=reader.info, since_s=reader.since_s)
+    return bag, cells.cell_s
 
 
-def _with_shorter_cells(
-    source: FitSource, share: float, reduced: Callable[..., ReducedBag]
-) -> ReducedBag | None:
+def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     """
-    Reduce a source of slow samples in shorter cells; None if cells of the usual length suffice.
+    Keep plausible readings with rising stamps; average readings that are less than 0.2 s apart.
 
-    `share`: the share of cells of the usual length that are at rest. Slow samples make cells so
-    long that a bias which changes within minutes looks like a motion, and that short rests are
-    lost.
+    No thermometer is faster than 0.2 s, and the recursion over all readings, in Python, is slow.
     """
-    if share < 0.95 and source.force is None:
-        # If rests are interrupted, shorter cells are used if these add 5 % of the bag to the
-        # rests.
-        shorter = reduced(least=10)
-        if shorter.n_still_cells / shorter.n_cells > share + 0.05:
-            return shorter
-    if share < 0.5:
-        # If rests are short, shorter cells are used if these show six attitudes.
-        shorter = reduced(least=5)
-        means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
-        means = means.reshape(-1, 3)
-        if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
-            return shorter
-    return None
+    stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
+    before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
+    use = (value >= COLDEST) & (value <= HOTTEST)
+    use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
+    stamp_ns, value = stamp_ns[use], value[use]
+    span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
+    size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
+    n = len(stamp_ns) // size * size if size > 1 else 0
+    if n:
+        first = stamp_ns[0]
+        middle = np.mean((stamp_ns[:n] - first).reshape(-1, size), axis=1)
+        stamp_ns = first + middle.astype(np.int64)
+        value = np.mean(value[:n].reshape(-1, size), axis=1)
+    return Readings(stamp_ns, value)
+
+
+def is_spike(value: Floats) -> Bools:
+    """
+    Return which readings are more than 10 K from the median of five readings, shape (n,).
+
+    A thermometer without contact reads -127 or 85 degC for a moment. The tracker rejects spikes,
+    unless spikes have increased the noise that a fit expects of the thermometer.
+    """
+    far = np.zeros(len(value), dtype=bool)
+    if len(value) > 4:
+        middle = np.median(sliding_window_view(value, 5), axis=1)
+        far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
+    return far
 
 
 def _max_abs(cells: Cells) -> float:
@@ -315,10 +334,8 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
 def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:
     """
     Join rests that are separated by a vibration without motion, if this happens six times or more,
-    as with a compressor that cycles.
-
-    Two rests are joined if a parabola describes the four cells on either side of the vibration,
-    with a mean squared residual below 4 variances.
+    as with a compressor that cycles: a parabola describes the four cells on either side of the
+    vibration, with a mean squared residual below 4 variances.
     """
     is_calm = stillness.is_under(cells, still_sd)
     result = ranges[:1]
@@ -354,11 +371,6 @@ def _windows(
     # A last window with less than 90 % of the usual samples is not of full length: the bag ended.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
-
-    def means(of_cells: Floats) -> Floats:
-        summed = np.add.reduceat(of_cells[rows] * count[:, None], offsets, axis=0)
-        return np.asarray(summed / total[:, None])
-
     return StillInterval(
         start_ns=cells.start_ns + round(cells.time[lower] * 1e9),
         end_ns=cells.start_ns + round(cells.time[upper - 1] * 1e9),
@@ -366,7 +378,7 @@ def _windows(
         n_whole=n_whole,
         time=np.add.reduceat(cells.time[rows] * count, offsets) / total,
         count=total,
-        mean=means(cells.mean),
+        mean=block_means(cells.mean[rows], count, offsets),
         sample_sd=np.sqrt(np.median(cells.variance[rows], axis=0)),
-        angular_rate=means(cells.rate) if has_rate else None,
+        angular_rate=block_means(cells.rate[rows], count, offsets) if has_rate else None,
     )

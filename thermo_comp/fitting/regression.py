@@ -133,11 +133,9 @@ class Point:
 
     @property
     def _common_variance(self) -> float:
-        """
-        Prior variance of the sum over the bags of an initial lag state. The sd of the mean over
-        the bags is 0.1 of the sd of one bag: if the mean differs from 0, the cause is an effect of
-        the unit, not the bags' initial states.
-        """
+        """Prior variance of the sum over the bags of an initial lag state."""
+        # The sd of the mean over the bags is 0.1 of that of one bag: a mean that differs from 0 is
+        # an effect of the unit.
         return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_share
 
     @cached_property
@@ -155,15 +153,12 @@ class Point:
         """Derivatives of each position's mean norm by the unit's unknowns, (n_positions, n)."""
         regression, state, layout = self.regression, self.state, self.layout
         products = regression.products(layout.used)
-        means = self.tangent.of(
-            regression.at_starts(products.means[:, None], state, products.base)
-        )[:, :, 0]
+        at_state = regression.at_starts(products.means[:, None], state, products.base)
+        means = self.tangent.of(at_state)[:, :, 0]
         result = np.zeros((len(means), layout.n_unit))
-        for axis in range(3):
-            places = layout.unit[axis, :-1]
-            result[:, places] += (
-                self.norm_by_axes[:, [axis]] * means[:, axis, -1 - len(places) : -1]
-            )
+        for axis, places in enumerate(layout.unit[:, :-1]):
+            of_unit = means[:, axis, -1 - len(places) : -1]
+            result[:, places] += self.norm_by_axes[:, [axis]] * of_unit
         return result
 
     def _reduced(self, normal: Normal) -> Reduced:
@@ -254,9 +249,7 @@ class Point:
         return result
 
     def posterior(self, end: Point) -> Posterior:
-        """
-        Return the posterior at `end`, a small step from this point, with this point's curvature.
-        """
+        """Return the posterior at `end`, near this point, with this point's curvature."""
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
         n, unit_root = layout.n_unit, inverse_root(factor)
@@ -323,7 +316,7 @@ class Regression(Equations):
         columns, at = np.unique(column, return_inverse=True)
         among, beside = self.products_of(columns, base)
         # Derivative of the reading by a unit of a column's effect on the bias and on the scale.
-        acts = np.stack((np.ones_like(state.up), state.kappa * self.along_axes(state)))
+        acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
         acts /= sigma
         rows = point.tangent.of(self.at_starts(beside, state, base))[:, :, at]
         rows *= (acts[part] / sigma).transpose(1, 2, 0)[..., None]

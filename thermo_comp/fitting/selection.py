@@ -56,6 +56,11 @@ class Trial:
     is_chosen: bool = False
     is_near: bool = False
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether noise explains the left-out drift."""
+        return self.score.rms <= 2.0 * float(self.posterior.prior.sigma.mean())
+
 
 @dataclass(frozen=True)
 class Selected:
@@ -83,11 +88,6 @@ class Fit(NamedTuple):
     def posterior(self) -> Posterior:
         """The fit of the chosen model."""
         return self.selected.posterior
-
-
-def _is_complete(trial: Trial) -> bool:
-    """Whether noise explains the left-out drift of a model."""
-    return trial.score.rms <= 2.0 * float(trial.posterior.prior.sigma.mean())
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
@@ -122,10 +122,15 @@ class Growth:
         return Trial(groups, score_of(self.regression, posterior), posterior, typical)
 
     def extended(
-        self, before: Trial, groups: tuple[str, ...] = (), typical: Floats | None = None
+        self, before: Trial, groups: tuple[str, ...] = (), most: Floats | None = None
     ) -> Trial:
-        """Fit a model with further groups, from the fit of the model without them."""
-        typical = before.typical if typical is None else typical
+        """
+        Fit a model with further groups, from the fit of the model without them.
+
+        `most`: largest typical prior sd of the new columns, shape (2, m), see `_typical`; None if
+        `before` has a typical sd of these columns
+        """
+        typical = before.typical if most is None else self._typical(before, groups, most)
         posterior = before.posterior
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
@@ -134,9 +139,7 @@ class Growth:
         trials: list[Trial] = []
         part = 1.0
         while True:
-            larger = self.trials(
-                chosen, [group for group in self.free if group not in chosen.groups]
-            )
+            larger = self.trials(chosen, self.free)
             trials += larger
             better = [trial for trial in larger if is_better(chosen.score, trial.score)]
             part *= 0.6
@@ -148,9 +151,8 @@ class Growth:
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
         """Fit a model with further groups, and then the same model with bends."""
         added = tuple(group for group in groups if group in self.free)
-        typical = self._typical(before, added, self._candidates.typical)
-        smooth = self.extended(before, added, typical)
-        return [smooth, *(self.trials(smooth, [BEND]) if BEND in self.free else [])]
+        smooth = self.extended(before, added, self._candidates.typical)
+        return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
         """
@@ -161,20 +163,19 @@ class Growth:
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
         typical, state = self._candidates.typical, constants.posterior.state
         number = np.cumsum(self._names == CURVE)
-        curves = [
-            self.fit(
-                (*constants.groups, CURVE), state, prior, np.where(number <= degree, typical, 0.0)
-            )
+        groups = *constants.groups, CURVE
+        chosen, *larger = (
+            self.fit(groups, state, prior, np.where(number <= degree, typical, 0.0))
             for degree in range(1, int(number[-1]) + 1)
-        ]
-        chosen = curves[0]
-        for curve in curves[1:]:
+        )
+        for curve in larger:
             if log_density(curve.posterior) - log_density(chosen.posterior) > TRIAL_GAIN:
                 chosen = curve
         return chosen
 
-    def trials(self, chosen: Trial, absent: list[str]) -> list[Trial]:
-        """Fit the chosen model plus each group with a large possible gain in log evidence."""
+    def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
+        """Fit the chosen model plus each free group of a large possible gain in log evidence."""
+        absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
         typical = self._candidates.typical
@@ -198,16 +199,12 @@ class Growth:
         tried = likely[:3]
         if chosen.groups == (CURVE,) and (SET,) in likely[3:]:
             tried.append((SET,))
-        return [
-            self.extended(chosen, groups, self._typical(chosen, groups, typical))
-            for groups in tried
-        ]
+        return [self.extended(chosen, groups, typical) for groups in tried]
 
     def _typical(self, chosen: Trial, groups: tuple[str, ...], most: Floats) -> Floats:
         """
-        Return the typical prior sd of a model with further groups.
-
-        The sd of a new column corresponds to the RMS residual of the chosen model, up to `most`.
+        Return the typical prior sd of a model with further groups: that of a new column
+        corresponds to the RMS residual of the chosen model, up to `most`.
         """
         regression, posterior = self.regression, chosen.posterior
         kelvins = regression.windows.kelvins
@@ -225,13 +222,10 @@ def better_beginning(fits: Sequence[Trial]) -> Trial:
     offsets and misalignments explain the norms of few positions equally well, but only
     misalignments predict the norm of another position.
     """
-    small, *others = fits
-    for large in others:
-        evidence_gain = log_density(large.posterior) - log_density(small.posterior)
-        is_likelier = evidence_gain > TRIAL_GAIN and not is_better(large.score, small.score)
-        if is_likelier or is_better(small.score, large.score):
-            return large
-    return small
+    small, large = fits[0], fits[-1]
+    evidence_gain = log_density(large.posterior) - log_density(small.posterior)
+    is_likelier = evidence_gain > TRIAL_GAIN and not is_better(large.score, small.score)
+    return large if is_likelier or is_better(small.score, large.score) else small
 
 
 def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
@@ -287,24 +281,21 @@ def select(
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
 ) -> tuple[Trial, list[Trial]]:
-    """
-    Add groups to the curve, or to the curves of parts; return the best model and all that were
-    tried.
-    """
+    """Add groups to the curve, or to the curves of parts; return the best model and all tried."""
     chosen, trials = first, []
     if parts is not None:
-        trials = [parts, *growth.trials(parts, [BEND] if BEND in growth.free else [])]
-        if GRADIENT in growth.free and not _is_complete(_best(chosen, trials)):
+        trials = [parts, *growth.trials(parts, [BEND])]
+        if GRADIENT in growth.free and not _best(chosen, trials).is_complete:
             trials.append(growth.extended(parts, (GRADIENT,)))
         chosen = _best(chosen, trials)
-    if growth.regression.windows.has_part_lags and not _is_complete(chosen):
+    if growth.regression.windows.acts_on is not None and not chosen.is_complete:
         tried = growth.with_bends(first, PART_SUMS)
         trials += tried
         chosen = _best(chosen, tried)
     chosen, tried = growth.added(chosen, progress)
     trials += tried
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
-    if is_without_bends and not _is_complete(chosen):
+    if is_without_bends and not chosen.is_complete:
         # A change of slope of a part is visible only in a model with the lag of this part, not in
         # a model whose products and squares approximate the lag. A model of bends is continued if
         # its drift is less than three times that of the chosen model.

@@ -15,12 +15,12 @@ from itertools import repeat
 from operator import itemgetter
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats
-from .readings import Readings
-from .reduction import ReducedBag
+from .reduction import Readings, ReducedBag
 
 # Interval of the grid of rates [s], and number of intervals on each side in a central difference.
 _BIN_S, _BINS_PER_SIDE = 10.0, 6
@@ -37,14 +37,11 @@ class Course:
     def is_resting(self) -> Bools:
         """Grid points that have no ramp within five minutes before and after."""
         moving = np.abs(self.rate) > max(0.2 * self.fastest, self.least_ramp)
-        near = np.convolve(moving, np.ones(61))[30:-30] > 0.5
-        return np.asarray(~near)
+        return np.asarray(np.convolve(moving, np.ones(61))[30:-30] < 0.5)
 
     @property
     def least_ramp(self) -> float:
-        """
-        Smallest rate that counts as a ramp [K/s]: 5 standard deviations of the noise of the rate.
-        """
+        """Smallest rate that counts as a ramp [K/s]: 5 sd of the noise of the rate."""
         return 5.0 * self.rate_sd
 
     @property
@@ -90,8 +87,7 @@ def learn_thermometer(
     lags = []
     for course in with_ramps:
         bend = np.abs(course.rate[_BINS_PER_SIDE:] - course.rate[:-_BINS_PER_SIDE])
-        steepest = float(np.quantile(bend, 0.995)) / (_BIN_S * _BINS_PER_SIDE)
-        if steepest > 0.0:
+        if (steepest := float(np.quantile(bend, 0.995)) / (_BIN_S * _BINS_PER_SIDE)) > 0.0:
             lags.append(course.fastest / steepest)
     lag = float(np.clip(np.median(lags), 30.0, 3600.0)) if lags else base.lag_s
     return replace(
@@ -105,9 +101,7 @@ def learn_thermometer(
 
 
 def quantum_of(values: Floats) -> float:
-    """
-    Find the quantum of a sensor's readings, shape (n,) [K]; 0 if the readings are not rounded.
-    """
+    """Find the quantum of a sensor's readings, shape (n,) [K]; 0 if they are not rounded."""
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -132,9 +126,7 @@ def _noise_of(values: Sequence[Floats], quantum: float) -> float:
 
 
 def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
-    """
-    Return the temperature rates of the bags with at least 30 readings and 6 intervals of the rate.
-    """
+    """Return the rates in bags with at least 30 readings and 6 intervals of the rate."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:
@@ -144,11 +136,8 @@ def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list
         n_bins = int(time[-1] / _BIN_S)
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a bin is the difference of the integral at the bin's edges over the bin's
-        # length.
-        integral = np.concatenate(
-            ([0.0], np.cumsum(0.5 * (readings.value[1:] + readings.value[:-1]) * np.diff(time)))
-        )
+        # The mean over a bin is the difference of the integral at its edges over its length.
+        integral = cumulative_trapezoid(readings.value, time, initial=0)
         edges = np.interp(np.arange(n_bins + 1) * _BIN_S, time, integral)
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side
         rate = (means[_BINS_PER_SIDE:] - means[:-_BINS_PER_SIDE]) / side
@@ -164,7 +153,7 @@ def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
     slowest = usual / 0.7
     for course in courses:
         is_ramp = np.abs(course.rate) > max(course.least_ramp, 0.1 / 60.0)
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], is_ramp.astype(np.int8), [0]))))
+        edges = np.flatnonzero(np.diff(is_ramp, prepend=False, append=False))
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             if (stop - start) * _BIN_S > 600.0:
                 middle = float(np.quantile(np.abs(course.rate[start:stop]), 0.9)) * 60.0
@@ -176,7 +165,7 @@ def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
     """Return the amplitude of the ambient ripple in soaks [K], from rates and lag."""
     rates = [course.rate[course.is_resting] for course in courses]
     resting = np.concatenate(rates) if rates else np.zeros(0)
-    if len(resting) < 60 or not courses:
+    if len(resting) < 60:
         return usual
     noise = float(np.median([course.rate_sd for course in courses]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
@@ -217,11 +206,12 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
     """Remove thermometers that repeat the board's readings in every bag; return their names."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
+    is_read = any(len(bag.board.value) for bag in bags)
     copies = [
         name
         for name in names
-        if all(np.array_equal(bag.temperatures[name].value, bag.board.value) for bag in bags)
-        and any(len(bag.board.value) for bag in bags)
+        if is_read
+        and all(np.array_equal(bag.temperatures[name].value, bag.board.value) for bag in bags)
     ]
     kept = [
         replace(bag, temperatures={k: v for k, v in bag.temperatures.items() if k not in copies})

@@ -24,9 +24,9 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -46,11 +46,8 @@ class Whitener:
         self._is_there = step < lengths
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
-        interval = np.zeros((n_steps, len(starts)))
-        interval[1:] = np.where(
-            self._is_there[1:], time[self._row[1:]] - time[self._row[:-1]], 0.0
-        )
-        self._interval = interval
+        since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])
+        self._interval = interval = np.where(self._is_there, since, 0.0)
         #: Candidate correlation times [s]: from 3 windows to a sixth of a position's length, in
         #: steps of half a decade.
         self.times_s: list[float] = []
@@ -67,43 +64,42 @@ class Whitener:
         """Whether a correlation time is within the range of the candidates."""
         return bool(self.times_s) and self.times_s[0] <= time_s <= self._longest_s
 
-    def gains(self, weight: Floats, noise: Noise) -> tuple[Floats, Floats, Floats]:
-        """Return decay, Kalman gain and sd of the innovation [sigma], (n_steps, n_positions)."""
-        white = 1.0 / weight[self._row]
-        gain, root = np.zeros_like(white), np.sqrt(white)
-        decay = np.exp(-self._interval / noise.time_s)
-        if noise.ratio <= 0.0:
-            return decay, gain, root
-        variance = np.full(white.shape[1], noise.ratio)
-        for k in range(len(white)):
-            if k:
-                variance = noise.ratio + decay[k] ** 2 * (variance - noise.ratio)
-            total = variance + white[k]
-            gain[k] = variance / total
-            root[k] = np.sqrt(total)
-            variance = variance * (1.0 - gain[k])
-        return decay, gain, root
+    def _innovations(
+        self, series: Floats, weight: Floats, ratio: Floats | float, time_s: Floats | float
+    ) -> Iterator[tuple[Ints, Bools, Floats, Floats]]:
+        """
+        Run the Kalman filter over series, shape (n, m), for one noise, or for k of shape (k, 1).
 
-    def filter(self, series: Floats, gains: tuple[Floats, Floats, Floats]) -> Floats:
-        """Whiten series, shape (n, k)."""
-        decay, gain, root = gains
-        result = np.empty_like(series)
-        if not gain.any():
-            scale = np.empty(self._n)
-            scale[self._row[self._is_there]] = 1.0 / root[self._is_there]
-            return np.asarray(series * scale[:, None])
-        level = np.zeros((self._row.shape[1], series.shape[1]))
-        for k, rows in enumerate(self._row):
-            level *= decay[k][:, None]
+        Yields, for each step, the window of each position, whether it is there, the innovations,
+        shape (..., n_positions, m), and their variances [sigma^2], shape (..., n_positions).
+        """
+        variance, level = ratio, 0.0
+        for rows, is_there, interval in zip(
+            self._row, self._is_there, self._interval, strict=True
+        ):
+            decay = np.exp(-interval / time_s)
+            variance = ratio + decay**2 * (variance - ratio)
+            total = variance + 1.0 / weight[rows]
+            level = level * decay[..., None]
             innovation = series[rows] - level
-            level += gain[k][:, None] * innovation
-            is_present = self._is_there[k]
-            result[rows[is_present]] = (innovation / root[k][:, None])[is_present]
+            yield rows, is_there, innovation, total
+            gain = variance / total
+            level = level + gain[..., None] * innovation
+            variance = variance * (1.0 - gain)
+
+    def filter(self, series: Floats, weight: Floats, noise: Noise) -> Floats:
+        """Whiten series, shape (n, m)."""
+        if noise.ratio <= 0.0:
+            return np.asarray(series * (1.0 / np.sqrt(1.0 / weight))[:, None])
+        result = np.empty_like(series)
+        for rows, is_there, innovation, total in self._innovations(series, weight, *noise):
+            result[rows[is_there]] = (innovation / np.sqrt(total)[:, None])[is_there]
         return result
 
-    def log_determinant(self, gains: tuple[Floats, Floats, Floats]) -> float:
+    def log_determinant(self, weight: Floats, noise: Noise) -> float:
         """Return the log determinant of the noise covariance, in units of sigma^2."""
-        return 2.0 * float(np.log(gains[2][self._is_there]).sum())
+        steps = self._innovations(np.empty((self._n, 0)), weight, *noise)
+        return float(sum(np.log(total[is_there]).sum() for _, is_there, _, total in steps))
 
     def estimate(self, residual: Floats, weight: Floats) -> Noise:
         """
@@ -131,24 +127,12 @@ class Whitener:
 
     def _deviances(self, residual: Floats, weight: Floats, noises: Sequence[Noise]) -> Floats:
         """Return -2 times the profile log likelihood of each noise, shape (n_noises,)."""
-        ratio = np.array([noise.ratio for noise in noises])[:, None]
-        time_s = np.array([noise.time_s for noise in noises])[:, None]
-        shape = len(noises), self._row.shape[1]
-        level, variance = np.zeros((*shape, 3)), np.broadcast_to(ratio, shape)
+        ratio, time_s = np.array(noises).T[..., None]
         square, size = np.zeros((len(noises), 3)), np.zeros(len(noises))
-        for k, rows in enumerate(self._row):
-            is_present = self._is_there[k]
-            decay = np.exp(-self._interval[k] / time_s)
-            if k:
-                variance = ratio + decay**2 * (variance - ratio)
-            total = variance + 1.0 / weight[rows]
-            level = level * decay[:, :, None]
-            innovation = residual[rows] - level
-            gain = variance / total
-            level = level + gain[:, :, None] * innovation
-            variance = variance * (1.0 - gain)
-            square += np.sum((innovation**2 / total[:, :, None])[:, is_present], axis=1)
-            size += np.log(total[:, is_present]).sum(axis=1)
+        steps = self._innovations(residual, weight, ratio, time_s)
+        for _, is_there, innovation, total in steps:
+            square += np.sum((innovation**2 / total[..., None])[:, is_there], axis=1)
+            size += np.log(total[:, is_there]).sum(axis=1)
         spread = np.log(np.maximum(square, 1e-300) / self._n).sum(axis=1)
         return np.asarray(3.0 * size + self._n * spread)
 
@@ -222,9 +206,9 @@ class Products:
     def without(self, sections: Ints) -> Floats:
         """Products of each position without some sections; their shape is that of `whole`."""
         result: Floats = self.whole.copy()
-        position = np.cumsum(np.isin(np.arange(len(self.cells)), self.first)) - 1
-        gone = np.isin(self.section, sections)
-        np.subtract.at(result, position[gone], self.cells[gone])
+        gone = np.flatnonzero(np.isin(self.section, sections))
+        position = np.searchsorted(self.first, gone, side='right') - 1
+        np.subtract.at(result, position, self.cells[gone])
         return result
 
 
@@ -255,12 +239,10 @@ class Series:
         self.start_root = vectors[:, kept] * np.sqrt(values[kept])
         self._first = windows.edges[:-1]
         self.level = self._averaged(self.measured)
-        others = (t, windows.tilt, self.measured - self.level[windows.position])
-        self._others = np.hstack((np.ones((len(t), 1)), *others))
-        self._n_t = t.shape[1]
-        new_cell = np.diff(windows.position, prepend=-1) != 0
-        new_cell |= np.diff(windows.section, prepend=-1) != 0
-        self._cells = np.flatnonzero(new_cell)
+        self._ones, self._n_t = np.ones((len(t), 1)), t.shape[1]
+        self._others = np.hstack((t, windows.tilt, self.measured - self.level[windows.position]))
+        cell = np.column_stack((windows.position, windows.section))
+        self._cells = np.flatnonzero(np.diff(cell, axis=0, prepend=-1).any(axis=1))
         self.whitener = Whitener(windows.position, windows.time)
         shares = 1.0 if windows.undisturbed is None else windows.undisturbed
         self.reweigh(windows.weight * shares)
@@ -269,34 +251,31 @@ class Series:
         """Use weights of the windows, shape (n,), in all products."""
         self.weight = weight
         self.noise: Noise | None = None
-        self._products: tuple[Bools, Products] | None = None
+        self._products: Products | None = None
 
     def whiten(self, noise: Noise) -> None:
         """Use a noise model, with which the series are whitened."""
         if noise == self.noise:
             return
-        self._gains = self.whitener.gains(self.weight, noise)
         self.noise, self._products = noise, None
-        self.noise_determinant = self.whitener.log_determinant(self._gains)
+        self._whitened = partial(self.whitener.filter, weight=self.weight, noise=noise)
+        self.noise_determinant = self.whitener.log_determinant(self.weight, noise)
 
     def products(self, used: Bools) -> Products:
         """Return the products of the active columns, shape (2, m), for the current noise."""
-        is_active: Bools = np.any(used, axis=0)
-        if self._products and np.array_equal(self._products[0], is_active):
-            return self._products[1]
-        n_tilts = self.windows.tilt.shape[1]
-        base = Base.of(np.flatnonzero(is_active), self.windows.lag, self._n_t, n_tilts)
-        series = self.of(base)
-        filtered = self.whitener.filter(series, self._gains)
-        result = Products(
-            base,
-            self._averaged(series),
-            np.stack([part.T @ part for part in np.split(filtered, self._cells[1:])]),
-            np.searchsorted(self._cells, self._first),
-            self.windows.section[self._cells],
-        )
-        self._products = is_active, result
-        return result
+        active = np.flatnonzero(used.any(axis=0))
+        if self._products is None or not np.array_equal(self._products.base.columns, active):
+            base = Base.of(active, self.windows.lag, self._n_t, self.windows.tilt.shape[1])
+            series = self.of(base)
+            parts = np.split(self._whitened(series), self._cells[1:])
+            self._products = Products(
+                base,
+                self._averaged(series),
+                np.stack([part.T @ part for part in parts]),
+                np.searchsorted(self._cells, self._first),
+                self.windows.section[self._cells],
+            )
+        return self._products
 
     def products_of(self, columns: Ints, base: Base) -> tuple[Floats, Floats]:
         """
@@ -304,7 +283,7 @@ class Series:
         shapes (n_positions, k, k) and (n_positions, k, n_base).
         """
         series = np.hstack((self.columns[:, columns], self.of(base)))
-        parts = np.split(self.whitener.filter(series, self._gains), self._first[1:])
+        parts = np.split(self._whitened(series), self._first[1:])
         k = len(columns)
         products = np.stack([part[:, :k].T @ part for part in parts])
         return products[..., :k], products[..., k:]
@@ -316,9 +295,8 @@ class Series:
 
     def of(self, base: Base) -> Floats:
         """Return the series of a base, shape (n, n_base)."""
-        constant, others = self._others[:, :1], self._others[:, 1:]
         at_start = self._starts[:, base.columns[base.moved]]
-        return np.hstack((constant, self.columns[:, base.columns], at_start, others))
+        return np.hstack((self._ones, self.columns[:, base.columns], at_start, self._others))
 
     def starts(self, state: State, base: Base) -> Floats:
         """Return the initial state of the lag of each moved column, (n_positions, n_moved) [K]."""
@@ -336,8 +314,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """
-        Apply `at_starts` to products of the base series, shape (n_positions, n_base, n_base).
-        """
+        """Apply `at_starts` to products of the base series, (n_positions, n_base, n_base)."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

@@ -120,16 +120,19 @@ def _refine(
 
 def position_means(windows: Windows) -> Floats:
     """Return the mean raw vector of each position, shape (n_positions, 3)."""
-    first = windows.edges[:-1]
-    total = np.add.reduceat(windows.weight, first)
-    weighted = np.add.reduceat(windows.mean * windows.weight[:, None], first, axis=0)
-    return np.asarray(weighted / total[:, None])
+    return block_means(windows.mean, windows.weight, windows.edges[:-1])
+
+
+def block_means(values: Floats, weight: Floats, first: Ints) -> Floats:
+    """Return the weighted means of blocks of rows, (n, k), that begin at the rows `first`."""
+    total = np.add.reduceat(weight, first)
+    return np.asarray(np.add.reduceat(values * weight[:, None], first, axis=0) / total[:, None])
 
 
 def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     """
-    Return the white noise of the windows of each axis [m/s^2], shape (3,), from second differences
-    of windows, which do not depend on a linear drift; 0 if no position has three windows.
+    Return the windows' white noise of each axis [m/s^2], shape (3,), from second differences,
+    which do not depend on a linear drift; 0 if no position has three windows.
 
     In fast ramps the second differences contain the drift; then fourth or sixth differences are
     much smaller, and taken.

@@ -70,23 +70,19 @@ class Tangent:
         (n_positions, n_base, n_base).
         """
         first, turned = self.n_local, products[:, None] @ self.combined
+        place = self.place[first:]
+        n, bias = len(place), slice(1, 1 + self.n_bias)
+        scale = slice(bias.stop, bias.stop + self.n_scale)
         # Sums over the positions of the products, times powers of the factor of the scale's
         # weights.
-        bias = slice(first + 1, first + 1 + self.n_bias)
-        scale = slice(bias.stop, bias.stop + self.n_scale)
         powers = np.stack([self.scale**k for k in range(3)])
         sums = np.tensordot(powers.transpose(2, 0, 1), products, 1)
-        n = len(self.place) - first
         unit = np.empty((3, n, n))
         for rows, columns, k in ((bias, bias, 0), (bias, scale, 1), (scale, scale, 2)):
-            block = sums[:, k, self.place[rows, None], self.place[columns]]
-            at, beside = (
-                slice(columns_of.start - first, columns_of.stop - first)
-                for columns_of in (rows, columns)
-            )
-            unit[:, at, beside] = block
-            unit[:, beside, at] = np.swapaxes(block, 1, 2)
-        others = np.array([0, *range(scale.stop - first, n)])
+            block = sums[:, k, place[rows, None], place[columns]]
+            unit[:, rows, columns] = block
+            unit[:, columns, rows] = np.swapaxes(block, 1, 2)
+        others = np.array([0, *range(scale.stop, n)])
         rows_of = self._rows(np.append(np.arange(first), first + others), products, turned)
         of_others = rows_of[:, :, first:, first:].sum(axis=0)
         unit[:, others] = of_others
@@ -110,12 +106,8 @@ class Tangent:
 
     def at(self, places: Ints) -> Tangent:
         """Return the equations of some positions."""
-        return replace(
-            self,
-            combined=self.combined[places],
-            factor=self.factor[places],
-            scale=self.scale[places],
-        )
+        kept = {name: getattr(self, name)[places] for name in ('combined', 'factor', 'scale')}
+        return replace(self, **kept)
 
     def of(self, rows: Floats) -> Floats:
         """

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -26,11 +27,9 @@ MISALIGNMENT_SD = 1e-3
 
 def misalignment_scale(noise: float) -> float:
     """
-    Return the built-in prior sd of an element of the misalignment [rad], for a sensor with this
-    noise in 1 Hz [m/s^2].
-
-    The sd is 1 mrad up to 10 ug, as of single sensors of navigation grade on machined faces, and
-    proportional to the noise above, up to 1 %, the cross-axis sensitivity of consumer MEMS.
+    Return the built-in prior sd of an element of the misalignment [rad], by the noise in 1 Hz
+    [m/s^2]: 1 mrad up to 10 ug, as of single sensors of navigation grade on machined faces, above
+    proportional to the noise, up to 1 %, the cross-axis sensitivity of consumer MEMS.
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
 
@@ -84,17 +83,9 @@ class Windows:
         """Number of positions."""
         return int(self.position[-1]) + 1
 
-    @property
-    def has_part_lags(self) -> bool:
-        """Whether the lags are those of the unit's parts."""
-        return self.acts_on is not None
-
     @cached_property
     def share(self) -> Floats:
-        """
-        Prior sd of the weights of each axis over that of their column, shape (3, m); 1e-6 for a
-        weight that the column does not have.
-        """
+        """Prior sd of each axis's weights over that of the column, 1e-6 if it has none, (3, m)."""
         acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(acts.T, 1.0, 1e-6)
 
@@ -103,11 +94,6 @@ class Windows:
         """Whether a column changes within a position."""
         same = self.position[1:] == self.position[:-1]
         return bool(np.diff(self.columns, axis=0)[same].any())
-
-    @property
-    def n_sections(self) -> int:
-        """Number of program sections."""
-        return int(self.section.max()) + 1
 
     @property
     def parts(self) -> Bools:
@@ -178,11 +164,6 @@ class InformativePrior:
 
     mean: Floats
     root: Floats
-
-    @cached_property
-    def precision(self) -> Floats:
-        """Inverse covariance, shape (n_unit, n_unit)."""
-        return np.asarray(self.root.T @ self.root)
 
 
 @dataclass(frozen=True)
@@ -258,12 +239,12 @@ class State:
 
     @cached_property
     def inverse(self) -> Floats:
-        """Return the inverse of M."""
+        """The inverse of M."""
         return inverse_misalignment(self.misalignment)
 
     @cached_property
     def tangents(self) -> Floats:
-        """Return two unit vectors perpendicular to each attitude, shape (n, 3, 2)."""
+        """Two unit vectors perpendicular to each attitude, shape (n, 3, 2)."""
         return tangent_basis(self.up)
 
 
@@ -334,13 +315,23 @@ class Layout:
     def of_axis(self) -> Ints:
         """The unknowns of a position that each axis has, as places in `own`, shape (3, k)."""
         first = self.up.shape[1] + self.stretch.shape[1]
-        common = [*range(first)], [*range(first + 3, self.own.shape[1])]
-        return np.array([[*common[0], first + axis, *common[1]] for axis in range(3)])
+        before, after = range(first), range(first + 3, self.own.shape[1])
+        return np.array([[*before, first + axis, *after] for axis in range(3)])
 
     @cached_property
     def used(self) -> Bools:
         """Active columns of bias and scale, shape (2, m)."""
         return np.asarray(self.weights[:, 0] >= 0)
+
+    def by_weights(self, columns: Floats, force: Floats) -> Iterator[tuple[Floats, Ints]]:
+        """
+        Yield the derivatives of readings by the weights of each axis, and the weights' places,
+        given columns, shape (n, m), and the force along the axes, shape (n, 3) or (3,).
+        """
+        in_bias, in_scale = self.used
+        for axis in range(3):
+            along = np.hstack((columns[:, in_bias], force[..., [axis]] * columns[:, in_scale]))
+            yield along, self.axis[axis, 2 : 2 + along.shape[1]]
 
 
 def lay_out(
@@ -352,10 +343,8 @@ def lay_out(
     forces: Forces | None = None,
 ) -> Layout:
     """
-    Assign a place to every unknown.
-
-    `used`, `active`: active columns of bias and scale, shape (2, m), and active nonlinear
-    coefficients, shape (2 k,)
+    Assign a place to every unknown, given the active columns of bias and scale, shape (2, m), and
+    the active nonlinear coefficients, shape (2 k,).
     """
     n = 0
 

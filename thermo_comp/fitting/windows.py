@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ from ..unit.functions import Polynomial, TemperatureFunction
 from .part_curves import PartCurves, curves_of
 from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
+from .start import block_means
 from .unknowns import Windows
 
 #: Groups of columns: the curve, the difference of the sets, bends (changes of slope at a
@@ -105,17 +106,12 @@ class Model:
         """Axes that each column of the response acts on, shape (k, 3); None for all."""
         if self.parts is None:
             return None
-        return np.array(
-            [
-                [
-                    not column.source.is_of_part
-                    # A lag of a gradient has no `sensor_share`.
-                    or column.part in (part, part._replace(sensor_share=0.0))
-                    for part in self.parts
-                ]
-                for column in self.columns
-            ]
-        )
+        # A lag of a gradient has no `sensor_share`.
+        own = [(part, part._replace(sensor_share=0.0)) for part in self.parts]
+        return np.array([
+            [not column.source.is_of_part or column.part in lags for lags in own]
+            for column in self.columns
+        ])  # fmt: skip
 
     @cached_property
     def part_curves(self) -> PartCurves:
@@ -267,12 +263,6 @@ def _rows(
     window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
     slot = np.floor((time - time[0]) / window_s * (1.0 + 1e-9))
     first = np.flatnonzero(np.r_[True, np.diff(slot) != 0])
-    total = np.add.reduceat(count, first)
-
-    def averaged(values: Floats) -> Floats:
-        summed = np.add.reduceat(values * count[:, None], first, axis=0)
-        return np.asarray(summed / total[:, None])
-
     board, weight = states[BOARD], states[WEIGHT]
     raw, (factors, _) = table.raw(states), table.factors(board, weight)
     curves = model.sets.columns(board - model.reference_temperature, weight)
@@ -282,18 +272,16 @@ def _rows(
     for k, column in enumerate(table.columns):
         if isinstance(lag := column.source, Lag):
             by_start[k] = slopes[k] * lag.start_share(time - begin_s, np.exp)
+    rate = interval.angular_rate if has_rate else None
+    mean = partial(block_means, weight=count, first=first)
     return _Rows(
-        averaged(time[:, None])[:, 0],
-        total,
-        averaged(interval.mean[use]),
-        averaged(np.array([board, states[RATE], weight, states[GRADIENT], *raw]).T),
-        averaged(np.array([*curves, *(raw * factors)]).T),
-        averaged(by_start.T),
-        averaged(
-            np.empty((len(time), 0))
-            if not has_rate or interval.angular_rate is None
-            else interval.angular_rate[use]
-        ),
+        mean(time[:, None])[:, 0],
+        np.add.reduceat(count, first),
+        mean(interval.mean[use]),
+        mean(np.array([board, states[RATE], weight, states[GRADIENT], *raw]).T),
+        mean(np.array([*curves, *(raw * factors)]).T),
+        mean(by_start.T),
+        mean(np.empty((len(time), 0)) if rate is None else rate[use]),
     )
 
 
@@ -301,6 +289,12 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     """Make the data of the regression from windows of all rests."""
     curves = model.part_curves
     groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
+    if acts_on is not None:
+        of_sets, of_parts = (
+            np.ones((len(groups), 3), dtype=bool),
+            np.eye(3, dtype=bool)[curves.axis],
+        )
+        acts_on = np.vstack((of_sets, acts_on, of_parts))
     n_curves, lags = len(groups), Layout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 3]
     # A support tilts linearly with the board and case temperatures, and with the square of the
@@ -310,11 +304,12 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     is_tilting = tilt_rms > 0.0
     # The scale has no hysteresis, no bends and no level of the dynamic set: Fc = 1 at the
     # reference temperature in both regimes.
-    in_scale = [*[True] * n_curves, *(column.term.has_scale for column in columns)]
+    in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(curves.axis)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
     of_part = rows.columns @ curves.sums.T
+    kelvins = _kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient)
     # The columns of a curve over a part's temperature have at most one lag, the lag of the part.
     lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
     return Windows(
@@ -327,19 +322,12 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         columns=np.hstack((rows.columns, of_part)),
         groups=(*groups, *(column.group for column in columns), *[PART] * len(curves.axis)),
         lag=np.append(lag, lag_of_part),
-        kelvins=np.append(
-            _kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient),
-            curves.kelvins(of_part),
-        ),
+        kelvins=np.append(kelvins, curves.kelvins(of_part)),
         start=np.hstack((start, start @ curves.sums.T)),
         start_covariance=start_covariance(spec.lags),
-        in_scale=np.append(in_scale, np.full(len(curves.axis), fill_value=True)),
+        in_scale=np.array(in_scale),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
-        acts_on=None
-        if acts_on is None
-        else np.vstack(
-            (np.ones((n_curves, 3), dtype=bool), acts_on, np.eye(3, dtype=bool)[curves.axis])
-        ),
+        acts_on=acts_on,
     )
 
 
@@ -368,7 +356,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)
     slope = np.array(steepest)
-    return np.where(slope > 0.0, rms / np.where(slope > 0.0, slope, 1.0), 0.0)
+    return np.asarray(np.divide(rms, slope, out=np.zeros_like(rms), where=slope > 0.0))
 
 
 def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the likely reasons why a recording is not one of an accelerometer at rest, as messages.
-"""
+"""Owns the likely reasons why a recording is not one of an accelerometer at rest, as messages."""
 
 import numpy as np
 

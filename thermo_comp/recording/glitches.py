@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the detection of glitches: single samples with wrong bits, as after an error of a transfer.
-"""
+"""Owns the detection of glitches: single samples with wrong bits, as after a transfer error."""
 
 from __future__ import annotations
 

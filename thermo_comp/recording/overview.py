@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the survey of a recording before a fit: duration, rates, temperatures, rests, losses.
-"""
+"""Owns the survey of a recording before a fit: duration, rates, temperatures, rests, losses."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the search for the inputs' topics in a bag, and the messages for missing topics.
-"""
+"""Owns the search for the inputs' topics in a bag, and the messages for missing topics."""
 
 from __future__ import annotations
 
