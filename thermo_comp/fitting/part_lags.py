@@ -164,10 +164,12 @@ class _PartCurves:
             lags.append(lag)
         return lags
 
-    def _is_of_use(self, lag: Part, axis: int, noise: float) -> bool:
+    def _is_of_use(
+        self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
+    ) -> bool:
         """Whether a lag may meet the limits of `find_parts`, tested with wider limits."""
         typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
-        return bool(typical <= 3.0 * noise or self.reduction(lag, axis) >= 4.0)
+        return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
@@ -179,13 +181,19 @@ class _PartCurves:
         best = self._time_constant(axis)
         enough = 1.1**2 * noise**2 * len(self._t)
         if self._square(best, axis) > enough:
-            lags = [self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0))]
+            starts = [best]
             if self._has_case:
                 # The residual has a valley of several minima, along which this difference is
                 # constant: the time constant less the time by which the temperature between board
                 # and case leads the board.
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
-                for near in (best, min(along, key=lambda lag: self._square(lag, axis))):
+                starts.append(min(along, key=lambda lag: self._square(lag, axis)))
+            if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in starts):
+                # Two stages or another share change a lag of one stage too little to help.
+                return best
+            lags = [self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0))]
+            if self._has_case:
+                for near in starts:
                     first = near._replace(tau_s=max(near.tau_s, 15.0))
                     lags.append(self._searched(axis, first, (0.2, 0.0, 0.1)))
             best = self._better(axis, best, min(lags, key=lambda lag: self._square(lag, axis)))
