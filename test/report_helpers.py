@@ -19,7 +19,7 @@ from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = '15 12min, 30@1.5 14min, 15@1.5 8min'
-RATE_HZ = 5.0
+RATE_HZ = 1.0
 N_POSITIONS = 9
 LEFT_OUT_RMS = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(N_POSITIONS - 1)]
 
