@@ -42,9 +42,7 @@ def test_of(number, first, last):
     """Record some of twelve positions of one sibling."""
     ups = positions(12, number)[first:last]
     stations = [Position(PROGRAM, up) for up in ups]
-    unit = sibling(KIND, number, 0.15)
-    # A fit takes means over a minute, whose noise does not depend on the rate.
-    return tuple(arrays(unit, stations, 100 * number + first, rate_hz=1.0))
+    return tuple(arrays(sibling(KIND, number, 0.15), stations, 100 * number + first))
 
 
 test_of.__test__ = False
@@ -255,7 +253,7 @@ def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
         save_calibration(unit, files[-1])
     target = tmp_path / 'type.yaml'
     assert run(['prior', *map(str, files), '-o', str(target)]) == 0
-    assert 'prior from 3 units, 9 columns' in capsys.readouterr().out
+    assert 'prior from 3 units, 13 columns' in capsys.readouterr().out
     assert load_calibration(target) == population(siblings())
     assert run(['prior', *map(str, files[:2]), '-o', str(target), '--force']) == 1
     assert 'need 3 for a population' in capsys.readouterr().err
