@@ -51,8 +51,8 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 #: The longest test files, in order of duration, with which `make test` begins.
 _LONG = (
-    *('part_lags', 'cli_demo', 'cli_help', 'gyroscope', 'fleet_run', 'faults', 'report'),
-    *('priors', 'fitting', 'fault_process', 'few_positions', 'real_data', 'fit_api', 'record'),
+    *('part_lags', 'cli_demo', 'fleet_run', 'gyroscope', 'fitting', 'faults', 'priors'),
+    *('fault_process', 'real_data', 'cli_help', 'report', 'few_positions', 'fit_api', 'record'),
     *('regime', 'attacks', 'degenerate', 'correction', 'fault_files', 'docs', 'fitting_closing'),
     *('node_parity', 'fitting_windows', 'api', 'fitting_change', 'judging', 'fitting_selection'),
     *('judging_history', 'node_defence', 'node_startup', 'fitting_regression'),

@@ -207,7 +207,7 @@ def test_hours_of_bag_stay_a_small_page():
 
 def test_bag_is_read_in_bounded_memory(tmp_path):
     one = run(0)
-    n_times = 20
+    n_times = 50
     with BagWriter(tmp_path / 'long.mcap') as writer:
         writer.write_temperature('temperature/board', one.board_stamp_ns, one.board)
         for k in range(n_times):
