@@ -107,8 +107,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     model = model_of(bags, options, parts.lags)
     of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
     fit = regress(of_parts, problem)
-    # The white noise estimated by the fit includes the error of the lags, unlike `parts.noise`.
-    if fit.selected.score.rms > 2.0 * parts.noise:
+    if fit.selected.score.rms > parts.most_drift:
         with_bank = regress(windows, problem)
         if is_better(fit.selected.score, with_bank.selected.score):
             return with_bank

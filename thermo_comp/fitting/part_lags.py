@@ -14,7 +14,7 @@ factor, both over x.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,12 +66,12 @@ class Parts:
 
     lags: the lag of each axis; 0 s if the axis follows the board without a lag
     undisturbed: factors, up to 1, that reduce the weights of outlying windows, shape (n,)
-    noise: mean over the axes of the windows' white noise [m/s^2]
+    most_drift: left-out drift above which other models of the lags are tried [m/s^2]
     """
 
     lags: tuple[Part, Part, Part]
     undisturbed: Floats
-    noise: float
+    most_drift: float
 
 
 def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
@@ -100,9 +100,10 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
         x, y, z = (Part(round(lag[0], 1), round(lag[1], 1), round(lag[2], 4)) for lag in lags)
-        parts = Parts((x, y, z), factors, float(noise.mean()))
+        parts = Parts((x, y, z), factors, 2.0 * float(noise.mean()))
         if (square <= (shape.most_noise * noise) ** 2).all():
-            return parts
+            # The lags explain the drift. Left-out sections add the errors of extrapolated curves.
+            return replace(parts, most_drift=10.0 * float(noise.mean()))
         # A larger residual has another cause, for example slow noise: the lags are then accepted
         # only if they reduce the RMS residual of each axis to an eighth or less of the residual
         # without a lag.
