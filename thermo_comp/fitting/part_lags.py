@@ -102,7 +102,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         x, y, z = (Part(round(lag[0], 1), round(lag[1], 1), round(lag[2], 4)) for lag in lags)
         parts = Parts((x, y, z), factors, 2.0 * float(noise.mean()))
         if (square <= (shape.most_noise * noise) ** 2).all():
-            # The lags explain the drift. Left-out sections add the errors of extrapolated curves.
+            if shape.has_stress:
+                return parts
+            # Curves alone explain the drift; in left-out sections they are extrapolated.
             return replace(parts, most_drift=10.0 * float(noise.mean()))
         # A larger residual has another cause, for example slow noise: the lags are then accepted
         # only if they reduce the RMS residual of each axis to an eighth or less of the residual
