@@ -314,11 +314,11 @@ def _rest_gradient_range(
     windows: ThermalWindows, lag_s: float, known: Calibration | None
 ) -> Range | None:
     """
-    Return the range of the first sensor's gradient without that of ramps; None without the sensor.
+    Return the range of the first sensor's gradient without that of ramps; None without the sensor
+    or for a range beyond 100 K, as in bags too short for a rate.
     """
-    ranges = []
-    if windows.gradient.any():
-        ranges.append(_range(windows.gradient - lag_s * windows.rate, 0.01))
+    lower, upper = _range(windows.gradient - lag_s * windows.rate, 0.01)
+    ranges = [(lower, upper)] if windows.gradient.any() and max(-lower, upper) < 100.0 else []
     if known is not None and known.rest_gradient_range_k is not None:
         ranges.append(known.rest_gradient_range_k)
     return union(ranges) if ranges else None
