@@ -303,3 +303,9 @@ def test_fit_says_how_far_the_parts_lag(parts, tmp_path, cli):
     assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
     assert spoken == pytest.approx(content['part_lags_s'], abs=0.5)
     assert content['part_case_shares'] == [0.0, 0.0, 0.0]
+
+
+def test_soaks_alone_do_not_tell_a_loose_thermometer():
+    # The lag of the board is not known from soaks, so the gradient of a ramp is no sign of a fault.
+    study = next(soaks(1))
+    assert strangers.fitted(replace(study, bags=study.bags[:9])).rest_gradient_range_k is None

@@ -11,6 +11,7 @@ from datetime import datetime, timezone
 import numpy as np
 
 from .. import __version__
+from ..thermal.settings import RAMP_K_MIN
 from ..thermal.state import USUAL_BOARD_LAG_S
 from ..typing import Bools, Floats
 from ..unit.calibration import (
@@ -314,11 +315,13 @@ def _rest_gradient_range(
     windows: ThermalWindows, lag_s: float, known: Calibration | None
 ) -> Range | None:
     """
-    Return the range of the first sensor's gradient without that of ramps; None without the sensor
-    or for a range beyond 100 K, as in bags too short for a rate.
+    Return the range of the first sensor's gradient without that of ramps; None without the sensor,
+    without ramps, which determine the lag, or for a range beyond 100 K, as in bags too short for a
+    rate.
     """
     lower, upper = _range(windows.gradient - lag_s * windows.rate, 0.01)
-    ranges = [(lower, upper)] if windows.gradient.any() and max(-lower, upper) < 100.0 else []
+    has_ramps = windows.gradient.any() and 60.0 * float(windows.rate.std()) > RAMP_K_MIN
+    ranges = [(lower, upper)] if has_ramps and max(-lower, upper) < 100.0 else []
     if known is not None and known.rest_gradient_range_k is not None:
         ranges.append(known.rest_gradient_range_k)
     return union(ranges) if ranges else None
