@@ -241,3 +241,17 @@ def test_initial_lag_states_decay_with_their_time_constants():
     memory.banks['case'].step(300 * SECOND_NS, 2.0)
     shares = memory.start_shares(600 * SECOND_NS)
     assert shares == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])
+
+
+def test_readings_of_the_board_that_stand_still_are_errors_of_both_lags():
+    memory = ThermalMemory(MemorySpec(lags=(('board', 900.0), ('case', 600.0))))
+    memory.board_step(0, 20.0)
+    memory.banks['case'].step(0, 1.0)
+    at = (0, 20.0, [1.0])
+    moving, board, both = (
+        np.array(memory.at(*at, still)[1::2])
+        for still in ((), ((2.0, 300.0), (0.0, 0.0)), ((2.0, 300.0), (2.0, 300.0)))
+    )
+    share = 1.0 - np.exp(-300.0 / np.array([900.0, 600.0]))
+    np.testing.assert_allclose(board - moving, (2.0 * share) ** 2)
+    np.testing.assert_allclose(both - moving, (2.0 * share) ** 2 * [1.0, 2.0])

@@ -306,6 +306,6 @@ def test_fit_says_how_far_the_parts_lag(parts, tmp_path, cli):
 
 
 def test_soaks_alone_do_not_tell_a_loose_thermometer():
-    # The lag of the board is not known from soaks, so the gradient of a ramp is no sign of a fault.
+    # Soaks do not show the lag of the board, so the gradient of a ramp is no sign of a fault.
     study = next(soaks(1))
     assert strangers.fitted(replace(study, bags=study.bags[:9])).rest_gradient_range_k is None

@@ -354,13 +354,14 @@ class ThermalMemory:
         """
         behind, extra = self._single_lags(stamp_ns, board, gradients)
         if still:
-            taus = [bank.taus for bank in self.banks.values()]
-            errors = [
-                sd * math.expm1(-still_s / tau)
-                for (sd, still_s), of_bank in zip(still, taus, strict=True)
-                for tau in of_bank
+            # An error of the board temperature is one of each gradient, too.
+            causes = [still[:1], *((still[0], one) for one in still[1:])]
+            grown = [
+                sum((sd * math.expm1(-still_s / tau)) ** 2 for sd, still_s in of_bank)
+                for bank, of_bank in zip(self.banks.values(), causes, strict=True)
+                for tau in bank.taus
             ]
-            extra = [variance + sd * sd for variance, sd in zip(extra, errors, strict=True)]
+            extra = [variance + more for variance, more in zip(extra, grown, strict=True)]
         if self._sums:
             values, variances = behind, extra
             behind = [sum([share * values[k] for k, share in lag]) for lag in self._sums]

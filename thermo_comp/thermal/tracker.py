@@ -299,13 +299,10 @@ class ThermalTracker:
         """
         Whether the effect of the unknown temperatures before the start on the memory has decayed.
         """
-        state, n_sensors, n_lags = (
-            self.sample(stamp_ns),
-            len(self.spec.sensors),
-            len(self.spec.lags),
-        )
-        gradients = list(state[GRADIENT : GRADIENT + 2 * n_sensors : 2])
-        extra = self.memory.at(stamp_ns, state[BOARD], gradients)[1 : 2 * n_lags : 2]
+        state = self.sample(stamp_ns)
+        gradients = list(state[GRADIENT : GRADIENT + 2 * len(self.spec.sensors) : 2])
+        lags = self.memory.at(stamp_ns, state[BOARD], gradients)[: 2 * len(self.spec.lags)]
+        extra = lags[1::2]
         start = start_covariance(self.spec.lags).diagonal().tolist()
         shares = self.memory.start_shares(stamp_ns)
         return all(
