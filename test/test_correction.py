@@ -152,7 +152,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
     judged = replace(unit, posterior=posterior)
     _, states = states_of(unit, rng)
     slow = SlowUncertainty(judged, Correction(judged))
-    nobody = [0.0] * len(Correction(unit).memory.lags)
+    nobody = np.zeros((len(Correction(unit).memory.lags), 2))
     draws = rng.multivariate_normal(np.zeros(n), posterior.covariance(), size=300)
     # Evaluate one state in the static regime (weight 0) and during the transition (weight 0.3).
     weights = np.array([0.0, 0.3])
@@ -170,10 +170,10 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
     tilted[:, [1, 2, 2], [0, 0, 1]] = draws[:, layout.misalignment :]
     M = np.array([[1.0, 0.0, 0.0], [0.1, 1.0, 0.0], [-0.2, 0.15, 1.0]])
     elements = CovarianceMap((0.1, -0.2, 0.15))
-    for k, state in enumerate(pair.T.tolist()):
-        rows = np.array(slow.at(state, nobody))[:, np.newaxis]
-        coefficients = elements.coefficients(rows)[:, 0].tolist()
-        for axis, (a, b, c) in enumerate(rows[:9].reshape(3, 3)):
+    rows = slow.at(pair, nobody)
+    each = zip(elements.coefficients(rows).T.tolist(), rows[:9].T.reshape(2, 3, 3), strict=True)
+    for k, (coefficients, parts) in enumerate(each):
+        for axis, (a, b, c) in enumerate(parts):
             for x in (-9.8, 0.0, 9.8):
                 variance = np.var(scatter[:, 0, axis, k] + scatter[:, 1, axis, k] * x)
                 # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %; tolerance: 4 sd.
@@ -233,7 +233,8 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     _, states = states_of(unit, rng)
     _, state, shares = states[0]
     state = (*state[:RATE], 0.0, *state[RATE + 1 :])
-    slow = SlowUncertainty(unit, correction).at(state, shares)
+    column, of_start = np.array([state]).T, np.array([shares]).T
+    slow = SlowUncertainty(unit, correction).at(column, of_start)
     layout = Layout(correction.memory)
     places = [layout.places[lag] for lag in layout.lags]
     draws = rng.multivariate_normal(np.zeros(len(lags)), start_covariance(lags), size=4000)
@@ -453,14 +454,14 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
     unit = rich_calibration()
     correction = Correction(unit)
     slow = SlowUncertainty(unit, correction)
-    nobody = [0.0] * len(correction.memory.lags)
+    nobody = np.zeros((len(correction.memory.lags), 1))
     for sign in (1.0, -1.0):
         variances = []
         for beyond in (0.0, 0.1, 1.0, 3.0, 7.4, 7.6, 15.0, 40.0):
-            state = [0.0] * Layout(correction.memory).width
+            state = np.zeros((Layout(correction.memory).width, 1))
             state[BOARD] = 20.0 + sign * (15.0 + beyond)
-            line = correction.line(state, state, np.array(slow.at(state, nobody)), 0.0)
-            variances.append(line[list(VARIANCES)])
+            line = correction.line(state, state, slow.at(state, nobody), 0.0)
+            variances.append(line[list(VARIANCES), 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
         # The claimed sd is at least the error of a curve that is constant from the edge on.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]

@@ -15,7 +15,14 @@ from thermo_comp.thermal.memory import Lag, Play, memory_on_grid
 from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
-from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial, check_reference, hold
+from thermo_comp.unit.functions import (
+    CubicSpline,
+    Exponential,
+    Polynomial,
+    check_reference,
+    hold,
+    in_order,
+)
 from thermo_comp.unit.metrics import norm_residual, residual_statistics, statistics_by_regime
 from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import ramp_states, sd_of_states
@@ -25,6 +32,15 @@ FUNCTIONS = [Polynomial((1.0,)), Polynomial((0.0, 2e-3, -3e-5, 4e-7, 1e-9)),
              CubicSpline(KNOTS, (1.5, 0.4, 0.0, -0.2, 0.9)),
              Exponential(-0.5, (0.2, 0.3), (12.0, -7.0))]  # fmt: skip
 temperatures = st.floats(-15.0, 15.0)
+
+
+@given(st.integers(0, 2**32), st.integers(1, 40), st.integers(1, 5), st.integers(1, 5))
+def test_sums_do_not_depend_on_the_size_of_the_other_axes(seed, size, before, after):
+    values = np.random.default_rng(seed).standard_normal((before, size, after))
+    for order in 'CF':
+        total = in_order(np.array(values, order=order), 1)
+        for i, k in np.ndindex(total.shape):
+            assert total[i, k] == sum(values[i, :, k].tolist())
 
 
 def test_polynomial_by_hand():

@@ -109,7 +109,7 @@ def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
     whole, t = unit.posterior.covariance(), 7.0
     state = np.zeros(Layout(correction.memory).width)
     state[BOARD] = 20.0 + t
-    slow = SlowUncertainty(unit, correction).at(state.tolist(), [])
+    slow = SlowUncertainty(unit, correction).at(state[:, np.newaxis], np.zeros((0, 1)))[:, 0]
     linear, beyond = np.reshape(slow[:9], (3, 3)), np.reshape(slow[N_ROWS:], (3, 5))
     for axis in range(3):
         for f in (-60.0, -9.8, 0.0, 30.0):

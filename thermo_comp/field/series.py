@@ -289,11 +289,9 @@ def _along(
     x: Floats,
 ) -> Floats:
     """Return the error variance along the force's directions u, with the noise of a sample."""
-    parts = np.array(
-        [slow.at(s, p) for s, p in zip(states.tolist(), shares.tolist(), strict=True)]
-    )
     columns = states.T
-    line = list(correction.line(columns, columns, parts.T, np.zeros(len(states))))
+    parts = slow.at(columns, shares.T)
+    line = list(correction.line(columns, columns, parts, np.zeros(len(states))))
     covariance = (
         covariance_at(line[12:], *x.T)
         if correction.of_force is None

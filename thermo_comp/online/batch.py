@@ -178,11 +178,11 @@ def _apply(
     correction, of_rate = compensator.thermal.correction, compensator.thermal.rate_correction
     line = rate_line = np.empty((0, 0))
     if segments:
-        n_slow = correction.n_slow
-        line = _line(correction, segments, slice(n_slow))
+        slow, n_slow = _slow_rows(compensator, segments), correction.n_slow
+        line = _line(correction, segments, slow[:n_slow])
         is_good = is_sound(line)
         if of_rate is not None:
-            rate_line = _line(of_rate, segments, slice(n_slow, None))
+            rate_line = _line(of_rate, segments, slow[n_slow:])
             is_good &= is_sound(rate_line)
         if not is_good.all():
             counts = [count for _, count in segments]
@@ -206,12 +206,19 @@ def _apply(
     return CompensatedBlock(index, stamps, force[:3].T, force[3:].T, *rates)
 
 
-def _line(correction: Correction, segments: Segments, part: slice) -> Floats:
-    """Evaluate `Correction.line` for segments, with the rows `part` of their slow variance."""
-    each = [segment for segment, _ in segments]
-    start, end, slow = (np.array([one[at] for one in each]).T for at in (4, 5, 6))
-    excess = np.array([segment.noise_excess for segment in each])
-    return correction.line(start, end, slow[part], excess)
+def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
+    """Evaluate the slow part of the variance of segments, each held state once."""
+    held = {id(segment.slow): segment.slow for segment, _ in segments}
+    rows = compensator.thermal.model.slow_rows([*held.values()])
+    places = {key: place for place, key in enumerate(held)}
+    return rows[:, [places[id(segment.slow)] for segment, _ in segments]]
+
+
+def _line(correction: Correction, segments: Segments, slow: Floats) -> Floats:
+    """Evaluate `Correction.line` for segments, with the slow part of their variance."""
+    start, end = (np.array([one[at] for one, _ in segments]).T for at in (4, 5))
+    excess = np.array([segment.noise_excess for segment, _ in segments])
+    return correction.line(start, end, slow, excess)
 
 
 def _corrected(

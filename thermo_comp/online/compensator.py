@@ -208,10 +208,10 @@ class Compensator:
             return None
         counters = self.counters
         segment = thermal.segment(stamp_ns, counters.n_in - counters.n_out_of_order)
-        start_ns, is_new, is_too_fast, excess, start, end, slow = segment
+        start_ns, is_new, is_too_fast, excess, start, end, _ = segment
         self.event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
         correction = thermal.correction
-        n_slow = correction.n_slow
+        slow, n_slow = thermal.slow_rows(segment.slow), correction.n_slow
         line = correction.line(start, end, slow[:n_slow], excess)
         is_good = is_sound(line)
         if thermal.rate_correction is not None:

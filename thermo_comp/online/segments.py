@@ -15,12 +15,15 @@ from dataclasses import replace
 from math import sqrt
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from ..thermal.memory import BOARD_INPUT
 from ..thermal.reading_queue import NEVER_NS, ReadingQueue
 from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig
 from ..thermal.state import BOARD
 from ..thermal.tracker import ANY_RANGE, ThermalTracker
+from ..typing import Floats
 from ..unit.calibration import Calibration, rate_triad
 from ..unit.correction import Correction
 from ..unit.prediction import SlowUncertainty
@@ -36,6 +39,13 @@ EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 UNMEASURED_SD_K: Final = 10.0
 
 
+class SlowState(NamedTuple):
+    """The thermal state that determines the slow part of the variance, and the lags' shares."""
+
+    state: tuple[float, ...]
+    start_shares: list[float]
+
+
 class Segment(NamedTuple):
     """A time interval with a linear correction, and the checks that apply to its samples."""
 
@@ -46,9 +56,10 @@ class Segment(NamedTuple):
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    #: Slow part of the variance of the force, `Correction.n_slow` numbers, then of the angular
-    #: rate.
-    slow: list[float]
+    slow: SlowState  # the same object in all segments with the same slow part of the variance
+
+
+_NO_STATE: Final = SlowState((), [])
 
 
 class Model:
@@ -66,6 +77,15 @@ class Model:
             self.rate_correction = Correction(triad, self.correction.memory)
             self.uncertainty.append(SlowUncertainty(triad, self.rate_correction))
         self.inputs = (BOARD_INPUT, *calibration.sensors)
+
+    def slow_rows(self, held: Sequence[SlowState]) -> Floats:
+        """
+        Evaluate the slow part of the variance of the force, `Correction.n_slow` rows, then that of
+        the angular rate, shape (rows, len(held)).
+        """
+        states = np.array([one.state for one in held]).T
+        shares = np.array([one.start_shares for one in held]).T
+        return np.concatenate([part.at(states, shares) for part in self.uncertainty])
 
 
 class ThermalSide:
@@ -91,7 +111,11 @@ class ThermalSide:
         self.rate = RateCheck(unit.cycle_time_s, unit.input == 'counts')
         self._segment_key: tuple[int, int] | None = None
         self._slow_key: int | None = None
-        self._slow: list[float] = []
+        self._slow = _NO_STATE
+        self._slow_evaluated = _NO_STATE
+        self._slow_rows: Floats = np.empty(0)
+        #: End and thermal state of the last segment, where the next one begins without a reading.
+        self._last_end: tuple[int, int, tuple[float, ...]] | None = None
 
     def _new_tracker(self) -> ThermalTracker:
         return ThermalTracker(
@@ -196,7 +220,11 @@ class ThermalSide:
         if is_new:
             self._segment_key = key
             self.rate.update(n_seen, stamp_ns)
-        start, end = self.sample(start_ns), self.sample(start_ns + SEGMENT_NS)
+        end_ns, last = start_ns + SEGMENT_NS, self._last_end
+        is_next = last is not None and last[:2] == key
+        start = last[2] if last is not None and is_next else self.sample(start_ns)
+        end = self.sample(end_ns)
+        self._last_end = (self._n_applied, end_ns, end)
         slow, rate = self._slow_at(start_ns, end), self.rate
         return Segment(start_ns, is_new, rate.is_too_fast, rate.noise_excess, start, end, slow)
 
@@ -206,18 +234,25 @@ class ThermalSide:
         pairs = zip(variances, correction.noise, strict=False)
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
-    def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> list[float]:
-        """Return the slow part of a segment's variance, held for `SLOW_NS` once evaluated."""
+    def slow_rows(self, slow: SlowState) -> Floats:
+        """Evaluate the slow part of a segment's variance, once while it is held."""
+        if slow is not self._slow_evaluated:
+            self._slow_evaluated = slow
+            self._slow_rows = self.model.slow_rows([slow])[:, 0]
+        return self._slow_rows
+
+    def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
+        """Return the state of the slow part of a segment's variance, held for `SLOW_NS`."""
         # The first readings after a start do not show the rate yet, on which the unknown initial
         # lag states depend: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS
         key = start_ns // (SEGMENT_NS if is_young else SLOW_NS)
         if key != self._slow_key:
             self._slow_key = key
-            shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
             if self.is_unmeasured:
                 # Without a temperature reading, evaluate the variance one sd of the temperature
                 # from the reference temperature.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
-            self._slow = [v for part in self.model.uncertainty for v in part.at(end_state, shares)]
+            shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
+            self._slow = SlowState(end_state, shares)
         return self._slow

@@ -87,16 +87,15 @@ def grown(between: Floats, growth: Floats) -> Floats:
     return np.asarray(between * roots[_FIRST] * roots[_SECOND])
 
 
-def rows_between(errors: Floats, misalignment_variances: Floats) -> list[float]:
+def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     """
-    Return the rows `BETWEEN` of errors that are linear in independent unit variances, (9, p), and
-    of variances that are added to the elements of the misalignment, (3,).
+    Return the rows `BETWEEN`, (36, n), of errors that are linear in p independent unit variances,
+    (9, p, n), and of variances that are added to the elements of the misalignment, (3,).
     """
     # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
-    result = (errors[_FIRST] * errors[_SECOND]).sum(axis=1)
-    result[_OF_M] += misalignment_variances
-    numbers: list[float] = result.tolist()
-    return numbers
+    result = in_order(errors[_FIRST] * errors[_SECOND], 1)
+    result[_OF_M] += misalignment_variances[:, np.newaxis]
+    return result
 
 
 def misalignment_variances(between: Floats) -> Floats:

@@ -294,8 +294,10 @@ def _natural_pieces(knots: npt.ArrayLike, values: npt.ArrayLike) -> Floats:
 
 
 def in_order(values: Floats, axis: int) -> Floats:
-    """Sum along an axis in a fixed order, whatever the size of the other axes."""
-    if not values.shape[axis]:
+    """Sum along an axis from first to last, whatever the size of the other axes."""
+    values = np.ascontiguousarray(values)
+    if not values.shape[axis] or math.prod(values.shape[axis + 1 :]) > 1:
         return np.asarray(values.sum(axis=axis))
+    # Along the innermost axis a plain sum has another order.
     total: Floats = np.add.accumulate(values, axis=axis).take(-1, axis)
     return total

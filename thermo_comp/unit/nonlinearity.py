@@ -21,7 +21,7 @@ import numpy as np
 from ..quantities import QUANTITIES
 from ..typing import Floats
 from .covariance import N_COEFFICIENTS, covariance_at
-from .functions import hold
+from .functions import hold, in_order
 from .gravity import STANDARD_GRAVITY
 from .schema import Vector, check_ranges
 
@@ -245,24 +245,28 @@ class ForceCorrection:
         return np.concatenate((k.reshape(9, -1), higher.reshape(12, -1)))
 
     def variance(
-        self, t: float, rows: Floats, rest: Floats, on_bias: Floats, on_scale: Floats
-    ) -> list[float]:
+        self, t: Floats, rows: Floats, rest: Floats, on_bias: Floats, on_scale: Floats
+    ) -> Floats:
         """
-        Return the nonlinear terms' part of the coefficients of x^2 to x^6 in an axis' variance.
+        Return the nonlinear terms' part of the coefficients of x^2 to x^6 in an axis' variance, at
+        temperatures (n,) from the reference, (5, n).
 
         `rows`, `rest`: factor of the covariance of the coefficients (2 k, rank), and variances
-        added to it; `on_bias`, `on_scale`: factors of bias and relative scale, (rank,). The
+        added to it; `on_bias`, `on_scale`: factors of bias and relative scale, (rank, n). The
         covariances of the coefficient of |f| f with other parameters are omitted, which overstates
         the variance.
         """
         kinds = [term.kind for term in self._of.terms]
-        n = len(kinds)
-        units = np.array([unit_of(kind) for kind in kinds])
-        along = (rows[:n] + t * rows[n:]) / units[:, np.newaxis]
-        alone = (rest[:n] + t * t * rest[n:]) / (units * units)
-        none = np.zeros(rows.shape[1])
-        n2, nq, n3 = (along[kinds.index(k)] if k in kinds else none for k in POWERS)
-        v2, vq, v3 = (float(alone[kinds.index(k)]) if k in kinds else 0.0 for k in POWERS)
+        k = len(kinds)
+        units = np.array([unit_of(kind) for kind in kinds]).reshape(-1, 1)
+        along = (rows[:k, :, np.newaxis] + t * rows[k:, :, np.newaxis]) / units[:, np.newaxis]
+        alone = (rest[:k, np.newaxis] + t * t * rest[k:, np.newaxis]) / (units * units)
+        none = np.zeros_like(on_bias), np.zeros_like(t)
+        terms = [
+            (along[kinds.index(kind)], alone[kinds.index(kind)]) if kind in kinds else none
+            for kind in POWERS
+        ]
+        (n2, v2), (nq, vq), (n3, v3) = terms
         # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
         products = (
             2.0 * on_bias * n2,
@@ -271,5 +275,7 @@ class ForceCorrection:
             2.0 * n2 * n3,
             n3 * n3,
         )
-        c, d, e, f, g = (float(product.sum()) for product in products)
-        return [c, d, e + (v2 + vq), f, g + v3]
+        result = in_order(np.array(products), 1)
+        result[2] += v2 + vq
+        result[4] += v3
+        return result

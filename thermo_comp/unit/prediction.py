@@ -10,8 +10,8 @@ stop; in a soak (q = 0) all of them are 0. The static set applies in a soak, the
 ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
 """
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,10 @@ from ..typing import Floats
 from .calibration import Calibration, parameter_layout
 from .correction import Correction
 from .covariance import rows_between
-from .functions import hold
+from .functions import hold, in_order
+
+#: Largest number of thermal states evaluated at once, so that the arrays stay in the cache.
+_CHUNK: Final = 64
 
 
 class SlowUncertainty:
@@ -54,55 +57,61 @@ class SlowUncertainty:
             self._blocks.append([(matrix[part], diagonal[part]) for part in parts])
         self._misalignment = matrix[layout.misalignment :], diagonal[layout.misalignment :]
 
-    def at(self, state: Sequence[float], start_shares: Sequence[float]) -> list[float]:
+    def at(self, states: Floats, start_shares: Floats) -> Floats:
         """
-        Evaluate the rows of the error covariance (see `unit.covariance`) at one thermal state: a,
-        b, c of each axis' error variance ``v(x) = a + b x + c x^2`` [m^2/s^4], then the rows
-        between axes and misalignment; with a nonlinearity then its contribution to the
-        coefficients of x^2 to x^6 of each axis' variance.
+        Evaluate the rows of the error covariance (see `unit.covariance`) at thermal states, shape
+        (width, n), with the remaining shares of the lags' initial states, (n_lags, n); each state
+        alone. Returns `Correction.n_slow` rows: a, b, c of each axis' error variance
+        ``v(x) = a + b x + c x^2`` [m^2/s^4], then the rows between axes and misalignment; with a
+        nonlinearity then its part of the coefficients of x^2 to x^6 of each axis' variance.
         """
-        states = np.array(state)[:, np.newaxis]
+        cuts = range(_CHUNK, states.shape[1], _CHUNK)
+        parts = zip(np.split(states, cuts, 1), np.split(start_shares, cuts, 1), strict=True)
+        return np.hstack([self._at(*part) for part in parts])
+
+    def _at(self, states: Floats, start_shares: Floats) -> Floats:
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         phi = table.held(table.raw(states)) * factors
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
-        by_pair = by_pair[self._correction.layout.lag_pairs, :, 0]
-        moved = by_pair * np.array(start_shares)[:, np.newaxis]
+        moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
         # If the start was in a ramp, the parts were behind the board, by an unknown amount up to
         # that of a long ramp at the rate of now, within the calibrated temperatures.
-        behind = hold(state[RATE] * self._behind_s, -self._span, self._span)
-        in_ramp = (moved * behind[:, np.newaxis]).sum(axis=0)
+        behind = hold(self._behind_s[:, np.newaxis] * states[RATE], -self._span, self._span)
+        in_ramp = in_order(moved * behind[:, np.newaxis], 0)
+        by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
         of_misalignment, var_misalignment = self._misalignment
-        n_lags, rank = len(moved) + 1, of_misalignment.shape[1]
-        errors = np.zeros((9, n_lags + rank))
+        n_lags, (n, rank) = len(moved), (states.shape[1], of_misalignment.shape[1])
+        errors = np.zeros((9, n_lags + 1 + rank, n))
         # A larger element of the misalignment increases the force, a larger bias or scale factor
         # decreases it.
-        errors[6:, n_lags:] = -of_misalignment
-        added = np.zeros((3, 3))
-        beyond: list[float] = []
+        errors[6:, n_lags + 1 :] = -of_misalignment[:, :, np.newaxis]
+        added = np.zeros((3, 3, n))
+        beyond: list[Floats] = []
         nonlinear = self._correction.of_force
         for axis, K in enumerate(self._K):
             on_bias, on_scale = errors[2 * axis : 2 * axis + 2]
-            on_bias[: n_lags - 1] = (self._root * moved[:, [axis]]).sum(axis=0) / K
-            on_scale[: n_lags - 1] = (self._root * moved[:, [axis + 3]]).sum(axis=0)
-            on_bias[n_lags - 1], on_scale[n_lags - 1] = in_ramp[axis] / K, in_ramp[axis + 3]
+            on_bias[:n_lags], on_scale[:n_lags] = by_root[:, axis] / K, by_root[:, axis + 3]
+            on_bias[n_lags], on_scale[n_lags] = in_ramp[axis] / K, in_ramp[axis + 3]
             if self._blocks:
                 (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
                 by_bias, by_scale = regressors[axis] / K, regressors[axis + 3]
-                on_bias[n_lags:] = (of_bias * by_bias).sum(axis=0)
-                on_scale[n_lags:] = (of_scale * by_scale).sum(axis=0)
-                added[axis, 0] = (var_bias * by_bias[:, 0] ** 2).sum()
-                added[axis, 2] = (var_scale * by_scale[:, 0] ** 2).sum()
+                on_bias[n_lags + 1 :] = _combined(of_bias, by_bias)
+                on_scale[n_lags + 1 :] = _combined(of_scale, by_scale)
+                added[axis, 0] = in_order(var_bias[:, np.newaxis] * by_bias**2, 0)
+                added[axis, 2] = in_order(var_scale[:, np.newaxis] * by_scale**2, 0)
                 if nonlinear is not None:
-                    t = float(nonlinear.held(states[BOARD])[0])
-                    both = on_bias[n_lags:], on_scale[n_lags:]
-                    beyond += nonlinear.variance(t, *of_force, *both)
+                    both = on_bias[n_lags + 1 :], on_scale[n_lags + 1 :]
+                    beyond.append(
+                        nonlinear.variance(nonlinear.held(states[BOARD]), *of_force, *both)
+                    )
             elif nonlinear is not None:
-                beyond += [0.0] * 5
-            added[axis] += _products(on_bias, on_scale)
+                beyond.append(np.zeros((5, n)))
+            products = on_bias * on_bias, 2.0 * (on_bias * on_scale), on_scale * on_scale
+            added[axis] += in_order(np.array(products), 1)
         between = rows_between(errors, var_misalignment)
-        return [*added.ravel().tolist(), *between, *beyond]
+        return np.concatenate((added.reshape(9, n), between, *beyond))
 
     def of_bias(
         self, states: Floats, mean_of: Callable[[Floats], Floats]
@@ -122,9 +131,10 @@ class SlowUncertainty:
         return of_state, of_difference
 
 
-def _products(bias: Floats, scale: Floats) -> Floats:
+def _combined(rows: Floats, by: Floats) -> Floats:
+    """Return ``rows.T @ by``, (rank, n), for a factor (p, rank) and derivatives (p, n)."""
     # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
-    return np.array([(bias * bias).sum(), 2.0 * (bias * scale).sum(), (scale * scale).sum()])
+    return in_order(rows[:, :, np.newaxis] * by[:, np.newaxis], 0)
 
 
 def in_a_soak(
@@ -179,9 +189,8 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     """Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3)."""
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
-    forgotten = [0.0] * len(correction.memory.lags)
-    variance = np.array([slow.at(state, forgotten)[:9] for state in states.tolist()])
-    variance = variance.reshape(-1, 3, 3)
+    forgotten = np.zeros((len(correction.memory.lags), len(states)))
+    variance = slow.at(states.T, forgotten)[:9].T.reshape(-1, 3, 3)
     is_dynamic = np.rint(states[:, WEIGHT]) == 1.0
     both = np.broadcast_to(correction.curves.unexplained(states[:, BOARD]), (2, 3, len(states)))
     unexplained = np.where(is_dynamic, both[1], both[0]).T
