@@ -102,7 +102,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # A statistic with a known onset is a lower bound of the CUSUM's delay, within a second.
+        # With a known onset the delay is a lower bound of the CUSUM's delay, within a second.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])

@@ -306,7 +306,7 @@ def _iso_ns(text: str) -> int:
     year, month, day, hour, minute, second = (int(part or 0) for part in moment)
     try:
         seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
-    except ValueError:  # an invalid date, as in month 13
+    except ValueError:  # an invalid date, such as 2026-13-01
         return NO_STAMP
     east_s = 3600 * int(hours or 0) + 60 * int(minutes or 0)
     seconds += east_s if sign == '-' else -east_s

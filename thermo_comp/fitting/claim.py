@@ -140,9 +140,8 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # A curve may have columns that the temperatures of the soaks do not show. From one attitude
-    # the drifts of bias and scale factor cannot be separated: each may have the columns of the
-    # other.
+    # Few temperatures do not determine all powers of a curve. One attitude does not separate the
+    # drifts of bias and scale factor, so each of them may have the columns of the other.
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))

@@ -85,7 +85,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the begin of the part that is read [s]; set when
+        #: Time from the bag's first sample to the part of the bag that is read [s]; set when
         #: the first sample is read.
         self.since_s = 0.0
         self.apart = ''  # warning, if any so far, about a thermometer on another clock
