@@ -135,7 +135,7 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_have_no_false_switches(sensor):
-    # At the required 0.05 switches an hour more than 2 openings in 15 h have p < 0.01.
+    # At the required 0.05 switches an hour (2 per opening) over 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):

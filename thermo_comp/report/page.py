@@ -115,7 +115,7 @@ def render_report(
 
 
 def position_error(bias: float, time: float) -> float:
-    """Return the position error of a constant error [m/s^2] of a horizontal axis, ``b t^2/2``."""
+    """Return the position error [m] by a constant horizontal error [m/s^2] after a time [s]."""
     return 0.5 * bias * time * time
 
 

@@ -69,7 +69,7 @@ class SlowUncertainty:
         by_pair = by_pair[self._correction.layout.lag_pairs, :, 0]
         moved = by_pair * np.array(start_shares)[:, np.newaxis]
         # If the start was in a ramp, the parts were behind the board, by an unknown amount up to
-        # that of a long ramp at the rate of now, within the calibrated temperatures.
+        # that of a long ramp at the present rate, within the calibrated temperatures.
         behind = hold(state[RATE] * self._behind_s, -self._span, self._span)
         in_ramp = (moved * behind[:, np.newaxis]).sum(axis=0)
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
