@@ -136,7 +136,7 @@ an output that is its input.
 ## Recording a test
 
 `thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the node's inputs, and to every other
-`temperature/<name>`, once they have a publisher, reliably if offered. `thermo_comp_record` publishes nothing. See
+`temperature/<name>`, once they have a publisher, as reliable if the publisher is. `thermo_comp_record` publishes nothing. See
 [Recording](recording.md#recording).
 
 ## Parameters

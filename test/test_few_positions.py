@@ -78,7 +78,7 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
     at = np.array([-3.0, 12.0])
     for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
         fitted = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
-        # 15000 samples of 3 mg over 16 K determine a slope to some hundredths of a mg/K.
+        # 15000 samples (noise 3 mg) over 16 K determine a slope to some hundredths of a mg/K.
         assert fitted == pytest.approx(slope, abs=0.2)
 
 

@@ -411,5 +411,5 @@ def test_an_axis_that_reads_one_value_is_refused():
 
 
 def test_positions_in_motion_are_refused(rng):
-    with pytest.raises(FitError, match='no ellipsoid'):
+    with pytest.raises(FitError, match='not lie on an ellipsoid'):
         constant_calibration(rng.standard_normal((30, 3)), GRAVITY, 1e-3)

@@ -56,7 +56,7 @@ class Windows:
     tilt: temperatures with which a support may tilt, over their RMS, shape (n, k)
     forces: known |f| and nonlinear terms; None if |f| is gravity in all positions
     undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,); None if the fit
-        shall estimate them
+        estimates them
     acts_on: axes that each column acts on, shape (m, 3); None for all
     """
 
