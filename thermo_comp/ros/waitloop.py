@@ -128,7 +128,7 @@ class RawSubscription:
         return messages[first:], received_ns[first:], first
 
     def drain(self) -> tuple[list[bytes], list[int], list[int | None]]:
-        """Take waiting messages, oldest first; return also arrival times [ns] and their numbers."""
+        """Take waiting messages, oldest first; return also arrival times [ns] and numbers."""
         messages: list[bytes] = []
         received_ns: list[int] = []
         numbers: list[int | None] = []
