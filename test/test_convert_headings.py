@@ -216,7 +216,7 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
     ],
 )  # fmt: skip
 def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
-    # WHY: minutes were read as seconds; the message for other times did not apply to them.
+    # WHY: minutes were read as seconds, and the message about other times named a wrong cause.
     path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
         table_log(path, guess_columns(path))

@@ -120,7 +120,7 @@ def position_error(bias: float, time: float) -> float:
 
 
 def schuler_peak(bias: float) -> float:
-    """Return the largest position error [m] of a constant error, 2 R b / g, after 42 minutes."""
+    """Return the largest position error [m] by a constant bias, 2 R b / g, after 42 minutes."""
     return 2.0 * _EARTH_RADIUS * bias / STANDARD_GRAVITY
 
 

@@ -230,7 +230,7 @@ class ChangeDetector:
 
     def _follow(self, rate: float, dt: float) -> None:
         """
-        Let the baseline follow a rate that lasts for `dt` [s], by one swing per memory at most.
+        Let the baseline follow a rate that lasts for `dt` [s]; its swing and error limit the step.
         """
         baseline, error = self._baseline, self._baseline_error
         limit = self.swing + error
