@@ -83,7 +83,7 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
 
 
 def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], float]]:
-    """Yield name, bag, the begins of all parts and the end [s], and the length of a window [s]."""
+    """Yield name, bag, the starts of all parts and the end [s], and the length of a window [s]."""
     # From the sensor's last jump (docs/real_data.md) until the sensor is taken out of the freezer.
     yield 'freezer', freezer_bag(folder, work), [518.5, *np.arange(900.0, 1941.0, 104.0)], 10.0
     for unit in range(3):

@@ -58,7 +58,7 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
         lines=True,
     )
     if done.returncode:
-        # A process that the system has killed, as for lack of memory, prints nothing.
+        # A process that the system has killed, e.g. for lack of memory, prints nothing.
         lines = done.stderr.splitlines() or [f'exit code {done.returncode}']
         sys.exit(f'{task} of {len(paths)} bags failed: {lines[-1]}')
     return dict(json.loads(done.stdout))

@@ -4,7 +4,7 @@
 Owns the cost of a fleet: scaling, overhead of the scheduler, network traffic, lost results.
 
 Units are simulated and written to bags once (``--folder`` keeps them), and fitted as by the
-command `fleet fit`. Workers are processes of one thread, as by `fleet fit`.
+command `fleet fit`. Workers are processes of one thread, as in `fleet fit`.
 
     python benchmarks/fleet.py scaling              strong and weak, 1 and 2 workers
     python benchmarks/fleet.py overhead             500 small units, and 100 computed workers

@@ -11,7 +11,7 @@ of coefficients, and compensated.
 
 The gyroscopes are ideal and the Earth does not rotate, so that only the accelerometer matters; the
 height, which needs a barometer, is kept constant. The filter has four errors per level axis,
-position p, velocity v, tilt a and accelerometer b, as of [1]_ chapter 12::
+position p, velocity v, tilt a and accelerometer b, as in [1]_ chapter 12::
 
     p' = v      v' = b - g a      a' = v / R      b' = -b / tau + noise
 

@@ -31,8 +31,8 @@ from thermo_comp.unit.calibration_file import load_calibration
 
 #: Largest number of samples that the node may be behind the player; its middleware holds 5000.
 IN_FLIGHT = 2000
-#: Time limit for discovery, and for the last messages [s]: Fast DDS repeats a lost message after 3
-#: s, on a busy machine several times.
+#: Time limit for discovery, and for the last messages [s]: Fast DDS sends a lost message again
+#: after 3 s, on a busy machine several times.
 PATIENCE_S = 30.0
 EVERYTHING = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 STAMP = Struct('<iI')

@@ -16,9 +16,9 @@ rate the node is measured once more while its `calibration_file` is set twice a 
 binds each relay to a core. `--floor` measures a third relay, too, which copies bytes with one wait
 set, one subscription and the node's profile, and computes nothing.
 
-The source keeps `--depth` samples to repeat them. With a reliable relay Fast DDS removes samples
-from the source's store 859 at a time; with 2000 kept samples the removal delays the source by 1 to
-3 ms, which is no property of the relay.
+The source keeps `--depth` samples to send lost samples again. With a reliable relay Fast DDS
+removes samples from the source's store 859 at a time; with 2000 kept samples the removal delays
+the source by 1 to 3 ms, whatever the relay.
 
 Processes that missed each other's first DDS announcements discover each other at the next
 announcements, 3 s later. A process that opens another's shared memory may stand still for a third
@@ -122,7 +122,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def _calibration_for(rate: int, folder: Path) -> str:
-    """Write the example's calibration for a unit of this rate."""
+    """Write the example calibration with `rate` conversion cycles per second; return its path."""
     from dataclasses import replace
 
     from thermo_comp.unit.calibration_file import load_calibration, save_calibration

@@ -153,7 +153,7 @@ def seconds(run: Callable[[], object], repeats: int = 1) -> tuple[float, float]:
 
 
 def pipelines(folder: Path, n: int, repeats: int) -> None:
-    """Compare the whole process, bag to bag, in samples per second."""
+    """Print the samples per second of both pipelines, from bag to bag."""
     path, output = folder / 'in.mcap', folder / 'out'
     n_peer = n // 20
     peer = folder / 'peer.mcap'
@@ -174,7 +174,7 @@ def pipelines(folder: Path, n: int, repeats: int) -> None:
 
 
 def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
-    """Measure reading, and reading with compensation, and their growth with the length."""
+    """Time the reading of bags of rising length, without and with compensation."""
     print(
         f'{compression}: wall (CPU) seconds; alone = compensation only, million samples per CPU s'
     )

@@ -53,7 +53,7 @@ BASELINES = ('constants', 'cubic', 'golovach', 'sets')
 #: Smallest share of the minutes in which a correction must publish all samples; below 1, because
 #: the node publishes nothing before the first reading of a thermometer.
 LEAST_PUBLISHED = 0.98
-#: Cases of recorded bags, which have one unit.
+#: Cases of recorded bags, each with a single unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the means of a minute and the curves by scipy of the benchmark `strangers.py`.
+Owns the baselines fitted by scipy to one-minute means, for the benchmark `strangers.py`.
 
 Constants are nine numbers: bias, scale and misalignment. A cubic has in addition to the constants,
 for each axis, a cubic of the bias and a line of the scale over board temperature. Constants and

@@ -182,7 +182,7 @@ def rms(values: Floats | Sequence[float]) -> float:
 
 
 def judged_ratio(score: Score) -> float:
-    """Return the ratio that is limited: over three axes, or along the norm without a truth."""
+    """Return the limited ratio: that over three axes or, if no truth is known, of the norm."""
     return score.norm_ratio if np.isnan(score.ratio) else score.ratio
 
 

@@ -276,7 +276,7 @@ def record(
     Returns
     -------
     Bag
-        With the true force.
+        The recording, with the true force.
 
     """
     lasts_s = float(corners[-1, 0])

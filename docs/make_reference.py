@@ -115,7 +115,7 @@ parameters.
 
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has no
 ROS QoS setting. With the default of 0 s each sample for a reliable subscriber wakes a thread of the middleware about four
-times, which takes a quarter of the node's CPU time. A lost sample is repeated up to 20 ms later than by default. Another
+times, which takes a quarter of the node's CPU time. A lost sample is sent again up to 20 ms later than with the default. Another
 profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces the profile of
 the node; repeat the parameter in the other profile.
 
@@ -136,7 +136,7 @@ an output that is its input.
 ## Recording a test
 
 `thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the node's inputs, and to every other
-`temperature/<name>`, once they have a publisher, reliably if offered. `thermo_comp_record` publishes nothing. See
+`temperature/<name>`, once they have a publisher, as reliable if the publisher is. `thermo_comp_record` publishes nothing. See
 [Recording](recording.md#recording).
 
 ## Parameters

@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / 'README.md').read_text(encoding='utf-8')
-SESSION = ROOT / 'docs' / 'cli.md'
+CLI_PAGE = ROOT / 'docs' / 'cli.md'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
 _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
@@ -26,7 +26,7 @@ _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 def shown():
     """Return the page's console examples: sub-command -> (words of the command, output)."""
     collected = {}
-    for kind, text in FENCE.findall(SESSION.read_text(encoding='utf-8')):
+    for kind, text in FENCE.findall(CLI_PAGE.read_text(encoding='utf-8')):
         if kind == 'console':
             command, _, output = text.partition('\n')
             words = shlex.split(command.removeprefix('$ '))
@@ -66,12 +66,12 @@ def refresh():
             )  # fmt: skip
             return f'```console\n{command}\n{finished.stdout.rstrip()}\n```'
 
-        page = SESSION.read_text(encoding='utf-8')
+        page = CLI_PAGE.read_text(encoding='utf-8')
         text = re.sub(r'^```console\n(.*?)^```', run, page, flags=re.MULTILINE | re.DOTALL)
         shutil.copy(
             Path(folder, 'out', 'figures', '4_gravity.png'), ROOT / 'docs/images/gravity.png'
         )
-    SESSION.write_text(text, encoding='utf-8')
+    CLI_PAGE.write_text(text, encoding='utf-8')
 
 
 if __name__ == '__main__':

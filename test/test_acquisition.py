@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the tests of the state of a recording: known positions, in blocks of any length."""
+"""The progress of a test during recording: simulated positions are found in any blocks."""
 
 from dataclasses import replace
 

@@ -126,7 +126,7 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
     ('spoil', 'name', 'text'),
     [
         (late_by(120.0), 'unmeasured', '^2[0-9] % of the time at rest has no temperatures'),
-        # WHY: `no temperatures ... the same clock?` for a soak before the first whole degree.
+        # WHY: a soak before the first whole degree ended in `no temperatures ... the same clock?`.
         (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
         (in_kelvins, 'kelvins', r'^temperature/board reads 2\d+\S* .. \d+\S* degC: that looks'),

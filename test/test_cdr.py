@@ -103,7 +103,7 @@ def test_signalling_nan_survives_the_byte_swap():
 
 
 def test_frame_ids_of_several_lengths_in_one_stream():
-    # WHY: another length of frame_id, as of a second driver, shifts all later bytes of a message.
+    # WHY: another length of frame_id, by a second driver, shifts all later bytes of a message.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))

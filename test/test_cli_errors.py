@@ -84,7 +84,7 @@ class TestUsage:
             (('simulate', '-o', 'a', '--positions=2.5'),
              r"--positions.*(expected a whole number, got '2\.5'|'2\.5' is not a valid int)"),
             (('fit', 'a', '-o', 'b', '--gravity', '9.8,1'),
-             r"--gravity: expected a number with a point, as 9\.8154, got '9\.8,1'"),
+             r"--gravity: expected a number with a point, like 9\.8154, got '9\.8,1'"),
             (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', '1e4'),
              r'--reference-temperature: must be less than 1000, got 10000'),
             (('export', 'a', '--to', 'ardupilot', '--device-id', '7', '-o', 'b'), r'is for PX4'),

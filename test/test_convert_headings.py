@@ -216,7 +216,7 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
     ],
 )  # fmt: skip
 def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
-    # WHY: minutes were read as seconds; the message for other times did not apply to them.
+    # WHY: minutes were read as seconds, and the message about other times named a wrong cause.
     path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
         table_log(path, guess_columns(path))
@@ -372,7 +372,7 @@ def test_the_unit_of_times_gives_a_plausible_sample_rate(tmp_path, rng, step, un
 
 
 def test_seconds_and_milliseconds_differ_in_how_fast_a_hand_turns(tmp_path, rng):
-    # WHY: samples at 1 Hz were taken for 1 kHz. The units are turned by 180 deg in 1 s and 0.8 s.
+    # WHY: samples at 1 Hz were taken for 1 kHz. A turn by 180 deg takes 1 s, then 0.8 s.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):

@@ -114,8 +114,8 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch):
     assert n_figures == 2
 
 
-def test_refusals_on_the_page_are_those_of_the_source():
-    text = (ROOT / 'docs' / 'recording.md').read_text()
+def test_messages_on_the_pages_are_those_of_the_source():
+    text = ''.join((ROOT / 'docs' / name).read_text() for name in ('recording.md', 'at_home.md'))
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10
     sources = ''.join(path.read_text() for path in (ROOT / 'thermo_comp').rglob('*.py'))

@@ -26,7 +26,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 SIGMAS = 5.0
 #: Largest difference [m/s^2] of a recovered output to the undisturbed run: 1 ug.
 RECOVERED = 9.80665e-6
-#: Rows about the order of arrival, which the node takes from the middleware.
+#: Rows that also run over DDS, because the order of arrival matters in them.
 OVER_DDS = (
     *('board late by 5 s', 'counts out of order'),
     *('time jumps back', 'temperatures of another clock'),

@@ -41,7 +41,7 @@ def left_by(pair, **options):
 
 def test_two_positions_tell_the_thermal_response():
     # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine the sd to 6 %, and superfluous
-    # columns may add 10 %. Half of 36 pairs of positions reach this (docs/accuracy.md).
+    # columns may add 10 %. All 36 pairs of positions have a median of 1.3 ug (docs/accuracy.md).
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 
@@ -78,7 +78,7 @@ def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
     at = np.array([-3.0, 12.0])
     for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
         fitted = np.diff(axis.bias_function.value(at))[0] / 15.0 / MG
-        # 15000 samples of 3 mg over 16 K determine a slope to some hundredths of a mg/K.
+        # 15000 samples (noise 3 mg) over 16 K determine a slope to some hundredths of a mg/K.
         assert fitted == pytest.approx(slope, abs=0.2)
 
 
@@ -157,7 +157,7 @@ def test_counts_of_32_bits_are_fitted(rng):
 
 
 def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
-    # WHY: the positions of one recording agree, and its bias was claimed to a sixth of the error.
+    # WHY: the positions of one recording agree: the claimed sd of the bias was 1/6 of the error.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(18, 3)
     # The prior of a MEMS with a noise of 0.02 m/s^2 in a sample at 100 Hz, and a stated sd.
@@ -173,7 +173,7 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
 
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: knocks cut each position into rests that agree, and the claimed offset was a twentieth.
+    # WHY: with positions cut into rests, which agree, the claimed sd of the offset was 1/20.
     whole, cut = (
         fit([turned(rng, np.repeat(positions(9, 3), n, axis=0))], OPTIONS) for n in (1, 5)
     )

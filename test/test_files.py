@@ -47,7 +47,7 @@ def umask(mask):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return a folder with bags of each kind, a calibration, and other names of them."""
+    """Return a folder with bags of each kind, a calibration, and links to them."""
     save_calibration(calibration(), tmp_path / 'unit.yaml')
     bag(tmp_path / 'raw.mcap')
     bag(tmp_path / 'raw')
@@ -221,7 +221,7 @@ def test_a_link_is_written_through(tmp_path):
 
 def test_a_writer_that_fails_leaves_no_file(tmp_path):
     (tmp_path / 'file').touch()
-    with pytest.raises(OutputError, match=r'unit\.yaml: cannot be written: .*is no directory'):
+    with pytest.raises(OutputError, match=r'unit\.yaml: cannot be written: .*is not a directory'):
         write_atomically(tmp_path / 'file' / 'unit.yaml', b'', CALIBRATION)
     draft = Draft(tmp_path / 'new' / 'bag', BAG)
     draft.drop()

@@ -107,6 +107,6 @@ def test_a_bag_of_another_environment_is_excluded_and_widens_the_claimed_sd():
         # In bag r4 the slope above the knee is 5 times 20 ug/K, over 11 K; half as much on z.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
-    # One more bag of the same environment is no contradiction.
+    # One more bag of the same environment contradicts no other bag.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]

@@ -274,7 +274,7 @@ def faces(scale, offset, rng):
 
 
 def test_accelerations_are_not_taken_for_counts(rng):
-    with pytest.raises(FitError, match=r'norm 9.81 and are no whole numbers: they look like m/s'):
+    with pytest.raises(FitError, match=r'norm 9.81 and are not whole numbers: they look like m/s'):
         fit(faces(9.81, 0.01, rng), FitOptions(gravity=9.81))
     with pytest.raises(FitError, match='they look like g, not counts'):
         fit(faces(1.0, 0.01, rng), FitOptions(gravity=9.81))

@@ -101,7 +101,7 @@ def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, r
     assert 'swapped' not in findings
     assert 'no ramp' in findings['ramps'].message
     assert 'soaks at 3 temperatures' in findings['soaks'].message
-    # A slow drift through the whole range is no soak.
+    # A slow drift through the whole range is not a soak.
     drift = replace(windows, rate=0.0 * windows.rate)
     assert 'soaks' not in findings_of(drift, up)
 
@@ -169,10 +169,10 @@ def test_the_residual_of_the_fit_is_reported():
     ('given', 'name', 'message'),
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
-        # The temperatures are stamped an hour late, as by another clock.
+        # The temperatures are stamped an hour late, by another clock.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
-        # WHY: 0.3 K show nothing; noise is no misfit; a turn-on is no loose thermometer.
+        # WHY: false advice for a span of 0.3 K, for noise, and for different turn-ons.
         ((1.1, 1.0, 0.1, 1.0, 0.3), 'residual', '1.1 ug RMS raw'),
         ((85.0, 2.6, 50.0, 14.6, 8.6, 2.6, 2.6), 'residual', '2.6 ug in sample'),
         ((3689.0, 980.0, 1500.0, 1793.0, 30.0, 60.0, 40.0), 'misfit', 'mounted or switched on'),

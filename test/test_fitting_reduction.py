@@ -160,7 +160,7 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     assert noise == pytest.approx(0.02, rel=0.1)
     (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'spikes')
     assert '33 readings' in finding.message
-    # Slow readings of a fast change are no spikes.
+    # Slow readings of a fast change are not spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
 
 

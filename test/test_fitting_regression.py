@@ -205,8 +205,8 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: With LINEAR groups the problem is linear in everything except directions, which are determined
-#: to some urad: the result is exact except for rounding. With PRODUCTS the scores, which are one
-#: or two linear steps, neglect the product of the changes of initial state and weight.
+#: to some urad: the result is exact except for rounding. With PRODUCTS a score, found by one or
+#: two linear steps, neglects the product of the changes of initial lag state and of its weight.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
@@ -411,5 +411,5 @@ def test_an_axis_that_reads_one_value_is_refused():
 
 
 def test_positions_in_motion_are_refused(rng):
-    with pytest.raises(FitError, match='no ellipsoid'):
+    with pytest.raises(FitError, match='not lie on an ellipsoid'):
         constant_calibration(rng.standard_normal((30, 3)), GRAVITY, 1e-3)

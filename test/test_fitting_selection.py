@@ -327,7 +327,7 @@ def test_tilts_of_supports_are_estimated_apart_from_the_unit():
 
 
 def test_a_stiff_support_gets_no_tilt(calm):
-    # The estimated tilt is below the noise of the mean of 60 windows of 2 ug.
+    # The estimated tilt is below the noise of the mean of 60 windows with a noise of 2 ug each.
     _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
     tilt = GRAVITY * chosen.posterior.state.tilt

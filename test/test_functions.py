@@ -150,7 +150,7 @@ def slope_and_lag(variances):
 
 
 def test_the_predicted_sd_by_hand():
-    # Parameters of x: level and slope of both biases, weight of the lag, two levels of scale.
+    # Parameters of x: level and slope of the bias by set, weight of the lag, both scale levels.
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     bias, scale = sd_of_states(unit, states)

@@ -30,7 +30,7 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
 
 def test_residual_of_a_good_calibration_is_within_its_sd(rng):
     result = watch(rng)
-    # The mean of a window of 99 samples has a noise of 0.2 mm/s^2, of 30 windows 0.04 mm/s^2.
+    # The mean of 99 samples has a noise of 0.2 mm/s^2, the mean of 30 such windows 0.04 mm/s^2.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
     assert result.n_windows == 59  # the first of 60 windows has no predecessor

@@ -55,7 +55,7 @@ def test_changes_between_calibrations_and_their_sd_by_hand():
 
 def test_calibrations_that_are_no_history_give_no_drift():
     unit = dated('2026-01-01')
-    # A single calibration, models of the same bags, and another unit are no history.
+    # A single calibration, models of the same bags, or another unit do not form a history.
     other = dataclasses.replace(unit, unit=dataclasses.replace(unit.unit, serial='other'))
     for calibrations in ([unit], [unit, unit], [unit, dataclasses.replace(other)]):
         assert drifts_of(history_of(calibrations)) == []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests and messages of strangers on the network: the node answers, and samples go on."""
+"""Requests and messages of unknown peers on the network: the node answers, and samples go on."""
 
 import os
 import re

@@ -27,7 +27,7 @@ def source(words, name='words'):
 
 
 def words_of(ups, rng, seconds=20.0):
-    """Read each attitude for some seconds after a second of handling; integers."""
+    """Draw integer codes at 100 Hz: in each attitude 1 s of handling, then `seconds` at rest."""
     parts = []
     for up in ups:
         n = round(100 * seconds)

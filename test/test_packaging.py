@@ -85,7 +85,7 @@ def test_no_source_file_is_too_long():
 
 
 def test_the_manifest_lists_dependencies_of_the_node_alone():
-    # Other dependencies of the commands come from PyPI; the node needs none of them.
+    # Only the commands have further dependencies, which come from PyPI.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
         'python3-numpy',

@@ -147,8 +147,8 @@ def test_a_unit_without_lags_gets_none():
 
 
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
-    # WHY: lags included a part of the effect of the gradient, 223 s for 163 s; the columns that
-    # made up for this failed in a soak, 167 ug with a claim of 15.
+    # WHY: a time constant absorbed a part of the effect of the gradient (223 s instead of 163 s),
+    # and the columns that balanced this failed in a soak: error 167 ug, claimed sd 15 ug.
     (study,) = gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
@@ -212,8 +212,8 @@ def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
 
 @pytest.mark.parametrize('given', [{}, {'mounting_sd': 3e-4}])
 def test_six_faces_in_three_soaks(given):
-    # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces, and drifts of
-    # 10 mg ended in such a fit: 40 mg. With a stated repeatability the fit divided by zero.
+    # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
+    # unit with drifts of 10 mg left 40 mg. With a stated repeatability the fit divided by zero.
     rng = rng_of('faces in soaks', 1)
     unit = replace(cheap(rng), skew=np.zeros(3))
     faces = np.vstack((np.eye(3), -np.eye(3))).repeat(3, axis=0)
@@ -225,7 +225,7 @@ def test_six_faces_in_three_soaks(given):
 
 
 def test_a_curve_between_two_soaks_is_claimed():
-    # WHY: the claimed sd was an eighth of the error, without the powers that the bags do not show.
+    # WHY: without the powers that the soaks do not determine the claimed sd was 1/8 of the error.
     rng = rng_of('two soaks')
     unit = cheap(rng)
     bags = positions(unit, SOAKS[::2], spread(18, rng), rng, rate_hz=10.0)
@@ -235,7 +235,7 @@ def test_a_curve_between_two_soaks_is_claimed():
 
 
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
-    # WHY: with each axis vertical at another temperature the error was 15 claimed sd.
+    # WHY: if each axis was vertical at a different temperature, the error was 15 claimed sd.
     rng = rng_of('confounded soaks')
     unit = navigation(rng)
     faces = np.vstack((np.eye(3), -np.eye(3), np.eye(3)))
@@ -246,7 +246,7 @@ def test_a_curve_that_the_soaks_do_not_show_is_claimed():
 
 
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
-    # WHY: left-out soaks, which show no lags, refused the columns of the bag of ramps.
+    # WHY: the score of left-out soaks, which show no lags, rejected the columns of the ramps.
     rng = rng_of('soaks and a ramp')
     unit = navigation(rng)
     ramps = positions(unit, HALF, spread(1, rng), rng)
@@ -306,6 +306,6 @@ def test_fit_says_how_far_the_parts_lag(parts, tmp_path, cli):
 
 
 def test_soaks_alone_do_not_tell_a_loose_thermometer():
-    # Soaks do not show the lag of the board, so the gradient of a ramp is no sign of a fault.
+    # Soaks do not show the lag of the board, so the gradient of a ramp does not indicate a fault.
     study = next(soaks(1))
     assert strangers.fitted(replace(study, bags=study.bags[:9])).rest_gradient_range_k is None

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The README and the session on the page of the command line: outputs and links are right."""
+"""The README and the console examples of docs/cli.md: outputs and links are right."""
 
 import re
 
 import pytest
 import yaml
 from desk_helpers import write_fit_of_the_readme
-from readme_helpers import FENCE, README, ROOT, SESSION, is_alike, shown
+from readme_helpers import CLI_PAGE, FENCE, README, ROOT, is_alike, shown
 
 from thermo_comp.cli.app import app
 
@@ -33,7 +33,7 @@ def test_commands_that_no_test_runs_exist():
     known |= {group.typer_instance.info.name for group in app.registered_groups}
     named = set(re.findall(r'(?:^|^\$ |`)thermo_comp (\w+)', README, re.MULTILINE))
     assert named <= known, named - known
-    page = SESSION.read_text(encoding='utf-8')
+    page = CLI_PAGE.read_text(encoding='utf-8')
     assert {c for c in known if f'`thermo_comp {c}' in page} == known
     makefile = (ROOT / 'Makefile').read_text()
     for target in re.findall(r'^make (\w+)', README, re.MULTILINE):

@@ -246,7 +246,7 @@ def test_an_output_may_be_a_link(tmp_path):
 
 def test_an_output_that_cannot_be_created_is_refused(tmp_path):
     (tmp_path / 'file').write_text('')
-    with pytest.raises(OutputError, match=r'cannot be written: .*file is no directory'):
+    with pytest.raises(OutputError, match=r'cannot be written: .*file is not a directory'):
         BagWriter(tmp_path / 'file' / 'bag.mcap')
     if os.geteuid() == 0:
         with pytest.raises(OutputError, match='cannot be written'):

@@ -102,7 +102,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # A statistic with a known onset is a lower bound of the CUSUM's delay, within a second.
+        # With a known onset the delay is a lower bound of the CUSUM's delay, within a second.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -135,7 +135,7 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_have_no_false_switches(sensor):
-    # At the required 0.05 switches an hour more than 2 openings in 15 h have p < 0.01.
+    # At the required 0.05 switches an hour (2 per opening) over 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):

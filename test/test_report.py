@@ -246,7 +246,7 @@ def test_the_page_is_written_atomically(tmp_path):
     folder = tmp_path / 'figures'
     folder.write_text('in the way')
     plain = evidence_of_bags([], builders.calibration())
-    with pytest.raises(OutputError, match='figures is no directory'):
+    with pytest.raises(OutputError, match='figures is not a directory'):
         write_report(plain, target, figures=folder)
     assert target.read_text() == '<!doctype html>old'
     assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']

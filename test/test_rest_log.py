@@ -119,7 +119,7 @@ def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
 
 
 def test_windows_of_a_rest_of_a_day_are_kept_ever_more_rarely():
-    # Of a rest are kept: 60 windows in 10 min, one a minute up to 1 h, then one in 5 min.
+    # Windows kept of a rest: 60 in 10 min, one a minute up to 1 h, then one in 5 min.
     kept, one = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):

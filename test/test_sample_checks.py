@@ -96,7 +96,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
         begin = end
     assert collected == expected
     assert many.n_same == one.n_same
-    np.testing.assert_array_equal(many.run, one.run)  # NaN, before the first sample, equals NaN
+    np.testing.assert_array_equal(many.run, one.run)  # NaN before the first sample
 
 
 def test_a_user_may_switch_checks_of_samples_off():

@@ -108,7 +108,7 @@ def test_white_noise_has_its_density(unit):
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
     # The converter carries its remainder, so that its noise rises with f^2: 1 (ug)^2/Hz at 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
-    # 128 lines of 87 half-overlapping averages scatter by 1 %.
+    # The mean of 128 lines, each averaged over 87 half-overlapping segments, scatters by 1 %.
     np.testing.assert_allclose(
         power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
     )
@@ -138,7 +138,7 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
         (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
-    # 540 readings of 5 mK determine the mean to 0.2 mK and the sd to 3 %; limits: 5 sd.
+    # 540 readings with 5 mK of noise determine the mean to 0.2 mK and the sd to 3 %; limits: 5 sd.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 

@@ -141,7 +141,7 @@ def test_the_user_sets_the_shortest_rest(rng):
 
 
 def test_a_ramp_moves_no_unit_at_rest(rng):
-    # A drift of 60 ug per cell, 60 times the noise, is no motion; a knock of 0.1 mrad is a motion.
+    # A drift of 60 ug per cell, 60 times the noise, is not a motion, a knock of 0.1 mrad is.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG

@@ -92,7 +92,7 @@ def test_a_missing_cooling_ramp_is_reported(tmp_path):
 
 
 def test_a_quantum_is_no_ramp(tmp_path):
-    # Temperatures alternate between whole degrees: 1 K within 1 s is no ramp of 60 K/min.
+    # Temperatures alternate between whole degrees: 1 K within 1 s is not a ramp of 60 K/min.
     flips = 20.0 + (np.arange(3600) % 2)
     result = survey(tmp_path / 'bag', flips)
     board = result.thermometers['board']

@@ -137,7 +137,7 @@ def test_a_constant_without_noise_is_exact():
 
 
 def test_a_straight_line_without_noise_is_found():
-    # The prior sd of the rate, 3 K/min, is negligible after minutes of readings of 5 mK.
+    # The prior sd of the rate, 3 K/min, is negligible after minutes of readings (noise 5 mK).
     thermometer = Thermometer(ThermometerSettings())
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)

@@ -15,8 +15,8 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def test_a_start_in_a_ramp_is_claimed():
-    # WHY: a node that restarted in a ramp claimed a third of its error: the parts lag the board by
-    # the rate times their time constant, 1 K here, and not by the sd of a start at rest, 0.4 K.
+    # WHY: after a restart in a ramp the claimed sd was a third of the error: a part lags the board
+    # by the rate times its time constant, 1 K here; after a start at rest its sd is 0.4 K.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate in (0.0, 1.0 / 60.0):
@@ -81,7 +81,7 @@ def test_beyond_1_g_the_covariance_has_an_unknown_square():
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
 def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fault):
     # WHY: the bias follows a part that lags the board by 10 min, so a sudden error of the board
-    # temperature changes nothing, but a lasting error does; only the sudden error was claimed.
+    # temperature changes nothing, but a lasting error does; the sd had only the first.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))

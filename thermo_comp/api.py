@@ -136,7 +136,7 @@ def correct(
     unknown = sorted(set(sensors) - set(calibration.sensors))
     if unknown:
         known = ', '.join(('board', *calibration.sensors))
-        raise ValueError(f'`{unknown[0]}` is no thermometer of this calibration: it has {known}')
+        raise ValueError(f'`{unknown[0]}` is not a thermometer of the calibration: it has {known}')
     given = _block(time_s, counts, {'board': board, **sensors}, 0)
     compensator = Compensator(calibration, config)
     block = process_block(compensator, given)

@@ -84,7 +84,7 @@ def shown_name(path: str | Path) -> str:
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file; OSError, before reading can block, for anything else, as for a pipe."""
+    """Open a regular file; OSError, before reading can block, for anything else, e.g. a pipe."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -140,7 +140,7 @@ def check_output(
         return
     folder = next(above for above in target.parents if above.exists())
     if not folder.is_dir():
-        raise OutputError(f'cannot be written: {folder} is no directory', path)
+        raise OutputError(f'cannot be written: {folder} is not a directory', path)
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f'cannot be written: no permission to write in {folder}', path)
 

@@ -3,7 +3,7 @@
 """
 Owns recordings that other people made, as `test/test_real_data.py` reads them.
 
-The recordings are no part of the project: they are read from a folder beside the project, turned
+The recordings are not part of the project: they are read from a folder beside the project, turned
 into bags in a temporary directory.
 """
 

@@ -26,7 +26,7 @@ _REST_S = 10.0
 # Minimum length of a cell (samples averaged together) [s], and number of samples from which the
 # length is chosen.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
-# Number of earlier cells that are searched again for the begin of a rest.
+# Number of earlier cells that are searched again for the start of a rest.
 _LOOKED_BACK = 200
 # Sd of a position's force by hysteresis, mounting and drift, however long the rest [g].
 _FLOOR_SD = 2e-5

@@ -127,7 +127,7 @@ def _plain(message: str, arguments: list[str]) -> str:
         if word.partition('=')[0] in (option[1], option[2])
     ]
     values = ', '.join(map(repr, given))
-    wanted = 'a whole number' if option[3] == 'integer' else 'a number with a point, as 9.8154'
+    wanted = 'a whole number' if option[3] == 'integer' else 'a number with a point, like 9.8154'
     return f'{option[1]}: expected {wanted}, got {values}'
 
 

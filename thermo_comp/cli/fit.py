@@ -47,8 +47,8 @@ def fit(
         'Prior: a calibration of the type, or an old calibration of the unit.', metavar='YAML'
     ),
     ageing_bias: str | None = option(
-        'Assumed bias change (1 sd) since the prior calibration, as 50ug; default: estimated from '
-        'the bags.'
+        'Assumed bias change (1 sd) since the prior calibration, e.g. 50ug; default: estimated '
+        'from the bags.'
     ),
     ageing_scale: float = option(
         'Assumed scale change (1 sd) since the prior calibration, in ppm.', 0.0, metavar='PPM'

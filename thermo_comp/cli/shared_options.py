@@ -108,7 +108,7 @@ SERIAL = option(
     "Serial of the unit, instead of the bag's; '' accepts any calibration.", callback=check_serial
 )
 OFFSET = option(
-    'Reading of raw samples without a force, as 32768; default: detected.', metavar='WORD'
+    'Reading of raw samples without a force, e.g. 32768; default: detected.', metavar='WORD'
 )
 INPUT = option(
     'Input to read from the bag: counts, imu, or auto (the input that it has).',
@@ -200,7 +200,7 @@ def place(
 def site(
     where: tuple[float | None, float] = place,
     gravity_sd: str | None = option(
-        'Standard uncertainty of gravity, as 5ug; default: 0 for --gravity, 50ug for --latitude.'
+        'Standard uncertainty of gravity, e.g. 5ug; default: 0 for --gravity, 50ug for --latitude.'
     ),
 ) -> dict[str, float]:
     """Return local gravity and its standard deviation; a usage error if not stated."""
@@ -232,7 +232,7 @@ def judging(
 @expanded
 def force(
     specific_force: str | None = option(
-        'Known |f| of rests not at 1 g: a value for all bags, as 5g, or a file of lines '
+        'Known |f| of rests not at 1 g: a value for all bags, e.g. 5g, or a file of lines '
         "[BAG] BEGIN END |f| [SD] in s and m/s^2; default: the bags' metadata.",
         metavar='VALUE|FILE',
     ),
@@ -279,8 +279,8 @@ def fitting(
         "Largest scatter of samples at rest: a few times the sensor's noise.", '50mg'
     ),
     mounting_sd: str | None = option(
-        'Repeatability of mounting and turn-on (sd of the bias), as 30ug; default: estimated from '
-        'the bags.'
+        'Repeatability of mounting and turn-on (sd of the bias), e.g. 30ug; default: estimated '
+        'from the bags.'
     ),
     k2_sd: float | None = option(
         'Data-sheet bound (1 sd) of the quadratic nonlinearity, in ug/g^2; default: 100 if rests '

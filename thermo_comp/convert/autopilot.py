@@ -55,7 +55,7 @@ _Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, _Co
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
-_NO_NOISE = 1e-6  # noise below this is rounding of sums, as in a simulator [g]
+_NO_NOISE = 1e-6  # noise below this is rounding, as in a simulator [g]
 _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}

@@ -58,8 +58,8 @@ class Accel:
     """
     The accelerometer's three columns, which become `output`: ``counts`` or ``imu`` (m/s^2).
 
-    `clip` are the readings, in the table's unit, from which on the sensor is saturated; `offset`
-    is the reading without a force, as 32768 in offset binary, which is subtracted.
+    `clip`: lowest and highest reading, at which the sensor is saturated, in the table's unit;
+    `offset`: reading without a force, which is subtracted, such as 32768 in offset binary.
     """
 
     columns: Triple

@@ -235,7 +235,7 @@ def import_calibration(
         )
     (_, _, _), (yx, _, _), (zx, zy, _) = (matrix * K).tolist()
     if not is_si:
-        # Samples with an offset, as 32768, may reach beyond the offset by the full scale.
+        # Samples with an offset, such as 32768, may exceed the offset by the full scale.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
     unity = Polynomial((1.0,))
     x_set, y_set, z_set = (unit.AxisSet(curve, unity) for curve in _curves(content.bias))

@@ -238,7 +238,7 @@ def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
 
 
 def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
-    """Leave out single readings that are no temperatures, as -127 degC of a lost DS18B20."""
+    """Leave out single impossible readings, such as -127 degC of a DS18B20 without contact."""
     low, high = PLAUSIBLE_CELSIUS
     kept, n = {}, 0
     for name, readings in log.temperatures.items():

@@ -42,7 +42,7 @@ _ROWS_AT_ONCE = 4096  # number of rows whose cells are read together
 _MOST_ROWS_PER_BYTE = 4  # largest number of rows per byte of a Parquet file with measurements
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
-#: ISO 8601, optionally followed by the name of a zone, as of some loggers; the default is UTC.
+#: ISO 8601, optionally followed by the name of a zone, as in some logs; the default is UTC.
 _ISO = re.compile(
     r'(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d)(?::(\d\d)(?:[.,](\d{1,9})\d*)?)?'
     r'\s*(?:(Z|UTC)|([+-])(\d\d):?(\d\d)?)?(?:\s*\[[^\]]*\])?'
@@ -89,7 +89,7 @@ class Table:
     line: Ints  # line of each row in the file, from 1; in Parquet the row's number
     values: dict[Column, Floats]  # NaN if a cell is not a number
     stamp_ns: Ints  # `NO_STAMP` if a cell is not a number
-    n_short: int = 0  # number of dropped rows with too few cells, as at a cut
+    n_short: int = 0  # number of dropped rows with too few cells, such as a cut row
     not_used: tuple[str, ...] = ()  # headings, or else numbers, of the columns that were not read
     headings: tuple[str, ...] = ()
 
@@ -306,7 +306,7 @@ def _iso_ns(text: str) -> int:
     year, month, day, hour, minute, second = (int(part or 0) for part in moment)
     try:
         seconds = timegm(datetime(year, month, day, hour, minute, second).timetuple())
-    except ValueError:  # an invalid date, as in month 13
+    except ValueError:  # an invalid date, such as 2026-13-01
         return NO_STAMP
     east_s = 3600 * int(hours or 0) + 60 * int(minutes or 0)
     seconds += east_s if sign == '-' else -east_s

@@ -4,9 +4,9 @@
 Owns the ageing model of a unit: a Gaussian model of the errors at rest, with variances estimated
 by evidence.
 
-``|f| - g`` of rest i at time t_i, of start k, is ``H_i delta + B_i b(t_i) + S_i s(t_i) + B_i o_k
-+ lack + e_i``: delta is the error of the calibration (its posterior), b and s are random walks of
-bias and scale since the calibration, o_k is a bias offset of start k, e is independent noise.
+``|f| - g`` of rest i at time t_i after start k of the node is ``H_i delta + B_i b(t_i) + S_i
+s(t_i) + B_i o_k + lack + e_i``: delta is the error of the calibration (its posterior), b and s are
+random walks of bias and scale since the calibration, o_k is a bias offset, e independent noise.
 Jumps of the levels, and a change of the curve, are added one at a time while the log Bayes factor
 is high enough. The variances maximise the marginal likelihood, with wide priors.
 """
@@ -47,8 +47,8 @@ class Ageing:
     Standard deviations of the ageing model [m/s^2].
 
     bias, scale: random walk of the bias, and of the scale times g, per root day
-    turn_on: bias offset of a start
-    rest: scatter of a rest
+    turn_on: bias offset of a start of the node
+    rest: scatter from rest to rest
     """
 
     bias: float

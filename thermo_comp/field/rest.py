@@ -43,9 +43,9 @@ class Start:
 class Rest:
     """
     One window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of
-    samples; `mean` and `sd` of one sample [input units]; `state`: mean thermal state, laid out as
-    by `thermal.state.Layout` of the start's memory; `shares`: remaining share of the unseen start
-    of each lag; `rate`: mean angular rate [rad/s], empty if unknown.
+    samples; `mean`, `sd`: of these samples [input units]; `state`: mean thermal state, laid out by
+    the `thermal.state.Layout` of `Start.memory`; `shares`: share of each lag's unknown initial
+    value that remains; `rate`: mean angular rate [rad/s], empty if unknown.
     """
 
     stamp_ns: int

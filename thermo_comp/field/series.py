@@ -161,7 +161,7 @@ def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0
 
 def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     """
-    Return the begin of a calibration's validity [days since 1970], the time up to which its
+    Return the start of a calibration's validity [days since 1970], the time up to which its
     covariance is aged, and whether it is an update.
 
     Validity begins at the last rest of an update, else at the file's date, or -inf without a date.

@@ -268,7 +268,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) -> RegimeSet:
-    """Raise the slow error of each axis to the scatter of the starts, if this is larger."""
+    """Set the slow error of determined axes to `turn_on`; raise that of other axes to it."""
     axes: dict[str, Any] = {
         name: replace(
             axis,

@@ -199,7 +199,7 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
-    # Bounds: 30 ug, as of sensors of navigation grade, and 0.5 mg, as of consumer MEMS; the tail
+    # Bounds: 30 ug, typical of navigation grade, and 0.5 mg, typical of consumer MEMS; the tail
     # of the Student prior allows for more. The lower bound is smaller for almost no noise, because
     # an offset 1e6 times as large as the noise cannot be estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-6), 5e-3
@@ -278,7 +278,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Estimate the triad without temperature: from the ellipsoid, or from the norms alone."""
+    """Estimate the triad without temperature: an ellipsoid or, with few attitudes, the scale."""
     means = position_means(windows.data)
     gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)

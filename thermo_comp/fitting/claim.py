@@ -76,8 +76,8 @@ def claim_of(
 
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
-    `known_offset_sd`: sd of the offset of a turn-on in the prior calibration, which fewer turn-ons
-    do not reduce [m/s^2]; 0 for none
+    `known_offset_sd`: turn-on sd of the prior calibration, a lower bound if the bags are too few
+    to determine the sd [m/s^2]; 0 for none
     """
     # The rests of one mounting have one offset, but the regression has one for each rest. The mean
     # of k offsets with k times the variance has the variance of one.
@@ -140,9 +140,8 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # A curve may have columns that the temperatures of the soaks do not show. From one attitude
-    # the drifts of bias and scale factor cannot be separated: each may have the columns of the
-    # other.
+    # Few temperatures do not determine all powers of a curve. One attitude does not separate the
+    # drifts of bias and scale factor, so each of them may have the columns of the other.
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -198,7 +197,7 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
     weight = np.minimum(of_data, of_norms + TRIAL_GAIN)
     if n_rests > 1.0:
-        # All rests of a mounting agree: only the mountings show how well they repeat.
+        # All rests of a mounting share its offset: only the means of mountings determine the sd.
         fits, weight = solved(n_rests**0.5 * tried), of_norms
     weight = weight + _LOG_DENSITY
     weight = np.exp(weight - weight.max())

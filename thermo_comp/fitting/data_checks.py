@@ -175,7 +175,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
         # Soaks at one temperature of a chamber differ by less than 1 K, or a tenth of the span.
         is_gap = steps > max(1.0, 0.1 * steps.sum())
         n = 1 + int(is_gap.sum())
-        # A slow drift through a range is no soak.
+        # A slow drift through a range is not a soak.
         has_soaks = steps[~is_gap].sum() < n * max(1.0, 0.1 * steps.sum())
         # Five temperatures determine a cubic, and show whether it fits.
         if has_soaks and n < 5:

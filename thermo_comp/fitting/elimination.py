@@ -136,7 +136,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add the prior of the sum of the initial lag states, which is now `total`; mean 0."""
+        """Add a prior of mean 0 to the sum of the initial lag states, at present `total`."""
         cross = self.bags.solved.sum(axis=0, keepdims=True)
         cross[..., -1] += total
         block = self.bags.inverse.sum(axis=0, keepdims=True) + variance * np.eye(len(total))

@@ -44,7 +44,7 @@ def contradicting_bag(fit: Fit) -> list[int]:
     """
     Find the bag that may be of another environment: a list of one bag, or of none.
 
-    A bag is suspect if its left-out drift is far above the median of all bags, and above the white
+    A bag is suspect if its left-out drift is far above both the median of all bags and the white
     noise of a window. A bag is also suspect if its drift is the only one that the other bags do
     not determine, and the median drift is far above the noise.
     """

@@ -103,7 +103,7 @@ def _updated(
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
         new_sd = float(np.sqrt(square / (share * gamma + 1.0)))
-        # Misalignments above 2 degrees, as of three single sensors on a printed bracket, would
+        # Misalignments above 2 degrees, as with three single sensors on a printed bracket, would
         # explain the norms of six faces, to second order.
         misalignment_sd = min(new_sd, 0.03)
     start_share = prior.start_share
@@ -154,7 +154,7 @@ def _offset_sd(posterior: Posterior) -> tuple[float, float]:
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, prior.offset_sd, slope, bend + 0.1)
-    # Bounds [m/s^2]: a thousandth of the prior's scale; 5 mg, as of the cheapest consumer MEMS.
+    # Bounds [m/s^2]: a thousandth of the prior's scale; 5 mg, typical of the cheapest MEMS.
     new = float(np.clip(prior.offset_sd * np.exp(step), 1e-3 * prior.offset_scale, 0.05))
     return new, float(np.abs(np.log(new / prior.offset_sd))) if effective > 1.0 else 0.0
 

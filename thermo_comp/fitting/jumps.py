@@ -40,7 +40,7 @@ _STEP_SDS = 8.0
 @dataclass(frozen=True)
 class Jump:
     """
-    A step in the reading of a sensor at rest that is no rotation of the unit.
+    A step in the reading of a sensor at rest that is not a rotation of the unit.
 
     time: time of the step since the bag's first sample [s]
     duration_s: interval between the samples before and after the step [s]
@@ -146,7 +146,7 @@ def _examine(
     size = float(np.linalg.norm(step))
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
     needed_rad = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
-    # The step is no rotation if the gyroscope measured less than a third of the angle needed, or
+    # A step is not a rotation if the gyroscope measured less than a third of the angle needed, or
     # if |a| changed: a rotation by d changes |a| by at most 2 d times the sensor's error (10 %).
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd

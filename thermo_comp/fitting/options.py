@@ -71,7 +71,7 @@ class FitOptions:
     input: unit of the samples
     full_scale: magnitude of a saturated sample; None: 32767 for counts, and for m/s^2 the smallest
         usual range that contains the data
-    offset: code at zero force, as 32768; None: estimated from the bags
+    offset: code at zero force, such as 32768; None: estimated from the bags
     reference_temperature: T_ref [degC]; the paper uses 20
     detector: thermometer and detector settings; None: estimated from the bags
     min_rest_s: length of the shortest rest [s]; None: chosen, see `reduction`

@@ -192,7 +192,7 @@ class _PartCurves:
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in starts):
-                # Two stages or another share change a lag of one stage too little to help.
+                # A second stage or another share would change the lag too little to help.
                 return best
             lags = [self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0))]
             if self._has_case:

@@ -33,7 +33,7 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
-    """Check the raw data: saturation, motion, numbers that are no counts, jumps, angular rates."""
+    """Check the raw data: saturation, motion, values that are not counts, jumps, angular rate."""
 
     def total(name: str) -> int:
         return sum(getattr(bag, name) for bag in bags)
@@ -120,13 +120,13 @@ def _judge_units(
             yield Finding(
                 'units',
                 'refusal',
-                f'the samples have norm {size:.3g} and are no whole numbers: they look like '
+                f'the samples have norm {size:.3g} and are not whole numbers: they look like '
                 f'{unit}, not counts; record them as sensor_msgs/Imu in m/s^2',
             )
             return
     yield advice(
         'compensated',
-        'the samples are no whole numbers: scaled or compensated before they were recorded? A '
+        'the samples are not whole numbers: scaled or compensated before they were recorded? A '
         'calibration made from scaled samples is valid for that scaling only',
     )
 
@@ -140,7 +140,7 @@ class _DeadAxis(NamedTuple):
 
 
 def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
-    """Explain constant readings: clipped, if they are the largest at several ends, or dead."""
+    """Explain constant readings: clipped if several axes or signs have the largest, or dead."""
     largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
     # The limits of a two's complement differ by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)

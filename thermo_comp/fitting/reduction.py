@@ -75,17 +75,17 @@ class ReducedBag:
 
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite or out of order
-    n_cells, n_still_cells: length of the bag and of its rests in cells
+    n_cells, n_still_cells: number of cells in the bag, and in its rests
     window_s: length of a window; longer than the option if the samples are slow
     cycle_s: typical interval between samples
     middle: code at zero force of the samples if the codes are unsigned, else 0
-    max_abs: largest reading without single glitches [input units]
-    since_s: start of the part of the bag that was read [s]
-    restless: reason why the bag has no rests
-    angular_rate: part of the bag that has finite angular rates
+    max_abs: largest magnitude of a reading without outliers, see `_max_abs` [input units]
+    since_s: time from the bag's first sample to the part of the bag that was read [s]
+    restless: reason why the bag has no rests; '' if it has some
+    angular_rate: whether none, a part or the whole of the bag has finite angular rates
     n_spikes: number of readings of each thermometer that are spikes, see `is_spike`
     n_glitches: number of single samples far from their neighbours, which are left out
-    n_repeated: number of samples with the stamp of the sample before, among the dropped samples
+    n_repeated: number of dropped samples that have the stamp of the sample before
     """
 
     source: FitSource

@@ -91,7 +91,7 @@ class Fit(NamedTuple):
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
-    """Return the last of the models that is better than those before."""
+    """Compare the chosen model with each trial in turn; return the better one each time."""
     for trial in trials:
         if is_better(chosen.score, trial.score):
             chosen = trial

@@ -126,7 +126,7 @@ def _noise_of(values: Sequence[Floats], quantum: float) -> float:
 
 
 def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
-    """Return the rates in bags with at least 30 readings and 6 intervals of the rate."""
+    """Return the rate in each bag with at least 30 readings and 6 minutes."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:

@@ -70,7 +70,7 @@ class Whitener:
         """
         Run the Kalman filter over series, shape (n, m), for one noise, or for k of shape (k, 1).
 
-        Yields, for each step, the window of each position, whether it is there, the innovations,
+        Yields for each step: window of each position, whether the position has it, innovations,
         shape (..., n_positions, m), and their variances [sigma^2], shape (..., n_positions).
         """
         variance, level = ratio, 0.0

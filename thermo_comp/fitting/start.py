@@ -73,7 +73,7 @@ def constant_calibration(
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(
-            'the positions lie on no ellipsoid: is every one of them at rest, and is it an '
+            'the positions do not lie on an ellipsoid: is every one of them at rest, and is it an '
             'accelerometer, with one unit for three axes at right angles?'
         )
     return calibration

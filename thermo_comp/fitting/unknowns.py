@@ -28,7 +28,7 @@ MISALIGNMENT_SD = 1e-3
 def misalignment_scale(noise: float) -> float:
     """
     Return the built-in prior sd of an element of the misalignment [rad], by the noise in 1 Hz
-    [m/s^2]: 1 mrad up to 10 ug, as of single sensors of navigation grade on machined faces, above
+    [m/s^2]: 1 mrad up to 10 ug, typical of navigation grade sensors on machined faces, above
     proportional to the noise, up to 1 %, the cross-axis sensitivity of consumer MEMS.
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
@@ -56,7 +56,7 @@ class Windows:
     tilt: temperatures with which a support may tilt, over their RMS, shape (n, k)
     forces: known |f| and nonlinear terms; None if |f| is gravity in all positions
     undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,); None if the fit
-        shall estimate them
+        estimates them
     acts_on: axes that each column acts on, shape (m, 3); None for all
     """
 

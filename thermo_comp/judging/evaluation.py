@@ -188,7 +188,7 @@ class Drift:
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
     Sort the calibrations of the first calibration's unit by date. If several calibrations were
-    fitted on the same bags, only the first is kept: two models of the same data are no history.
+    fitted on the same bags, only the first is kept: two models of the same data show no change.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []

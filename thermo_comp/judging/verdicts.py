@@ -202,7 +202,7 @@ def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict
         f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
     # At constant temperature the correction is constant, so a residual as large as the raw
-    # residual is no fault.
+    # residual is not a fault.
     if ratio > LARGEST_RATIO:
         return Verdict.NO_BETTER if total.rms >= total.raw_rms else Verdict.RECALIBRATE, text
     return Verdict.WIDE if total.claimed_rms > WIDE_PART * total.raw_rms else Verdict.VALID, text

@@ -8,7 +8,7 @@ A converter with noise does not repeat three numbers for seconds; three exact ze
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
 calibration, or that of another unit, |f| differs from gravity by more than the claimed
 uncertainty, in windows of a second or longer that are still: the scatter is that of the sensor,
-and the mean that of the window before. A step of |f| from one rest to another is no motion: the
+and the mean that of the window before. A step of |f| from one rest to another is not a motion: the
 calibration is judged by the step within a second.
 """
 
@@ -30,7 +30,7 @@ LARGEST_RATE: Final = 1.5
 #: or duration [s].
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
-#: Relative excess of the sample rate up to which the calibrated noise holds.
+#: Largest relative deviation from the calibrated sample rate at which its noise applies.
 RATE_TOLERANCE: Final = 0.1
 _WINDOW_S: Final = 1.0  # time over which the rate of samples is measured [s]
 #: Duration of a window of the gravity check [ns]: shortest, and longest if samples are few.

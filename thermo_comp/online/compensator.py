@@ -32,7 +32,7 @@ from .checks import GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
 
-#: Smallest backward step of the stamps that is a jump of time, as of a bag that loops [ns].
+#: Smallest backward step of the stamps that is a jump of time, as in a bag that loops [ns].
 TIME_JUMP_NS: Final = 1_000_000_000
 #: A forward step of the stamps above both limits ([ns], [cycles]) is accepted only if a reading or
 #: a second sample confirms it: a single damaged stamp would erase the thermal memory.

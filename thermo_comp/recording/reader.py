@@ -58,7 +58,7 @@ class RecordingReader(ExitStack):
     The roles in `require` must be in the bag. `info` describes the bag; after all blocks are read,
     `info.truncated` names the missing messages. `topics` are the bag's names by role, `fields` the
     fields read from messages with more content, `definitions` encoding and text of message types.
-    Raises RecordingError if the file is no bag, is damaged, or a topic is missing or ambiguous.
+    Raises RecordingError if the file is not a bag, is damaged, or a topic is missing or ambiguous.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the begin of the part that is read [s]; set when
+        #: Time from the bag's first sample to the part of the bag that is read [s]; set when
         #: the first sample is read.
         self.since_s = 0.0
         self.apart = ''  # warning, if any so far, about a thermometer on another clock

@@ -105,7 +105,7 @@ class Topics:
         roles: dict[str, Any] = {}
         further = {}
         for name, topic in names.items():
-            if name == 'output':  # the node's output is no input
+            if name == 'output':  # the node's output is not an input
                 continue
             role = name.removeprefix('temperature/')
             if not topic.strip('/'):

@@ -31,7 +31,7 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # after this silence of the samples readings are applied [s]
+IDLE_S = 5.0  # silence of the samples after which readings apply [s]; Fast DDS may be 3 s late
 #: Lead of the readings' stamps over the samples' [s] above which the clocks differ.
 AHEAD_S = 5.0
 #: Delay of the next sample, in cycles and in s, beyond both of which the samples have stopped.

@@ -4,7 +4,7 @@
 Owns the step from the names of topics and types to rclpy: message classes, QoS profiles, readings.
 
 A temperature is a field of a message of any type. The class of a message is imported at run time,
-so the package of a driver's messages is no dependency: it is installed with the driver.
+so the package of a driver's messages is not a dependency: it is installed with the driver.
 """
 
 import re

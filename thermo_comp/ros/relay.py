@@ -29,8 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading takes effect when it is older than the newest reading by this time
-#: [ns]: a sample that Fast DDS has to repeat can be 3 s late.
+#: Without samples a reading takes effect when it is older than the newest one by this time [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.

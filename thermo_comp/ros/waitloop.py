@@ -128,7 +128,7 @@ class RawSubscription:
         return messages[first:], received_ns[first:], first
 
     def drain(self) -> tuple[list[bytes], list[int], list[int | None]]:
-        """Take waiting messages, oldest first; arrival times [ns]; publishers' numbers or None."""
+        """Take waiting messages, oldest first; return also arrival times [ns] and numbers."""
         messages: list[bytes] = []
         received_ns: list[int] = []
         numbers: list[int | None] = []
@@ -226,7 +226,7 @@ class WaitLoop:
         others |= {service: partial(self._take_request, service) for service in node.services}
         hot = next((subscription for subscription in self._raw if subscription.is_hot), None)
         rest_ns = 0
-        # Only with best effort is a wake-up more expensive than a short sleep.
+        # With reliable samples a wake-up costs less than a short sleep: make no pause.
         if hot and hot.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             rest_ns = self._rest_ns
         crowd_ns = rest_ns * 3 // 4

@@ -141,7 +141,7 @@ def simulate_blocks(
         raise ValueError(f'the program of {duration} s is shorter than one cycle')
     direction = np.asarray(up, dtype=float)
     # Only a load that switches at random times makes the temperatures random.
-    truth = _heat_flow(unit, cyclogram, seed if unit.load else 0)
+    truth = _thermal_truth(unit, cyclogram, seed if unit.load else 0)
     truth = replace(
         truth,
         bias_grid=truth.thermal_bias + _walk(unit, truth.grid_s, seed),
@@ -222,8 +222,8 @@ def _along_axes(part: Truth, to_axes: Floats) -> Floats:
 
 
 @lru_cache(maxsize=1)
-def _heat_flow(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
-    """Solve the temperatures and the thermal errors of a program, for all attitudes."""
+def _thermal_truth(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
+    """Compute temperatures and thermal errors, which do not depend on the attitude."""
     knots, air, power = np.array(cyclogram.time_s), np.array(cyclogram.temperature_c), None
     if unit.load is not None:
         knots, is_on = _switched(unit.load, knots, seed)

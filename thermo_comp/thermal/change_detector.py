@@ -98,7 +98,7 @@ class ChangeDetector:
         """Begin a soak with the rate as its baseline, with an error of at least `least_error`."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
-        self._edge = nan  # cell edges crossed before the soak measure the ramp
+        self._edge = nan  # an edge crossed before the soak would give the rate of the ramp
 
     def is_following(self, stamp_ns: int) -> bool:
         """Whether `rate` includes the reading with a given stamp."""
@@ -230,7 +230,7 @@ class ChangeDetector:
 
     def _follow(self, rate: float, dt: float) -> None:
         """
-        Let the baseline follow a rate that lasts for `dt` [s], by one swing per memory at most.
+        Let the baseline follow a rate that lasts for `dt` [s]; its swing and error limit the step.
         """
         baseline, error = self._baseline, self._baseline_error
         limit = self.swing + error

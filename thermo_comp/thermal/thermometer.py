@@ -100,7 +100,7 @@ class Thermometer:
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
-        Take a reading [degC]; return False if it is no temperature, not newer, or an outlier.
+        Take a reading [degC]; return False if it is impossible, not newer, or an outlier.
         """
         if not COLDEST <= reading_c <= HOTTEST:
             return False

@@ -23,8 +23,8 @@ from .thermometer import Thermometer
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: Time without a reading after which the regime is unknown, as a share of the thermal lag.
 UNWATCHED_SHARE: Final = 0.25
-#: Changes of the gradient by which the unit heats itself that are not claimed as an error of the
-#: board temperature, since the air flow changes: in K, and as a share of the gradient in the fit.
+#: Largest change of the self-heating gradient that does not count as an error of the board
+#: temperature, because the air flow may differ: in K, and as a share of the gradient in the fit.
 SELF_HEATING_CHANGE_K: Final = 1.0
 SELF_HEATING_CHANGE: Final = 0.5
 #: A range without limits.
@@ -255,7 +255,7 @@ class ThermalTracker:
     def loose_k(self, gradient: float) -> float:
         """
         Return the part of a gradient of the leading sensor [K] that neither a ramp nor the unit's
-        own heat explains; 0 without.
+        own heat explains; else 0.
         """
         of_ramp = self._board_lag_s * self.board.rate
         lower, upper = self._rest_gradient_range
@@ -278,8 +278,8 @@ class ThermalTracker:
 
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
-        Estimate a gradient while its sensor is lost: the last one at rest (that of the fit before
-        the first rest), by which the unit heats itself, plus that of the board's rate.
+        Estimate a gradient while its sensor is lost: the gradient by self-heating (that of the
+        last rest, before any rest that of the fit), plus the board's lag times its rate.
         """
         lag = self._board_lag_s
         lower, upper = self._rest_gradient_range

@@ -337,7 +337,7 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
 
 
 def rate_triad(calibration: Calibration) -> Calibration:
-    """Return the gyroscope of a unit, which must have one, as a triad."""
+    """Return the gyroscope of a calibration as a triad; ValueError without a gyroscope."""
     gyroscope = calibration.gyroscope
     if gyroscope is None:
         raise ValueError('`calibration` must have a gyroscope')

@@ -157,9 +157,7 @@ class Curves:
 
     @cached_property
     def _families(self) -> list[int]:
-        """
-        For each bias and scale the first one whose functions have the same basis in both sets.
-        """
+        """Index of the first bias or scale with the same families of functions, for each."""
         bases = [
             tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
             for functions in zip(*self._functions.rows, strict=True)

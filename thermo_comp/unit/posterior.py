@@ -140,7 +140,7 @@ def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     with np.errstate(over='ignore'):
         correlation = (covariance + covariance.T) / 2.0 / scale / scale[:, np.newaxis]
-    # `eigh` needs finite numbers; a matrix with entries above 1 is no correlation anyway.
+    # `eigh` needs finite numbers; a matrix with entries above 1 is not a correlation anyway.
     is_bounded = np.abs(correlation).max(initial=0.0) < 2.0
     eigenvalues, vectors = np.linalg.eigh(correlation if is_bounded else -np.eye(1))
     if not eigenvalues[0] > _MOST_NEGATIVE:

@@ -76,7 +76,7 @@ class SlowUncertainty:
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
         # If the start was in a ramp, the parts were behind the board, by an unknown amount up to
-        # that of a long ramp at the rate of now, within the calibrated temperatures.
+        # that of a long ramp at the present rate, within the calibrated temperatures.
         behind = hold(self._behind_s[:, np.newaxis] * states[RATE], -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)

@@ -174,7 +174,7 @@ class Cube(Board):
 
 
 class Size(Gradient):
-    """Effect of a heat load, as of a heat pump."""
+    """Effect of a heat load, such as a heat pump."""
 
     kind, formula, groups = 'size', 'abs(q_s)', ()
     form, centre_key = Form(np.abs, np.sign), 'rest_k'
