@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermo_comp.fitting.beginning import STEEPEST
 from thermo_comp.fitting.equations import as_vector
 from thermo_comp.fitting.hyperparameters import Candidates
+from thermo_comp.fitting.initialisation import STEEPEST
 from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.unknowns import Noise, Prior, Windows, tangent_basis
 from thermo_comp.fitting.windows import N_SECTIONS

@@ -11,9 +11,9 @@ import yaml
 from position_helpers import Rest
 
 from thermo_comp.convert.column_map import (
+    column_map_text,
     guess_columns,
     load_column_map,
-    spoken_columns,
     table_log,
 )
 from thermo_comp.convert.headings import map_lines, read_headings
@@ -351,7 +351,7 @@ def write(path, rng, unit, **columns):
 def test_the_unit_follows_from_the_size_of_gravity(tmp_path, rng, unit, text):
     path = write(tmp_path / 'log.txt', rng, unit, time=0.01 * np.arange(len(UP)))
     columns = guess_columns(path)
-    assert spoken_columns(columns) == f'time [s], x y z [{text}]'
+    assert column_map_text(columns) == f'time [s], x y z [{text}]'
     log = table_log(path, columns)
     assert log.input == ('counts' if text == 'counts' else 'imu')
     write_log(log, tmp_path / 'bag.mcap')
@@ -392,7 +392,7 @@ def test_times_of_short_rests_at_1_hz_are_seconds(tmp_path, rng, rest_s, gap_s):
     path = tmp_path / 'log.txt'
     np.savetxt(path, np.column_stack((times, 9.8 * accel)), fmt='%.9g')
     columns = guess_columns(path)
-    assert spoken_columns(columns) == 'time [s], x y z [m/s^2]'
+    assert column_map_text(columns) == 'time [s], x y z [m/s^2]'
     write_log(table_log(path, columns), tmp_path / 'bag.mcap')
 
 
@@ -401,7 +401,7 @@ def test_turns_by_hand_show_the_unit_of_the_angular_rate(tmp_path, rng, fastest,
     rate = np.linspace(-fastest, fastest, 3 * len(UP)).reshape(-1, 3)
     path = write(tmp_path / 'log.txt', rng, 9.8, rate=rate)
     columns = guess_columns(path, 100.0)
-    assert spoken_columns(columns) == f'100 Hz, x y z [m/s^2], angular rate x y z [{unit}]'
+    assert column_map_text(columns) == f'100 Hz, x y z [m/s^2], angular rate x y z [{unit}]'
     expected = rate if unit == 'rad/s' else np.radians(rate)
     gyro = table_log(path, columns).gyro
     assert gyro is not None

@@ -8,11 +8,11 @@ import pytest
 from thermo_comp.fitting.coverage import (
     PRIOR_SD,
     constants_covariance,
+    direction_text,
     farthest,
     force_columns,
     next_direction,
     norm_columns,
-    spoken_direction,
     worst_sd,
 )
 from thermo_comp.simulation.campaign import positions
@@ -126,4 +126,4 @@ def test_the_largest_angle_to_the_nearest_direction():
     ],
 )
 def test_a_direction_is_described_in_words(up, words):
-    assert spoken_direction(np.array(up, float) / np.linalg.norm(up)) == words
+    assert direction_text(np.array(up, float) / np.linalg.norm(up)) == words

@@ -120,8 +120,8 @@ def test_messages_on_the_pages_are_those_of_the_source():
     assert len(quoted) > 10
     sources = ''.join(path.read_text() for path in (ROOT / 'thermo_comp').rglob('*.py'))
     # Join adjacent string literals, which form one message.
-    spoken = re.sub(r"'\s+f?'", '', sources)
+    plain = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
         # Numbers and the text after them are only known at run time.
         words = max(re.split(r'\d+(?:\.\d+)?|\.\.\.', sentence), key=len).strip(' ,;')
-        assert words in spoken, sentence
+        assert words in plain, sentence

@@ -18,7 +18,7 @@ from thermo_comp.fitting.equations import moved_by
 from thermo_comp.fitting.known_force import (
     MAGNITUDE,
     ROTATION,
-    AskedForce,
+    ForceOptions,
     KnownForce,
     Magnitude,
     Section,
@@ -177,15 +177,15 @@ def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
             writer.write_counts('table/rate', stamps, rate)
     (tmp_path / 'table.txt').write_text('a.mcap 0 5 20\nb* 0 5 25\n')
 
-    def read(name, asked=AskedForce()):  # noqa: B008
+    def read(name, asked=ForceOptions()):  # noqa: B008
         path = tmp_path / f'{name}.mcap'
         return known_force(path, inspect_recording(path), asked)
 
     whole = 10**18, 10**18 + 4 * 10**9, 10**18
     assert read('a').of(*whole).still == 30.0
-    assert read('a', AskedForce('5g')).of(*whole).still == pytest.approx(5 * G)
+    assert read('a', ForceOptions('5g')).of(*whole).still == pytest.approx(5 * G)
     for name, size in (('a', 20.0), ('b', 25.0), ('c', None)):
-        known = read(name, AskedForce(str(tmp_path / 'table.txt'))) if size else None
+        known = read(name, ForceOptions(str(tmp_path / 'table.txt'))) if size else None
         assert known is None or known.of(*whole).still == size
     turning = read('b')
     assert turning.of(*whole) == Magnitude(None, 0.0, 0.0)
@@ -197,12 +197,12 @@ def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
     with pytest.raises(FitError, match='need a positive rotation_radius_m'):
         read('c')
     with pytest.raises(FitError, match='0 topics are called spin'):
-        read('a', AskedForce(None, 'spin', 2.0))
+        read('a', ForceOptions(None, 'spin', 2.0))
     with pytest.raises(ValueError, match='a rotation topic needs a radius'):
-        AskedForce(None, 'spin')
+        ForceOptions(None, 'spin')
     (tmp_path / 'bad.txt').write_text('a.mcap 0 5\n')
     with pytest.raises(ThermoCompError, match=r'bad\.txt: a specific force must be'):
-        read('a', AskedForce(str(tmp_path / 'bad.txt')))
+        read('a', ForceOptions(str(tmp_path / 'bad.txt')))
 
 
 def test_a_constant_rotation_is_a_rest_a_changing_rotation_is_not(rng):

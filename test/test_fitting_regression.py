@@ -25,9 +25,9 @@ from scipy.optimize import least_squares
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting.elimination import factored
+from thermo_comp.fitting.initial_triad import constant_calibration
 from thermo_comp.fitting.left_out import score_of
 from thermo_comp.fitting.regression import Regression
-from thermo_comp.fitting.start import constant_calibration
 from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tangent_basis
 
 

@@ -22,10 +22,10 @@ from fitting_truth import (
     without_starts,
 )
 
-from thermo_comp.fitting.beginning import STEEPEST
 from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.evidence import group_evidence
 from thermo_comp.fitting.hyperparameters import downweigh, settle
+from thermo_comp.fitting.initialisation import STEEPEST
 from thermo_comp.fitting.left_out import is_better
 from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.selection import Selected, fit_all, select

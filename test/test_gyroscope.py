@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from thermo_comp.errors import CalibrationError
 from thermo_comp.fitting import FitOptions, FitSource, fit
+from thermo_comp.fitting.initial_triad import within_positions
 from thermo_comp.fitting.reduction import reduce_source
-from thermo_comp.fitting.start import within_positions
 from thermo_comp.judging.evaluation import judge_bags
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.online.batch import process_block

@@ -12,7 +12,7 @@ from builders import GRAVITY, axis_set, calibration, regime_set
 from thermo_comp.errors import CalibrationError, RecordingError
 from thermo_comp.fitting.sources import digest
 from thermo_comp.judging.evaluation import evaluate
-from thermo_comp.judging.judgement import AxisShift, judge, what_moved
+from thermo_comp.judging.judgement import AxisShift, change_texts, judge
 from thermo_comp.judging.verdicts import Verdict
 from thermo_comp.judging.windows import Windows, columns_of
 from thermo_comp.online.batch import process_block
@@ -21,7 +21,7 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
 from thermo_comp.replay import replay
-from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, spoken
+from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, ug_text
 from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
 
 TOPICS = Topics()
@@ -237,7 +237,7 @@ class TestVerdict:
         assert judgement.exit_code == (0 if judgement.is_valid else 1)
         assert judgement.sections['all'].ratio == pytest.approx(residual / claimed)
         for value in (residual, raw, claimed):
-            assert spoken(value * MICRO_G) in judgement.reason
+            assert ug_text(value * MICRO_G) in judgement.reason
 
     @pytest.mark.parametrize(
         ('residual', 'raw', 'claimed', 'verdict'),
@@ -366,7 +366,7 @@ class TestShifts:
         # WHY: the verdict read `x bias +829 +- 1.3e+02 ug`.
         one = AxisShift(829.4 * MICRO_G, 129.2 * MICRO_G, 0.0, 1.0)
         small = AxisShift(-1.234 * MICRO_G, 0.0567 * MICRO_G, 0.0, 1.0)
-        assert what_moved((one, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')
+        assert change_texts((one, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')
 
     def test_an_unchanged_unit_shows_no_shift(self):
         judgement = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)

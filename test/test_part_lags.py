@@ -298,10 +298,10 @@ def test_fit_says_how_far_the_parts_lag(parts, tmp_path, cli):
         )  # fmt: skip
     asked = ('fit', *tables, '--gravity', GRAVITY, '-o', tmp_path / 'unit.yaml', '--force')
     (line,) = (text for text in cli(*asked).stdout.splitlines() if 'its part' in text)
-    spoken = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
+    printed = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
     content = json.loads(cli(*asked, '--json').stdout)
     assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
-    assert spoken == pytest.approx(content['part_lags_s'], abs=0.5)
+    assert printed == pytest.approx(content['part_lags_s'], abs=0.5)
     assert content['part_case_shares'] == [0.0, 0.0, 0.0]
 
 

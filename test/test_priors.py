@@ -101,7 +101,7 @@ def test_a_fit_starts_with_the_widest_prior(monkeypatch):
         seen.extend((*given[-1], prior.informative))
         return fit_all(*given)
 
-    monkeypatch.setattr('thermo_comp.fitting.beginning.fit_all', fitted_with)
+    monkeypatch.setattr('thermo_comp.fitting.initialisation.fit_all', fitted_with)
     few = [source(record) for record in test_of(9, 0, 1)]
     fit(few, replace(OPTIONS, serial='unit-9', prior=population(siblings())))
     *tried, widest = (prior.root.T @ prior.root for prior in seen)

@@ -87,7 +87,7 @@ def convert(
             read = read_log(log, **given)
         tell_guess(out, read, {})
         report = write_log(read, output, force, done)
-    _tell_conversion(out, report, output)
+    _print_conversion(out, report, output)
     written, further = report.log, dict(report.messages)
     n_messages = {f'{name}_messages': further.pop(name) for name in ('accel', 'board', 'case')}
     out.end(
@@ -102,7 +102,7 @@ def convert(
     )
 
 
-def _tell_conversion(out: Output, report: 'ConversionReport', output: Path) -> None:
+def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> None:
     """Print the numbers of messages written, the findings, and the times of movement."""
     from ..convert.log import SLOW_HZ
 
@@ -151,14 +151,14 @@ def tell_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     Print a guessed column map, or name the log of `shown` whose printed map is the same; print the
     columns of a table that are not used, unless they are those of a log of `shown`.
     """
-    _tell_map(out, log, shown)
+    _print_map(out, log, shown)
     not_used = f'not used: {", ".join(log.not_used)}'
     if log.not_used and shown.setdefault(not_used, log.path) == log.path:
         out.line(f'{log.path}: {not_used}')
 
 
-def _tell_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
-    from ..convert.column_map import spoken_columns
+def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
+    from ..convert.column_map import column_map_text
     from ..convert.headings import map_lines
 
     if log.guessed is None:
@@ -175,7 +175,7 @@ def _tell_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
         for line in lines:
             out.line(f'  {line}')
     else:
-        out.line(f'{log.path}: guessed {spoken_columns(log.guessed)}; --columns overrides it')
+        out.line(f'{log.path}: guessed {column_map_text(log.guessed)}; --columns overrides it')
 
 
 def export(

@@ -37,8 +37,8 @@ def update(
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
     """
     from ..field.series import read_rests, series_of
+    from ..field.update import change_texts
     from ..field.update import update as run
-    from ..field.update import what_moved
     from ..unit.calibration_file import load_calibration, save_calibration
 
     check_output(output, CALIBRATION, overwrite=force, others=[calibration, *rests])
@@ -63,7 +63,7 @@ def update(
         title=f'changes shown by {len(result.series)} rests in {result.series.start[-1] + 1} '
         'starts (at rest: bias plus scale at the mean force of the rests)',
     )
-    out.points(what_moved(result))
+    out.points(change_texts(result))
     out.line(str(result.judged))
     is_better = result.judged.is_better and any(axis.is_determined for axis in result.moved)
     if is_better:
@@ -77,7 +77,7 @@ def update(
         **picked(result, 'moved changes judged'),
         ageing_m_s2=result.ageing,
         is_better=is_better,
-        notes=[*notes, *what_moved(result)],
+        notes=[*notes, *change_texts(result)],
     )
 
 
@@ -92,13 +92,13 @@ def evaluate_rests(
     from ..field.series import read_rests, series_of
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration
-    from ..unit.gravity import spoken
+    from ..unit.gravity import ug_text
 
     known = load_calibration(calibration)
     logged, _, notes = read_rests(rests, known, is_for_update=False)
     result = watch(series_of(logged, known, gravity), known, tolerance)
     out.points(notes)
-    limit = f'{LIMIT:g} times the claimed sd' if tolerance is None else spoken(tolerance)
+    limit = f'{LIMIT:g} times the claimed sd' if tolerance is None else ug_text(tolerance)
     for rows, name in ((result.periods, 'from'), (result.temperatures, 'board')):
         out.table(
             (name, 'rests', 'degC', 'mean ug', 'RMS ug', 'claimed ug', 'within'),

@@ -134,7 +134,7 @@ def fit(
 
         evidence = evidence_of_fit(result, wanted.gravity_sd)
         write_report(evidence, report, info=info, overwrite=force)
-    _say(out, result, output, report, verbose)
+    _print_fit(out, result, output, report, verbose)
 
 
 def prior(
@@ -173,19 +173,21 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name for name in map(str.strip, text.split(',')) if name)
 
 
-def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verbose: bool) -> None:
+def _print_fit(
+    out: Output, result: 'FitResult', output: Path, page: Path | None, verbose: bool
+) -> None:
     import numpy as np
 
     from ..fitting.coverage import distinct_directions
-    from ..unit.gravity import spoken
+    from ..unit.gravity import ug_text
 
     calibration = result.calibration
     gyroscope = calibration.gyroscope if result.rates else None
     model, left_out = calibration.provenance.model, result.residuals[-1].left_out
     n_positions = len(distinct_directions(np.array([rest.up for rest in result.positions])))
     if verbose:
-        _say_positions(out, result)
-    _say_models(out, result.fit.selected.trials)
+        _print_positions(out, result)
+    _print_models(out, result.fit.selected.trials)
     parts = result.fit.windows.model.parts
     # In a steady ramp the lag behind two stages is the sum of their time constants.
     taus = parts and [part.tau_s + part.second_tau_s for part in parts]
@@ -199,17 +201,17 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
             f'each axis is a curve of the temperature of its part, which lags {source} by '
             f'{", ".join(f"{tau:.0f}" for tau in taus)} s (x, y, z)'
         )
-    _say_groups(out, calibration)
+    _print_groups(out, calibration)
     tell_nonlinearity(out, calibration)
-    _say_residuals(out, result, n_positions)
+    _print_residuals(out, result, n_positions)
     if gyroscope is not None:
-        _say_rates(out, result, gyroscope)
+        _print_rates(out, result, gyroscope)
     out.points(finding.message for finding in result.findings if finding.level != 'good')
     headline = counted(n_positions, 'position')
     if len(result.positions) > n_positions:
         headline += f' ({counted(len(result.positions), "rest")})'
     if left_out.n:
-        headline += f', {spoken(left_out.rms)} RMS on data left out'
+        headline += f', {ug_text(left_out.rms)} RMS on data left out'
     out.line(f'{output}: unit {calibration.unit.serial}, {model}, {headline}')
     if page is not None:
         out.line(f'{page}: certificate')
@@ -229,7 +231,7 @@ def _say(out: Output, result: 'FitResult', output: Path, page: Path | None, verb
     )
 
 
-def _say_positions(out: Output, result: 'FitResult') -> None:
+def _print_positions(out: Output, result: 'FitResult') -> None:
     out.table(
         ('bag', 'UTC', 'minutes', 'up x', 'y', 'z', 'in sample ug', 'left out ug'),
         [
@@ -246,7 +248,7 @@ def _say_positions(out: Output, result: 'FitResult') -> None:
     )
 
 
-def _say_groups(out: Output, calibration: 'Calibration') -> None:
+def _print_groups(out: Output, calibration: 'Calibration') -> None:
     if calibration.evidence:
         out.table(
             ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
@@ -264,7 +266,7 @@ def _say_groups(out: Output, calibration: 'Calibration') -> None:
     out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
 
 
-def _say_residuals(out: Output, result: 'FitResult', n_positions: int) -> None:
+def _print_residuals(out: Output, result: 'FitResult', n_positions: int) -> None:
     steps = {'raw': 'raw', 'one_set': 'one set', 'two_sets': 'two sets'}
     steps['fitted'] = result.calibration.provenance.model
     out.table(
@@ -283,7 +285,7 @@ def _say_residuals(out: Output, result: 'FitResult', n_positions: int) -> None:
         )
 
 
-def _say_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> None:
+def _print_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> None:
     out.table(
         ('section', 'windows', 'raw', 'fitted', 'left out'),
         _steps(result.rates, ('raw', 'fitted', 'left_out'), millidegrees, axes=3),
@@ -298,7 +300,7 @@ def _say_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> None
     )
 
 
-def _say_models(out: Output, trials: Sequence['Trial']) -> None:
+def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     """Print the error of each model on data left out of its fit, and explain the columns."""
     columns = {
         'positions': 'drift of an axis in a position left out',

@@ -84,7 +84,7 @@ def fleet_fit(
         except KeyboardInterrupt:
             out.note(f'interrupted: {state}, kept in {output}; the same command continues')
             raise
-    _tell_result(out, result, with_prior)
+    _print_result(out, result, with_prior)
     out.end(
         int(not result.is_whole),
         **picked(result, 'rows n_fitted n_done parquet csv page prior skipped'),
@@ -92,7 +92,7 @@ def fleet_fit(
     )
 
 
-def _tell_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
+def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     """Print the tests, their problems, the units that stand out, and the files."""
     summary = result.summary
     out.table(

@@ -77,8 +77,8 @@ def evaluate(
             write(columns_of(judged.windows, list(map(shown_name, bags))))
     drifts = drifts_of(history_of([model for _, model in models]))
     tell_sections(out, result.judgements)
-    _tell_axes(out, judged)
-    _tell_levels(out, judged)
+    _print_axes(out, judged)
+    _print_levels(out, judged)
     rates = {name: one.rate for name, one in result.judgements.items() if one.rate is not None}
     if rows := _sections(rates, millidegrees):
         out.table(
@@ -86,7 +86,7 @@ def evaluate(
             rows,
             title='angular rate at rest less the mean of each rest, of all axes in mdeg/s',
         )
-    _tell_drifts(out, drifts)
+    _print_drifts(out, drifts)
     out.points(result.notes)
     out.line(str(judged))
     if judged.rate is not None:
@@ -101,7 +101,7 @@ def evaluate(
     )
 
 
-def _tell_axes(out: Output, judged: 'Judgement') -> None:
+def _print_axes(out: Output, judged: 'Judgement') -> None:
     """Print the thermal drift of each axis and, if determined, the shift since the fit."""
     columns = ['axis', 'static ug', 'dynamic ug']
     title = 'thermal drift of each axis at rest (RMS of its windows)'
@@ -115,7 +115,7 @@ def _tell_axes(out: Output, judged: 'Judgement') -> None:
     out.table(columns, axes, title=title)
 
 
-def _tell_levels(out: Output, judged: 'Judgement') -> None:
+def _print_levels(out: Output, judged: 'Judgement') -> None:
     """Print the residuals by |f|, if |f| was not gravity in all windows."""
     if judged.by_force:
         out.table(
@@ -131,7 +131,7 @@ def _tell_levels(out: Output, judged: 'Judgement') -> None:
         )
 
 
-def _tell_drifts(out: Output, drifts: Sequence['Drift']) -> None:
+def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
     """Print the changes from each calibration to the next."""
     if drifts:
         out.table(

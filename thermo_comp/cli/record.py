@@ -16,7 +16,7 @@ import typer
 
 from ..errors import RecordingError, ThermoCompError
 from ..text import counted
-from ..unit.gravity import STANDARD_GRAVITY, spoken
+from ..unit.gravity import STANDARD_GRAVITY, ug_text
 from . import shared_options as options
 from .output import Cell, Output, micro, picked
 from .shared_options import argument, option
@@ -64,7 +64,7 @@ def record(
     from .acquisition import Acquisition
 
     test = Acquisition(positions, _duration(soak), offset or 0.0)
-    _tell_leftovers(out, output, finish)
+    _print_leftovers(out, output, finish)
     known = numbered_bags(output)
     serial = _read_earlier(out, known, serial, test)
     bags = PositionBags(output, serial)
@@ -87,7 +87,7 @@ def record(
         show = stack.enter_context(out.live())
         for account in _accounts(out, news, test, bags):
             if show is None:
-                _tell(out, account, problems(), collected)
+                _print_account(out, account, problems(), collected)
             else:
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
@@ -171,7 +171,7 @@ def _end(
     )
 
 
-def _tell_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
+def _print_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
     """Report unfinished bags in a folder, or finish them."""
     from ..recording import growing
 
@@ -195,7 +195,9 @@ def _duration(text: str) -> float:
     return float(match[1]) * {'h': 3600.0, 'min': 60.0, 's': 1.0}[match[2]]
 
 
-def _tell(out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]) -> None:
+def _print_account(
+    out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
+) -> None:
     """Print each change since the last call on a line."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
@@ -241,17 +243,17 @@ def _now(account: 'Account') -> str:
 
 
 def _next(account: 'Account') -> str:
-    from ..fitting.coverage import spoken_direction
+    from ..fitting.coverage import direction_text
 
     by = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from here'
-    return f'next: {spoken_direction(account.next_up)}{by}'
+    return f'next: {direction_text(account.next_up)}{by}'
 
 
 def _accuracy(account: 'Account') -> str:
     bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     parts = (
-        f'{spoken(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
-        f'bias {" ".join(spoken(value * STANDARD_GRAVITY) for value in bias)}',
+        f'{ug_text(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
+        f'bias {" ".join(ug_text(value * STANDARD_GRAVITY) for value in bias)}',
         f'scale {" ".join(micro(1e6 * value) for value in scale)} ppm',
         f'misalignment {" ".join(micro(1e6 * value) for value in misalignment)} urad',
     )
@@ -260,11 +262,11 @@ def _accuracy(account: 'Account') -> str:
 
 def _lines(account: 'Account') -> list[str]:
     """Return the lines below the positions: state, and what is missing."""
-    from ..fitting.coverage import spoken_direction
+    from ..fitting.coverage import direction_text
 
     lines = [_accuracy(account)]
     if account.hole_deg > 0.0:
-        where = spoken_direction(account.hole)
+        where = direction_text(account.hole)
         lines.append(f'no position within {account.hole_deg:.0f} deg of {where}')
     for name, one in account.thermometers.items():
         lines.append(

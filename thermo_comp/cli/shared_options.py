@@ -248,10 +248,10 @@ def force(
     ),
 ) -> Any:
     """Build the statement of the user about |f|."""
-    from ..fitting.known_force import AskedForce
+    from ..fitting.known_force import ForceOptions
 
     with usage_of():
-        return AskedForce(specific_force, rotation, radius, radius_sd)
+        return ForceOptions(specific_force, rotation, radius, radius_sd)
 
 
 @expanded

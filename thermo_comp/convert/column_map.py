@@ -24,7 +24,7 @@ from ..recording.topics import is_thermometer
 from ..typing import Floats, Ints
 from ..unit.schema import SchemaError, build
 from .headings import Headings, read_headings
-from .log import NO_STAMP, PLAUSIBLE_CELSIUS, ForeignLog, Unit, believed_unit, find_stillness
+from .log import NO_STAMP, PLAUSIBLE_CELSIUS, ForeignLog, Unit, find_stillness, inferred_unit
 from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, TimeUnit, read_parquet, read_text
 
 Triple = tuple[Column, Column, Column]
@@ -239,7 +239,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     if not unit:
         # Any rising times will do: finding rests depends only on the order of the samples.
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
-        unit, reason = believed_unit(still.magnitude)
+        unit, reason = inferred_unit(still.magnitude)
         if unit == 'unknown':
             raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
     gyro = None
@@ -276,7 +276,7 @@ def _unnamed(path: Path, width: int) -> Headings:
     return Headings(0 if x else None, '', (x, x + 1, x + 2), '', gyro, '', {})
 
 
-def spoken_columns(columns: ColumnMap) -> str:
+def column_map_text(columns: ColumnMap) -> str:
     """Describe a column map in a line."""
     stamp = columns.stamp
     parts = [f'{stamp.rate_hz:g} Hz' if stamp.column is None else f'time [{stamp.unit}]']

@@ -20,7 +20,7 @@ from ..typing import Floats
 from ..unit import calibration as unit
 from ..unit.calibration import Calibration, rate_triad
 from ..unit.functions import Polynomial
-from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, spoken
+from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, ug_text
 from ..unit.prediction import bias_and_scale, ramp_states
 from ..unit.provenance import Provenance
 from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
@@ -125,7 +125,7 @@ def _thermal(
     offset = gain[:, None] * offset + ((gain - 1.0) * loads)[:, None]
     cubics, misfit = _cubics(d, offset)
     if misfit > 0.01 * MICRO_G:
-        notes.append(f'bias functions replaced by cubics, off by {spoken(misfit)}')
+        notes.append(f'bias functions replaced by cubics, off by {ug_text(misfit)}')
     folded = 'folded into the offset at one attitude'
     if curves.scale_drift > 1e-8:
         lost = _ppm(curves.scale_drift)
@@ -161,7 +161,7 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
     if calibration.needs_temperature:
         drift = (
             f'over the calibrated range the bias moves by up to '
-            f'{spoken(float(np.max(np.abs(curves.bias))))}, the scale by '
+            f'{ug_text(float(np.max(np.abs(curves.bias))))}, the scale by '
             f'{_ppm(curves.scale_drift)}'
         )
     reference_c = calibration.reference_temperature_c
@@ -185,7 +185,7 @@ def _losses(calibration: Calibration) -> list[str]:
     lost = sorted({term.group for term in calibration.response if any(term.bias + term.scale)})
     if lost:
         worth = [group.explains_m_s2 for group in calibration.evidence if group.group in lost]
-        cost = f', up to {spoken(float(np.linalg.norm(worth)))} RMS' if worth else ''
+        cost = f', up to {ug_text(float(np.linalg.norm(worth)))} RMS' if worth else ''
         notes.append(
             f'the thermal response is lost ({", ".join(lost)}){cost}: heating and cooling get '
             'the same correction'

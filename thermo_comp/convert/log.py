@@ -180,7 +180,7 @@ def write_log(
             'backwards': _finding(np.diff(stamp_ns, prepend=stamp_ns[0]) < 0, line),
             'repeated': _finding(np.diff(stamp_ns, prepend=stamp_ns[0] - 1) == 0, line),
         },
-        believed=believed_unit(stillness.magnitude)[1],
+        believed=inferred_unit(stillness.magnitude)[1],
         stillness=stillness,
     )
 
@@ -316,7 +316,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     )
 
 
-def believed_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
+def inferred_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
     """Infer the unit (or ``counts``, ``unknown``) from |a| at rest; return it and the reason."""
     if not np.isfinite(magnitude):
         return 'unknown', 'the sensor never rests, so its unit was not checked'
@@ -336,7 +336,7 @@ def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> 
     """Return why a stated unit cannot be true; None if it may be."""
     if not np.isfinite(magnitude):
         return None
-    believed, reason = believed_unit(magnitude)
+    believed, reason = inferred_unit(magnitude)
     if stated != 'counts' and believed == 'unknown':
         return reason
     if stated != 'counts':

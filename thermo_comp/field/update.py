@@ -21,7 +21,7 @@ from ..text import counted
 from ..typing import Bools, Floats
 from ..unit.calibration import AXES, Calibration, RegimeSet, parameter_layout
 from ..unit.correction import Correction
-from ..unit.gravity import spoken
+from ..unit.gravity import ug_text
 from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import Series, valid_since
@@ -82,8 +82,8 @@ class Judged:
     def __str__(self) -> str:
         gained = 'better' if self.is_better else 'not better beyond one standard error'
         return (
-            f'left-out {self.over}: |f| - g {spoken(self.before)} RMS before, '
-            f'{spoken(self.after)} after the update, {gained} ({self.n} {self.over})'
+            f'left-out {self.over}: |f| - g {ug_text(self.before)} RMS before, '
+            f'{ug_text(self.after)} after the update, {gained} ({self.n} {self.over})'
         )
 
 
@@ -279,13 +279,13 @@ def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) 
     return replace(part, **axes)
 
 
-def what_moved(result: Update) -> list[str]:
+def change_texts(result: Update) -> list[str]:
     """Describe the ageing, the changes, and the axes that the rests do not determine."""
     ageing = result.ageing
     lines = [
-        f'random walk of the bias {spoken(ageing.bias)}, of the scale '
+        f'random walk of the bias {ug_text(ageing.bias)}, of the scale '
         f'{1e6 * ageing.scale / result.calibration.gravity_m_s2:.2g} ppm per root day; '
-        f'scatter of starts {spoken(ageing.turn_on)}, of rests {spoken(ageing.rest)}'
+        f'scatter of starts {ug_text(ageing.turn_on)}, of rests {ug_text(ageing.rest)}'
     ]
     for change in result.changes:
         if change.time is None:

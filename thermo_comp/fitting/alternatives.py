@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from ..typing import Floats
 from ..unit.columns import Column, Part, bank
-from .beginning import Problem, regress
+from .initialisation import Problem, regress
 from .left_out import is_better
 from .nonlinear import with_forces
 from .options import FitOptions, sets_of

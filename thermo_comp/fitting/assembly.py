@@ -62,7 +62,7 @@ def build_calibration(
     # Response columns that have a weight, or only an entry in the covariance.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
-    to_file = file_parameters(regression, layout, state, model, used, kinds)
+    to_file = file_jacobian(regression, layout, state, model, used, kinds)
     values = to_file @ as_vector(state, layout)[: layout.n_unit]
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     static, dynamic = _regime_sets(fit, claim, known)
@@ -263,7 +263,7 @@ def with_parameters(
     )
 
 
-def file_parameters(
+def file_jacobian(
     regression: Regression,
     layout: Layout,
     state: State,

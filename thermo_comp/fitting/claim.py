@@ -34,9 +34,9 @@ from ..unit.calibration import LackOfFit
 from .data_checks import POSITIONS_FOR_MOUNTINGS
 from .equations import as_vector
 from .hyperparameters import STUDENT_NU
+from .initial_triad import within_positions
 from .regression import Posterior, Regression
 from .selection import LAGS, TRIAL_GAIN, Fit
-from .start import within_positions
 from .unknowns import Layout, Prior, State
 from .windows import CURVE, PART
 

@@ -21,7 +21,7 @@ from ..errors import FitError
 from ..typing import Floats
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.gravity import STANDARD_GRAVITY
-from .start import constant_calibration
+from .initial_triad import constant_calibration
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD
 
 #: Prior sd of a triad's nine constants: bias [g], relative scale, misalignment [rad].
@@ -221,7 +221,7 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
     )
 
 
-def spoken_direction(up: Floats) -> str:
+def direction_text(up: Floats) -> str:
     """Describe an attitude to a user: the axes that point up, and the axes' readings in g."""
     signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
     size = np.abs(up)

@@ -19,10 +19,10 @@ from ..errors import FitError
 from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
-from ..unit.gravity import MICRO_G, spoken
-from .coverage import LeastKnown, distinct_directions, geometry, spoken_direction
+from ..unit.gravity import MICRO_G, ug_text
+from .coverage import LeastKnown, direction_text, distinct_directions, geometry
+from .initial_triad import white_noise_of, within_positions
 from .options import FitOptions
-from .start import white_noise_of, within_positions
 from .windows import ThermalWindows
 
 if TYPE_CHECKING:
@@ -229,8 +229,8 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
         yield advice(
             'unseen',
             f'{least.away_deg:.0f} deg away from every position the sd of |f| is '
-            f'{spoken(least.sd_m_s2)}, in the positions {spoken(least.seen_sd_m_s2)}: record a '
-            f'position with {spoken_direction(np.array(least.up))}',
+            f'{ug_text(least.sd_m_s2)}, in the positions {ug_text(least.seen_sd_m_s2)}: record a '
+            f'position with {direction_text(np.array(least.up))}',
         )
 
 
@@ -244,7 +244,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     n, n_bags = int(fit.windows.data.mounting[-1]) + 1, fit.regression.n_bags
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
-    assumed = f'the uncertainty assumes {spoken(offset_sd)}: state --mounting-sd'
+    assumed = f'the uncertainty assumes {ug_text(offset_sd)}: state --mounting-sd'
     # The bias of the first recording is that of the unit; those of three others show how well
     # turn-ons repeat.
     needed = 4
@@ -346,9 +346,9 @@ def judge_result(
     if options.prior is not None and overall.fitted.rms > 1.5 * alone:
         yield advice(
             'prior',
-            f'the bags contradict the prior: |f| - g is {spoken(overall.fitted.rms)} RMS with the '
-            f'prior, {spoken(alone)} with two sets fitted without it: was the prior made for this '
-            'unit, or for its type?',
+            f'the bags contradict the prior: |f| - g is {ug_text(overall.fitted.rms)} RMS with '
+            f'the prior, {ug_text(alone)} with two sets fitted without it: was the prior made for '
+            'this unit, or for its type?',
         )
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
         yield advice(

@@ -21,16 +21,16 @@ from ..text import one_line
 from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
-from .beginning import initial_state
 from .claim import drift_variance
 from .data_checks import Finding
+from .initial_triad import within_positions
+from .initialisation import initial_state
 from .left_out import Folds
 from .options import FitOptions
 from .priors import constants_of, informative_priors, prior_model, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
-from .start import within_positions
 from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State, Windows
 from .windows import ThermalWindows, thermal_windows
 

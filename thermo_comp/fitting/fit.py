@@ -26,7 +26,6 @@ from ..unit.nonlinearity import NonlinearTerm
 from . import data_checks, raw_checks
 from .alternatives import model_of, regressed, windows_of
 from .assembly import build_calibration
-from .beginning import Problem, first_guess
 from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
@@ -38,6 +37,8 @@ from .environments import (
 )
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
+from .initial_triad import within_positions
+from .initialisation import Problem, initial_triad
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of
@@ -45,7 +46,6 @@ from .reduction import ReducedBag, reduce_source
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
-from .start import within_positions
 from .windows import FEWEST_WINDOWS
 
 Progress = Callable[[float], None]
@@ -220,7 +220,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         options = replace(options, prior=with_blank(options.prior, options))
         windows = with_forces(windows, bags, options)
     known = options.prior
-    start = first_guess(windows, options) if known is None else constants_of(known)
+    start = initial_triad(windows, options) if known is None else constants_of(known)
     up = start.directions(windows.data)
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case), options)

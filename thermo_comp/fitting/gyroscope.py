@@ -25,11 +25,11 @@ from .assembly import build_calibration
 from .claim import claim_of
 from .evidence import tables_of
 from .hyperparameters import Candidates
+from .initial_triad import position_means, within_positions
 from .options import FitOptions
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit, select
-from .start import position_means, within_positions
 from .unknowns import Prior, Windows
 from .windows import ThermalWindows
 

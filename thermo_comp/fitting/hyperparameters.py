@@ -26,8 +26,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ..typing import Bools, Floats, Ints
 from .equations import as_vector
 from .gains import log_bayes_factors
+from .initial_triad import white_noise_of
 from .regression import Posterior, Regression
-from .start import white_noise_of
 from .unknowns import Noise, Prior, State
 
 #: Degrees of freedom of the half-Student prior of the mounting's standard deviation; 4 as in [2]_.

@@ -103,7 +103,7 @@ class KnownForce:
 
 
 @dataclass(frozen=True)
-class AskedForce:
+class ForceOptions:
     """
     The user's options about |f|.
 
@@ -123,10 +123,10 @@ class AskedForce:
 
 
 #: Without options the bags' metadata apply.
-USUAL_FORCE = AskedForce()
+USUAL_FORCE = ForceOptions()
 
 
-def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForce | None:
+def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce | None:
     """
     Return the known |f| of a bag, from the user or else from its metadata; None for gravity.
 
@@ -144,7 +144,7 @@ def known_force(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForc
             radius, sd = float(metadata.get(RADIUS, 'nan')), float(metadata.get(RADIUS_SD, '0'))
             if not (0.0 < radius < math.inf and 0.0 <= sd < math.inf):
                 raise ValueError(f'metadata with {ROTATION} need a positive {RADIUS}')
-            return _rotating(path, info, AskedForce(None, metadata[ROTATION], radius, sd))
+            return _rotating(path, info, ForceOptions(None, metadata[ROTATION], radius, sd))
         if MAGNITUDE in metadata:
             return KnownForce(str(path), parse_sections(metadata[MAGNITUDE]))
     except ValueError as mistake:
@@ -215,7 +215,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
         raise ThermoCompError(str(mistake), table) from mistake
 
 
-def _rotating(path: Path, info: RecordingInfo, asked: AskedForce) -> KnownForce:
+def _rotating(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce:
     """Read the rotation rate of a bag."""
     wanted, field = split_field(asked.rotation or '')
     names = [name for name in info.topics if is_called(name, wanted)]

@@ -33,8 +33,8 @@ import numpy as np
 
 from ..typing import Floats, Ints
 from .elimination import inverse_root
+from .initial_triad import white_noise_of
 from .regression import Point, Posterior, Regression
-from .start import white_noise_of
 from .unknowns import State
 
 # Smallest number of windows of a position for a score of the position's drift.

@@ -25,7 +25,7 @@ from ..thermal.memory import Lag
 from ..typing import Floats
 from ..unit.columns import Part
 from .hyperparameters import undisturbed
-from .start import ConstantCalibration, position_means, white_noise_of
+from .initial_triad import ConstantCalibration, position_means, white_noise_of
 from .windows import ThermalWindows
 
 # Ratio of a time constant of the columns to the next smaller time constant: half an octave.

@@ -28,12 +28,12 @@ from ..unit.calibration import POPULATION, Calibration, RegimeSet, parameter_lay
 from ..unit.columns import FINE_TAUS, Column
 from ..unit.provenance import Provenance, Source
 from ..unit.terms import LINE
-from .assembly import blank_terms, file_parameters, parameters_of, union, with_parameters
+from .assembly import blank_terms, file_jacobian, parameters_of, union, with_parameters
 from .equations import as_vector
+from .initial_triad import ConstantCalibration
 from .nonlinear import without_terms
 from .options import FitOptions
 from .regression import Regression
-from .start import ConstantCalibration
 from .unknowns import InformativePrior, State
 from .windows import Model, Sets
 
@@ -133,7 +133,7 @@ def informative_priors(
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
     used = range(len(calibration.response))
-    to_file = file_parameters(regression, layout, state, model, used, kinds)
+    to_file = file_jacobian(regression, layout, state, model, used, kinds)
     mean = as_vector(state, layout)[: layout.n_unit]
     result = []
     for variances, share in tried:

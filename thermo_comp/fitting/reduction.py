@@ -30,8 +30,8 @@ from ..recording.stillness import CellAccumulator, Cells
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..typing import Bools, Floats, Ints
 from .coverage import best_rests, directions, distinct_directions, rough_centre
+from .initial_triad import block_means
 from .sources import FitSource, angular_velocity
-from .start import block_means
 
 #: Default length of a window of the fit [s].
 WINDOW_S = 10.0

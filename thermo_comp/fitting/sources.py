@@ -19,7 +19,7 @@ from ..recording.blocks import Block, Input, RecordingInfo, Role
 from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics, is_called, shown
 from ..typing import Floats
-from .known_force import USUAL_FORCE, AskedForce, KnownForce, known_force
+from .known_force import USUAL_FORCE, ForceOptions, KnownForce, known_force
 
 
 def angular_velocity(block: object) -> Floats | None:
@@ -50,7 +50,7 @@ class FitSource:
 
 
 def fit_sources(
-    paths: Sequence[str | Path], topics: Topics | None = None, force: AskedForce = USUAL_FORCE
+    paths: Sequence[str | Path], topics: Topics | None = None, force: ForceOptions = USUAL_FORCE
 ) -> tuple[list[FitSource], Input]:
     """
     Make sources of recordings; each recording is opened by this function and again by the fit.
@@ -82,7 +82,7 @@ def recording_source(
     *,
     require: Collection[Role] = ('accel',),
     progress: Callable[[float], None] | None = None,
-    force: AskedForce = USUAL_FORCE,
+    force: ForceOptions = USUAL_FORCE,
 ) -> tuple[FitSource, RecordingInfo]:
     """
     Make a source of a recording, which is opened by this function and again for each pass.

@@ -24,10 +24,10 @@ from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats, Ints
 from ..unit.columns import Column, ColumnTable, Part, memory_of
 from ..unit.functions import Polynomial, TemperatureFunction
+from .initial_triad import block_means
 from .part_curves import PartCurves, curves_of
 from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
-from .start import block_means
 from .unknowns import Windows
 
 #: Groups of columns: the curve, the difference of the sets, bends (changes of slope at a

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
-from ..fitting.known_force import USUAL_FORCE, AskedForce
+from ..fitting.known_force import USUAL_FORCE, ForceOptions
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import digest, recording_source
@@ -48,7 +48,7 @@ def open_bags(
     *,
     topics: Topics | None = None,
     window_s: float = WINDOW_S,
-    force: AskedForce = USUAL_FORCE,
+    force: ForceOptions = USUAL_FORCE,
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
@@ -110,7 +110,7 @@ def evaluate(
     tolerance: float | None = None,
     topics: Topics | None = None,
     serial: str | None = None,
-    force: AskedForce = USUAL_FORCE,
+    force: ForceOptions = USUAL_FORCE,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Evaluation:
     """

@@ -9,12 +9,12 @@ import numpy as np
 
 from ..fitting.coverage import distinct_directions, norm_columns
 from ..fitting.data_checks import POSITIONS_NEEDED
-from ..fitting.start import within_positions
+from ..fitting.initial_triad import within_positions
 from ..online.compensator import SWAPPED
 from ..text import counted
 from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.gravity import MICRO_G, spoken
+from ..unit.gravity import MICRO_G, ug_text
 from ..unit.metrics import means_by
 from . import verdicts
 from .verdicts import Section, Sections, Verdict
@@ -88,7 +88,7 @@ class Judgement:
     def verdict(self) -> str:
         """The verdict in words."""
         if self.kind is Verdict.WIDE:
-            return f'{self.kind.value} {spoken(self.sections["all"].claimed_rms)}'
+            return f'{self.kind.value} {ug_text(self.sections["all"].claimed_rms)}'
         return str(self.kind.value)
 
     def __str__(self) -> str:
@@ -141,7 +141,7 @@ def judge(
         left_out_rms=calibration.provenance.left_out_rms if is_seen else np.nan,
         tolerance=tolerance,
         shifts=shifts,
-        moved=what_moved(shifts) if claims else (),
+        moved=change_texts(shifts) if claims else (),
         axis_rms=rms_by_axis(windows),
         n_positions=distinct_positions(windows),
         windows=windows,
@@ -190,10 +190,10 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
         kind = Verdict.WIDE if is_wide else Verdict.VALID
     parts = [f'{_numbers(full)} over {_windows(full.n, windows)}']
     if np.isfinite(left_out):
-        parts = [f'{spoken(left_out)} RMS of |f| - g on positions left out; in sample {parts[0]}']
+        parts = [f'{ug_text(left_out)} RMS of |f| - g on positions left out; in sample {parts[0]}']
     if tolerance is not None:
         where = 'on positions left out' if worst == left_out else 'in the worse regime'
-        parts.append(f'{spoken(worst)} {where}, {spoken(tolerance)} tolerated')
+        parts.append(f'{ug_text(worst)} {where}, {ug_text(tolerance)} tolerated')
     elif claims:
         parts.append(f'largest ratio of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}')
     else:
@@ -205,15 +205,15 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
     if outside.n:
         parts.append(
             f'{_windows(outside.n, windows)} outside the calibrated ranges not judged: '
-            f'{spoken(outside.rms)}'
+            f'{ug_text(outside.rms)}'
         )
     return kind, '; '.join(parts)
 
 
 def _numbers(section: Section) -> str:
-    text = f'{spoken(section.rms)} RMS of |f| - g, {spoken(section.raw_rms)} raw'
+    text = f'{ug_text(section.rms)} RMS of |f| - g, {ug_text(section.raw_rms)} raw'
     if np.isfinite(section.claimed_rms):
-        text += f', {spoken(section.claimed_rms)} claimed'
+        text += f', {ug_text(section.claimed_rms)} claimed'
     return text
 
 
@@ -257,7 +257,7 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     return tuple(AxisShift(*row) for row in np.hstack((bias * gravity, scale)).tolist())
 
 
-def what_moved(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
+def change_texts(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
     """Name the significant shifts, as in ``z bias +12 +- 3 ug``."""
     collected = []
     for axis, shift in zip('xyz', shifts, strict=False):

@@ -22,7 +22,7 @@ from ..replay import check_unit
 from ..text import counted
 from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.gravity import spoken
+from ..unit.gravity import ug_text
 from ..unit.metrics import means_by, norm_residual
 from ..unit.provenance import Source
 from .trace import ShownBag, shown_bag, widest
@@ -275,8 +275,8 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
         left_out = part.left_out_rms_m_s2
         if part.section == 'all' and left_out is not None and left_out >= part.raw_rms_m_s2:
             notes.append(
-                f'on positions left out {spoken(left_out)} are no better than '
-                f'{spoken(part.raw_rms_m_s2)} raw: the positions do not predict a new attitude'
+                f'on positions left out {ug_text(left_out)} are no better than '
+                f'{ug_text(part.raw_rms_m_s2)} raw: the positions do not predict a new attitude'
             )
     if not calibration.has_uncertainty:
         notes.append('the calibration states no uncertainty')

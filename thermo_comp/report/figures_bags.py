@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from ..thermal.regime import Regime
 from ..typing import Bools, Floats
 from ..unit.calibration import AXES
-from ..unit.gravity import MICRO_G, spoken
+from ..unit.gravity import MICRO_G, ug_text
 from ..unit.metrics import statistics_by_regime
 from . import style
 from .evidence import LEFT_OUT, RAW, Evidence, Position, given
@@ -241,7 +241,7 @@ def draw_positions(evidence: Evidence) -> Figure:
         if least is not None and (least.up[2] >= 0.0) == (side > 0):
             place = equal_area(least.up, side)
             axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
-            text = '±' + spoken(least.sd_m_s2).replace('ug', 'µg')
+            text = '±' + ug_text(least.sd_m_s2).replace('ug', 'µg')
             # Shift the label towards the middle, as the names of the axes are outside.
             by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
             _note(axes, text, place, by, ha='center', color=style.RED)

@@ -68,7 +68,7 @@ class CompensationNode:
         except BaseException:
             self.node.destroy_node()
             raise
-        self._say_calibration()
+        self._print_calibration()
 
     def _build(self) -> None:
         self._log, config = self.node.get_logger(), parameters.declare(self.node)
@@ -148,7 +148,7 @@ class CompensationNode:
             if not result.successful:
                 raise parameters.ParameterError(result.reason)
             if new:
-                self._say_calibration()
+                self._print_calibration()
             self._loop.call_soon(partial(self._relay.release, before.samples))
             # A failure before this line restores the previous calibration.
             return result  # noqa: TRY300
@@ -188,7 +188,7 @@ class CompensationNode:
         if message:
             raise CalibrationError(message, loaded.path, key)
 
-    def _say_calibration(self) -> None:
+    def _print_calibration(self) -> None:
         loaded = self._relay.running.loaded
         serial = loaded.calibration.unit.serial
         self._log.info(f'unit {serial}: {loaded.path} ({loaded.sha256[:12]})')

@@ -23,7 +23,7 @@ _UNITS = {
 }
 
 
-def spoken(acceleration: float) -> str:
+def ug_text(acceleration: float) -> str:
     """Format an error in ug, or from 1 mg on in mg, with two or three digits."""
     value, unit = acceleration / MICRO_G, 'ug'
     if abs(value) >= 999.5:

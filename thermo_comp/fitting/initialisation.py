@@ -14,19 +14,19 @@ from ..typing import Bools, Floats
 from .coverage import distinct_directions, norm_columns
 from .data_checks import POSITIONS_NEEDED
 from .hyperparameters import Candidates
-from .nonlinear import starting_sd, with_terms
-from .options import FitOptions
-from .priors import informative_priors, with_calibration
-from .reduction import ReducedBag
-from .regression import Regression
-from .selection import Fit, fit_all, select
-from .start import (
+from .initial_triad import (
     ConstantCalibration,
     constant_calibration,
     position_means,
     white_noise_of,
     within_positions,
 )
+from .nonlinear import starting_sd, with_terms
+from .options import FitOptions
+from .priors import informative_priors, with_calibration
+from .reduction import ReducedBag
+from .regression import Regression
+from .selection import Fit, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, Prior, State, Windows, misalignment_scale
 from .windows import CURVE, ThermalWindows
 
@@ -277,7 +277,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
     return data.forces.sizes if data.forces else np.full(data.n_positions, options.gravity)
 
 
-def first_guess(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
+def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
     """Estimate the triad without temperature: an ellipsoid or, with few attitudes, the scale."""
     means = position_means(windows.data)
     gravity = sizes_of(windows, options)
