@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from builders import calibration
 from fitting_truth import Truth, table_of
 
 from thermo_comp.errors import FitError
@@ -30,8 +31,8 @@ from thermo_comp.unit.metrics import residual_statistics
 LINE = Polynomial((0.0, 1.0))
 
 
-def findings_of(windows, up, *, has_case=True):
-    return {finding.name: finding for finding in judge_windows(windows, up, has_case)}
+def findings_of(windows, up, *, has_case=True, prior=None):
+    return {finding.name: finding for finding in judge_windows(windows, up, has_case, prior)}
 
 
 @pytest.fixture
@@ -104,6 +105,24 @@ def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, r
     # A slow drift through the whole range is not a soak.
     drift = replace(windows, rate=0.0 * windows.rate)
     assert 'soaks' not in findings_of(drift, up)
+
+
+def test_rests_on_a_desk_with_a_prior_of_the_unit_need_no_chamber(good):
+    windows, up = good
+    room = 22.0 + 0.01 * windows.temperature
+    desk = replace(windows, temperature=room, rate=0.0 * windows.rate)
+    assert {'span', 'ramps', 'soaks'} <= {*findings_of(desk, up)}
+    prior = calibration()
+    findings = findings_of(desk, up, prior=prior)
+    assert not {'ramps', 'soaks', 'soak'} & {*findings}
+    assert findings['span'].level == 'good'
+    assert 'that of the prior, 5 to 35 degC' in findings['span'].message
+    warm = replace(desk, temperature=desk.temperature + 20.0)
+    advised = findings_of(warm, up, prior=prior)['span']
+    assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
+    # The other units of a type do not show the effects of this unit.
+    of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
+    assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}
 
 
 def test_six_faces_do_not_determine_the_misalignment(good):

@@ -19,6 +19,7 @@ from ..errors import FitError
 from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
+from ..unit.calibration import POPULATION, Calibration
 from ..unit.gravity import MICRO_G, ug_text
 from .coverage import LeastKnown, direction_text, distinct_directions, geometry
 from .initial_triad import white_noise_of, within_positions
@@ -67,8 +68,14 @@ def enforce(findings: Iterable[Finding], options: FitOptions) -> list[Finding]:
     return result
 
 
-def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterator[Finding]:
-    """Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest."""
+def judge_windows(
+    windows: ThermalWindows, up: Floats, has_case: bool, prior: Calibration | None = None
+) -> Iterator[Finding]:
+    """
+    Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest.
+
+    A prior calibration of the same unit contains the effects of temperature and ramps already.
+    """
     yield _judge_positions(up)
     used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
     if not windows.has_temperature:
@@ -80,16 +87,11 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
         yield advice('temperature', text)
         return
     yield from _judge_unmeasured(windows, used_bags)
-    span = float(np.ptp(windows.temperature))
-    text = f'temperature span {span:.1f} degC'
-    if span >= ADVISED_SPAN_K:
-        yield Finding('span', 'good', text)
+    if prior is not None and prior.provenance.model != POPULATION:
+        yield _judge_beyond(windows.temperature, prior)
     else:
-        why = 'run the chamber over the whole range of use'
-        if span < LEAST_SPAN_K and _has_drift(windows):
-            why = 'readings hardly change while the bias does: is the thermometer on the board?'
-        yield advice('span', f'{text} ({ADVISED_SPAN_K:g} advised): {why}')
-    yield from _judge_ramps(windows)
+        yield _judge_span(windows)
+        yield from _judge_ramps(windows)
     if not has_case:
         text = (
             'no case temperature: the regime is detected from the board temperature alone, later '
@@ -108,6 +110,31 @@ def judge_windows(windows: ThermalWindows, up: Floats, has_case: bool) -> Iterat
                 f'the board temperature leads the case (correlation {correlation:.2f} of gradient '
                 'and rate): are the two sensors exchanged?',
             )
+
+
+def _judge_span(windows: ThermalWindows) -> Finding:
+    span = float(np.ptp(windows.temperature))
+    text = f'temperature span {span:.1f} degC'
+    if span >= ADVISED_SPAN_K:
+        return Finding('span', 'good', text)
+    why = 'run the chamber over the whole range of use'
+    if span < LEAST_SPAN_K and _has_drift(windows):
+        why = 'readings hardly change while the bias does: is the thermometer on the board?'
+    return advice('span', f'{text} ({ADVISED_SPAN_K:g} advised): {why}')
+
+
+def _judge_beyond(temperature: Floats, prior: Calibration) -> Finding:
+    """Compare the temperatures of the bags with the range of a prior calibration."""
+    edges = [edge for part in prior.regime_sets() for edge in part.temperature_range_c]
+    lower, upper, coldest, hottest = min(edges), max(edges), temperature.min(), temperature.max()
+    text = f'the effect of temperature is that of the prior, {lower:.0f} to {upper:.0f} degC'
+    if max(lower - coldest, hottest - upper) <= 1.0:
+        return Finding('span', 'good', text)
+    return advice(
+        'span',
+        f'{text}; the bags reach {coldest:.0f} to {hottest:.0f} degC: fit them together with the '
+        'bags of the prior',
+    )
 
 
 def _judge_unmeasured(

@@ -223,7 +223,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     start = initial_triad(windows, options) if known is None else constants_of(known)
     up = start.directions(windows.data)
     has_case = all(len(bag.case.value) for bag in bags)
-    findings += enforce(data_checks.judge_windows(windows, up, has_case), options)
+    findings += enforce(data_checks.judge_windows(windows, up, has_case, known), options)
     progress(0.7)
     fit = regressed(windows, Problem(bags, options, start, up, progress))
     terms: tuple[NonlinearTerm, ...] = ()
