@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline as ReferenceSpline
 
+from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.thermal.memory import Lag, Play, memory_on_grid
 from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout
 from thermo_comp.unit.calibration import parameter_layout
@@ -25,7 +26,7 @@ from thermo_comp.unit.functions import (
 )
 from thermo_comp.unit.metrics import norm_residual, residual_statistics, statistics_by_regime
 from thermo_comp.unit.posterior import posterior_of
-from thermo_comp.unit.prediction import ramp_states, sd_of_states
+from thermo_comp.unit.prediction import in_a_soak, ramp_states, sd_of_states
 
 KNOTS = (-15.0, -6.0, 0.0, 4.0, 15.0)
 FUNCTIONS = [Polynomial((1.0,)), Polynomial((0.0, 2e-3, -3e-5, 4e-7, 1e-9)),
@@ -170,6 +171,29 @@ def test_parameters_without_variance_give_no_sd():
     bias, scale = sd_of_states(unit, ramp_states(unit, np.array([20.0]), 0.0, np.inf))
     assert bias == pytest.approx(np.full((1, 3), 1e-5))
     assert not scale.any()
+
+
+def test_in_a_soak_the_gradient_is_that_of_the_unit_s_own_heat():
+    # WHY: the certificate gave the bias without a gradient; with 3 K and 16 ug/K it was 50 ug off.
+    unit = calibration(
+        response=(
+            term('gradient', (30.0, 0.0, 0.0), scale=(0.0, 2e-5, 0.0)),
+            term('gradient_lag', (0.0, 60.0, 0.0), tau_s=600.0),
+            term('board', (0.0, 0.0, 90.0), tau_s=600.0, sensor_share=0.5),
+        ),
+        rest_gradient_range_k=(-3.4, -2.6),
+    )
+    bias, bias_sd, scale, scale_sd = in_a_soak(unit)
+    # In a soak the lag of the gradient equals the gradient; the part with half the gradient lags
+    # the board by minus half the gradient.
+    by_kelvin = np.array([30.0, 60.0, -45.0]) / 300.0
+    assert bias == pytest.approx(-3.0 * by_kelvin)
+    assert bias_sd == pytest.approx(0.2 * np.abs(by_kelvin))
+    assert scale / 300.0 - 1.0 == pytest.approx([0.0, -6e-5, 0.0])
+    assert scale_sd == pytest.approx([0.0, 0.4e-5, 0.0])
+    exported = export_calibration(unit, 'imu_tk')
+    assert exported.bias[:, 0] == pytest.approx(300.0 * bias)
+    assert 1.0 / np.diag(exported.matrix) == pytest.approx(scale)
 
 
 @pytest.mark.parametrize('rate', [0.01, -0.02])

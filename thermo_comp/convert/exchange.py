@@ -42,7 +42,7 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write a calibration's static set as the file of one of `TOOLS`: its `text`, and `notes` on the
+    Write a calibration in a soak as the file of one of `TOOLS`: its `text`, and `notes` on the
     lost parts.
 
     `number` is the number of the set or IMU, if the file numbers them; PX4 matches the sensor by
@@ -81,7 +81,7 @@ def export_calibration(
 
 
 class _Curves(NamedTuple):
-    """The static set: per axis a level, and its changes at n calibrated temperatures."""
+    """A soak: the level of each axis, and its changes at n calibrated temperatures."""
 
     temperature: Floats
     K: Floats
@@ -96,18 +96,13 @@ class _Curves(NamedTuple):
 
 
 def _static_curves(calibration: Calibration) -> _Curves:
-    sets = calibration.static.axes()
-    K = np.array([axis.scale_factor for axis in calibration.axes])
-    levels = zip(calibration.axes, sets, strict=True)
     temperature = np.linspace(*calibration.static.temperature_range_c, _GRID)
-    t = temperature - calibration.reference_temperature_c
-    return _Curves(
-        temperature,
-        K,
-        level=np.array([axis.bias + regime.delta for axis, regime in levels]),
-        bias=np.array([curves.bias_function.value(t) for curves in sets]) / K[:, None],
-        scale=np.array([curves.scale_function.value(t) for curves in sets]) - 1.0,
-    )
+    at = np.array([calibration.reference_temperature_c, *temperature])
+    bias, scale = bias_and_scale(calibration, ramp_states(calibration, at))
+    counts = (bias * [axis.scale_factor for axis in calibration.axes]).T
+    K, level = scale[0], counts[:, 0]
+    change = (counts[:, 1:] - level[:, None]) / K[:, None]
+    return _Curves(temperature, K, level, change, scale[1:].T / K[:, None] - 1.0)
 
 
 def _thermal(

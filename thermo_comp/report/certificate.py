@@ -164,6 +164,14 @@ def results(
     return rows
 
 
+def own_heat(calibration: Calibration | None) -> str:
+    """State the gradient of a soak, by which the unit heats itself; '' if it is not known."""
+    if calibration is None or calibration.rest_gradient_range_k is None:
+        return ''
+    lower, upper = (minus(f'{edge:.1f}') for edge in calibration.rest_gradient_range_k)
+    return f' (T_{calibration.sensors[0]} − T_board from {lower} to {upper} K)'
+
+
 def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOverTemperature]:
     """Tabulate bias and scale of each axis in a soak and in ramps at temperatures of the board."""
     calibration = evidence.calibration

@@ -6,8 +6,10 @@ by lags whose initial state is unknown), and hypothetical states: a soak and a r
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
-stop; in a soak (q = 0) all of them are 0. The static set applies in a soak, the dynamic set in a
-ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
+stop; in a soak (q = 0) all of them are 0. The gradient of the first sensor includes that by which
+the unit heats itself: the middle of `rest_gradient_range_k`. The static set applies in a soak, the
+dynamic set in a ramp. Predicted variances do not include noise and the uncertainty of the
+thermometers.
 """
 
 from collections.abc import Callable
@@ -140,7 +142,10 @@ def _combined(rows: Floats, by: Floats) -> Floats:
 def in_a_soak(
     calibration: Calibration, temperature: float | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,)."""
+    """
+    Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,), in a
+    soak at the reference temperature or at another one.
+    """
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
     states = ramp_states(calibration, at)
     bias, scale = bias_and_scale(calibration, states)
@@ -186,7 +191,10 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
 
 
 def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
-    """Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3)."""
+    """
+    Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3); the
+    gradient by self-heating is uncertain within the range of the fit.
+    """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
     forgotten = np.zeros((len(correction.memory.lags), len(states)))
@@ -194,8 +202,14 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     is_dynamic = np.rint(states[:, WEIGHT]) == 1.0
     both = np.broadcast_to(correction.curves.unexplained(states[:, BOARD]), (2, 3, len(states)))
     unexplained = np.where(is_dynamic, both[1], both[0]).T
+    # The range contains most soaks of the fit: about 4 sd.
+    lower, upper = calibration.rest_gradient_range_k or (0.0, 0.0)
+    warmer = states.copy()
+    _add_gradient(warmer, calibration, (upper - lower) / 4.0)
+    by_gradient = correction.bias_scale(warmer.T) - correction.bias_scale(states.T)
+    bias, scale = (by_gradient / correction.K).swapaxes(1, 2) ** 2
     a, c = variance[:, :, 0] + unexplained, np.maximum(variance[:, :, 2], 0.0)
-    return np.sqrt(a), np.sqrt(c)
+    return np.sqrt(a + bias), np.sqrt(c + scale)
 
 
 def ramp_states(
@@ -205,7 +219,8 @@ def ramp_states(
     lasted_s: Floats | float = 0.0,
 ) -> Floats:
     """
-    Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s].
+    Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s];
+    the gradient by self-heating is the middle of its range in the fit.
     """
     layout = Layout(Correction(calibration).memory)
     states = np.zeros((len(temperature), layout.width))
@@ -220,4 +235,19 @@ def ramp_states(
                 states[:, place] += share * end * (1.0 - np.exp(-np.asarray(lasted_s) / tau))
         elif isinstance(quantity, Play):
             states[:, place] = -np.sign(rate) * quantity.width_k
+    _add_gradient(states, calibration, sum(calibration.rest_gradient_range_k or (0.0,)) / 2.0)
     return states
+
+
+def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> None:
+    """Add a constant change of the first sensor's gradient to thermal states, in place."""
+    layout = Layout(Correction(calibration).memory)
+    for quantity, place in layout.places.items():
+        if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:
+            states[:, place] += change_k
+        elif isinstance(quantity, Lag):
+            states[:, place] += change_k * sum(
+                share
+                for (name, _), share in quantity.singles.items()
+                if name == calibration.sensors[0]
+            )
