@@ -185,6 +185,28 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     assert len(cut.fit.selected.score.norms.square) == 9
 
 
+def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
+    # WHY: twelve recordings, three cut in two, claimed half the sd of the bias.
+    def cut(source, at, pause_s):
+        (whole,) = source.blocks()
+        arrays = [
+            (whole.accel_stamp_ns[part] + shift, whole.accel[part])
+            for part, shift in ((slice(at), 0), (slice(at, None), round(1e9 * pause_s)))
+        ]
+        return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
+
+    # The cut is in the middle of the fifth position.
+    source = turned(rng, positions(9, 3))
+    whole = fit([source], OPTIONS)
+    parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
+    n_turn_ons = [one.fit.windows.data.n_turn_ons for one in (whole, parts, others)]
+    assert n_turn_ons == [1, 1, 2]
+    n_mountings = [len(one.fit.selected.score.norms.square) for one in (whole, parts, others)]
+    assert n_mountings == [9, 9, 10]
+    sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, parts))
+    assert sd_cut == pytest.approx(sd, rel=0.1)
+
+
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng):
     # WHY: recordings of six faces, 1 mg apart, were explained by misalignments of 20 mrad.
     faces = np.vstack((np.eye(3), -np.eye(3)))

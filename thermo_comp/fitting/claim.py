@@ -88,18 +88,18 @@ def claim_of(
         prior = replace(prior, misalignment_sd=prior.unseen_misalignment_sd)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
-    # The mountings of a bag share the offset of one turn-on, so that its mean over the bags is an
-    # error of the bias.
-    n_bags = regression.n_bags
-    shared = offset_sd**2 * (1.0 / n_bags - 1.0 / (mounting[-1] + 1))
+    # The mountings of a turn-on share its offset, so the mean over the turn-ons is an error of the
+    # bias.
+    n_turn_ons = regression.windows.n_turn_ons
+    shared = offset_sd**2 * (1.0 / n_turn_ons - 1.0 / (mounting[-1] + 1))
     if prior.offset_scale > 0.0:
         covariance, offset_sd = _over_mountings(regression, posterior)
         turn_on_sd = _turn_on_sd(regression, posterior)
         offset_sd = float(np.hypot(offset_sd, turn_on_sd))
-        if n_bags < POSITIONS_FOR_MOUNTINGS:
+        if n_turn_ons < POSITIONS_FOR_MOUNTINGS:
             offset_sd = max(offset_sd, known_offset_sd)
-            turn_on_sd = max(turn_on_sd, known_offset_sd * (n_bags <= mounting[-1]))
-        shared = turn_on_sd**2 / n_bags
+            turn_on_sd = max(turn_on_sd, known_offset_sd * (n_turn_ons <= mounting[-1]))
+        shared = turn_on_sd**2 / n_turn_ons
     covariance = covariance.copy()
     covariance[layout.bias, layout.bias] += shared
     if candidates is not None:
@@ -214,17 +214,20 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
 def _turn_on_sd(regression: Regression, posterior: Posterior) -> float:
     """
     Return the sd of the bias offset of a turn-on beside that of a mounting [m/s^2]; 0 if each
-    mounting has a bag of its own, as then the offset of a mounting contains that of the turn-on.
+    mounting has a turn-on of its own, whose offset that of the mounting contains.
 
-    All mountings of a bag share one turn-on. The norms show how well turn-ons repeat only if there
-    are several bags; for a single bag the sd is that of the prior.
+    The norms show how well turn-ons repeat only if there are several; for a single turn-on the sd
+    is that of the prior.
     """
-    if regression.n_bags == regression.windows.mounting[-1] + 1 or not regression.gravity:
+    if (
+        regression.windows.n_turn_ons == regression.windows.mounting[-1] + 1
+        or not regression.gravity
+    ):
         return 0.0
     tried = posterior.prior.offset_scale * _GRID
     without_norms = replace(posterior.prior, offset_sd=float(tried[-1]))
     by_drifts = regression.solve(posterior.state, without_norms, n_steps=1).root
-    evidence = _norm_evidence(regression, posterior, tried, by_drifts, of_bags=True)
+    evidence = _norm_evidence(regression, posterior, tried, by_drifts, of_turn_ons=True)
     weight = evidence + _LOG_DENSITY
     weight = np.exp(weight - weight.max())
     return float(np.sqrt(weight @ tried**2 / weight.sum()))
@@ -236,11 +239,11 @@ def _norm_evidence(
     offset_sd: Floats,
     by_drifts: Floats,
     *,
-    of_bags: bool = False,
+    of_turn_ons: bool = False,
 ) -> Floats:
     """
     Return the log evidence of the mean norms of the mountings, for each sd of the offsets of
-    mountings, or with `of_bags` of the offsets that the mountings of a bag share, (k,).
+    mountings, or with `of_turn_ons` of the offsets that the mountings of a turn-on share, (k,).
 
     `by_drifts`: root of the covariance without the norms, for the thermal weights
     """
@@ -271,14 +274,14 @@ def _norm_evidence(
         of_prior = solve_triangular(prior.informative.root, along.T, trans='T').T
     noise = float(np.mean(prior.sigma**2)) * (1.0 / weight + prior.noise.ratio)
     known = of_prior @ of_prior.T
-    if not of_bags:
+    if not of_turn_ons:
         variances, vectors = np.linalg.eigh(known + np.diag(noise))
         variances = np.maximum(variances, noise.min()) + offset_sd[:, None] ** 2
         square = np.sum((vectors.T @ errors) ** 2 / variances, axis=1)
         return np.asarray(-0.5 * (square + np.sum(np.log(variances), axis=1)))
     known += np.diag(noise + prior.offset_sd**2)
-    bag = regression.bag_of_position[first]
-    shared = (by_axes.T @ by_axes) * (bag[:, None] == bag)
+    turn_on = regression.windows.turn_on_of_position[first]
+    shared = (by_axes.T @ by_axes) * (turn_on[:, None] == turn_on)
     roots = [np.linalg.cholesky(known + sd**2 * shared) for sd in offset_sd.tolist()]
     squares = [np.sum(solve_triangular(root, errors, lower=True) ** 2) for root in roots]
     logs = [2.0 * np.sum(np.log(np.diag(root))) for root in roots]

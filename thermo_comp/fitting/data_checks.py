@@ -268,17 +268,18 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
     are explained by nine constants, whatever the offsets.
     """
-    n, n_bags = int(fit.windows.data.mounting[-1]) + 1, fit.regression.n_bags
+    n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
     assumed = f'the uncertainty assumes {ug_text(offset_sd)}: state --mounting-sd'
     # The bias of the first recording is that of the unit; those of three others show how well
     # turn-ons repeat.
     needed = 4
-    if n_bags < min(n, needed):
+    if n_turn_ons < min(n, needed):
         yield advice(
             'mountings',
-            f'{n} rests in {counted(n_bags, "recording")} have {counted(n_bags, "turn-on")}, too '
+            f'{n} rests in {counted(fit.regression.n_bags, "recording")} have '
+            f'{counted(n_turn_ons, "turn-on")}, too '
             f'few to show how well the bias repeats after the unit is switched on again; {assumed}'
             f', or switch the unit off between {needed} recordings or more',
         )

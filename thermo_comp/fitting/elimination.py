@@ -167,14 +167,13 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return `whole` without some positions of one bag, given their normal equations."""
+        """Return `whole` without some positions, given their normal equations."""
         bag, r = self.layout.bag, len(self.bags.root[0])
-        at = bag[places[0]]
-        others = (bag == at) & ~np.isin(np.arange(len(bag)), places)
-        rest = _of_bags(others[None].astype(np.float64), self.shares, self.starts_prior[:, [at]])
-        before, after = self.bags.turned[at], rest.turned[0]
+        at = np.unique(bag[places])
+        others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)
+        rest = _of_bags(others.astype(np.float64), self.shares, self.starts_prior[:, at])
         gone = _of_unit(normal.unit, self.layout) - _square(self.positions.turned[places][..., r:])
-        return np.asarray(self.whole - gone + before.T @ before - after.T @ after)
+        return np.asarray(self.whole - gone + _square(self.bags.turned[at]) - _square(rest.turned))
 
     def beside(self, rows: Floats) -> tuple[Floats, Floats]:
         """
