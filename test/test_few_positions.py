@@ -207,6 +207,40 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
     assert sd_cut == pytest.approx(sd, rel=0.1)
 
 
+def test_a_prior_tells_how_well_turn_ons_repeat(rng):
+    # WHY: six positions with a prior that states 8 ug claimed the 43 ug of a unit without prior.
+    known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=2e-4)).calibration
+    assert known.static.x.residual_sd_m_s2 == pytest.approx(2e-4)
+    six = [turned(rng, positions(6, 4))]
+    alone, helped = (
+        fit(six, replace(OPTIONS, serial='1', prior=prior, allow=('prior',))).calibration
+        for prior in (None, known)
+    )
+    assert alone.static.x.residual_sd_m_s2 > 1e-3
+    # The scale of the prior's density is a factor of 1.5, and its tails are wide.
+    assert 2e-4 < helped.static.x.residual_sd_m_s2 < 4e-4
+
+
+def test_three_positions_do_not_show_which_constants_have_aged(rng):
+    # WHY: the change of a scale factor was taken for one of the bias: error / claimed sd was 2.4.
+    known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=1e-5)).calibration
+    scale, bias = 1.0 + 2e-3 * rng.standard_normal(3), 1e-2 * rng.standard_normal(3)
+    corners = positions(60, 5)
+    ratios = []
+    for seed in range(4):
+        ups = positions(3, 10 + seed) * scale + bias / GRAVITY
+        few = replace(OPTIONS, serial='1', prior=known, allow=('prior',))
+        aged = fit([turned(rng, ups)], few).calibration
+        # A unit without thermometer must not need one after the fit.
+        assert not aged.needs_temperature
+        reading = GRAVITY * corners * scale + bias + (0.1, -0.2, 0.3)
+        out = aged.correct(np.arange(1.0, len(reading) + 1.0), reading)
+        variance = np.diagonal(out.covariance, axis1=1, axis2=2) - 0.02**2
+        ratios.append((out.specific_force - GRAVITY * corners) ** 2 / variance)
+    # The six ages are common to all fits: their mean square has a relative sd of 60 %.
+    assert np.mean(ratios) < 3.0
+
+
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng):
     # WHY: recordings of six faces, 1 mg apart, were explained by misalignments of 20 mrad.
     faces = np.vstack((np.eye(3), -np.eye(3)))

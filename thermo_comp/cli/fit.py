@@ -51,7 +51,10 @@ def fit(
         'from the bags.'
     ),
     ageing_scale: float = option(
-        'Assumed scale change (1 sd) since the prior calibration, in ppm.', 0.0, metavar='PPM'
+        'Assumed scale change (1 sd) since the prior calibration, in ppm; estimated from the '
+        'bags if this is 0 without --ageing-bias.',
+        0.0,
+        metavar='PPM',
     ),
     report: Path | None = option('Certificate to write (HTML).', metavar='HTML'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,

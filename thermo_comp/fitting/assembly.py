@@ -89,6 +89,13 @@ def build_calibration(
         evidence=group_evidence(regression, posterior) if windows.was_measured else (),
         nonlinearity=nonlinearity,
     )
+    if known is not None and not (known.needs_temperature or windows.has_temperature):
+        # Rounding errors must not make a unit without thermometer depend on temperature.
+        places = parameter_layout(blank)
+        for block in (*places.bias, *places.scale):
+            level = values[block.static]
+            values[block.rows] = 0.0
+            values[[block.static, block.dynamic]] = level
     covariance = to_file @ claim.covariance @ to_file.T
     return with_parameters(blank, state.kappa * regression.nominal_scale, values, covariance)
 

@@ -24,6 +24,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,13 +32,12 @@ from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import LackOfFit
-from .data_checks import POSITIONS_FOR_MOUNTINGS
 from .equations import as_vector
 from .hyperparameters import STUDENT_NU
 from .initial_triad import within_positions
 from .regression import Posterior, Regression
 from .selection import LAGS, TRIAL_GAIN, Fit
-from .unknowns import Layout, Prior, State
+from .unknowns import InformativePrior, Layout, Prior, State
 from .windows import CURVE, PART
 
 #: Grid of the standard deviation of offsets, relative to the scale of its prior, in steps of a
@@ -47,6 +47,12 @@ _GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
 #: above, and falling to 0 below a hundredth of the scale, which few mountings reach.
 _LOG_DENSITY = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_GRID**2 / STUDENT_NU)
 _LOG_DENSITY += np.log(np.minimum(_GRID / 0.01, 1.0))
+#: The same about the sd of a prior calibration: a Student's density of the logarithm, whose scale
+#: is a factor of 1.5, to which twelve positions determine an sd.
+_KNOWN_GRID = 10.0 ** np.arange(-1.5, 1.51, 0.125)
+_KNOWN_LOG_DENSITY = (
+    -0.5 * (STUDENT_NU + 1.0) * np.log1p(np.log(_KNOWN_GRID) ** 2 / np.log(1.5) ** 2 / STUDENT_NU)
+)
 
 
 @dataclass(frozen=True)
@@ -70,14 +76,15 @@ def claim_of(
     candidates: Floats | None = None,
     gravity_sd: float = 0.0,
     known_offset_sd: float = 0.0,
+    informative: Sequence[InformativePrior] = (),
 ) -> Claim:
     """
     Return the published covariance of the fit of the chosen model.
 
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
-    `known_offset_sd`: turn-on sd of the prior calibration, a lower bound if the bags are too few
-    to determine the sd [m/s^2]; 0 for none
+    `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
+    `informative`: priors from a calibration that differ in the ageing since then
     """
     # The rests of one mounting have one offset, but the regression has one for each rest. The mean
     # of k offsets with k times the variance has the variance of one.
@@ -93,14 +100,14 @@ def claim_of(
     n_turn_ons = regression.windows.n_turn_ons
     shared = offset_sd**2 * (1.0 / n_turn_ons - 1.0 / (mounting[-1] + 1))
     if prior.offset_scale > 0.0:
-        covariance, offset_sd = _over_mountings(regression, posterior)
-        turn_on_sd = _turn_on_sd(regression, posterior)
+        tried = prior.offset_scale * _GRID, _LOG_DENSITY
+        if known_offset_sd:
+            tried = known_offset_sd * _KNOWN_GRID, _KNOWN_LOG_DENSITY
+        covariance, offset_sd = _over_mountings(regression, posterior, *tried)
+        turn_on_sd = _turn_on_sd(regression, posterior, *tried)
         offset_sd = float(np.hypot(offset_sd, turn_on_sd))
-        if n_turn_ons < POSITIONS_FOR_MOUNTINGS:
-            offset_sd = max(offset_sd, known_offset_sd)
-            turn_on_sd = max(turn_on_sd, known_offset_sd * (n_turn_ons <= mounting[-1]))
         shared = turn_on_sd**2 / n_turn_ons
-    covariance = covariance.copy()
+    covariance = covariance + _excess_over_priors(regression, posterior, informative)
     covariance[layout.bias, layout.bias] += shared
     if candidates is not None:
         wider = _with_unseen(regression, posterior, candidates)
@@ -175,11 +182,15 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     return replace(prior, column_sd=np.where(matters, sd, prior.column_sd))
 
 
-def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Floats, float]:
-    """Return covariance and offset sd of the mixture of fits over the mounting's sd."""
+def _over_mountings(
+    regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
+) -> tuple[Floats, float]:
+    """
+    Return covariance and offset sd of the mixture of fits over the mounting's sd, given values of
+    the sd and their log prior density, (k,).
+    """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
-    tried = prior.offset_scale * _GRID
 
     def solved(offset_sd: Floats) -> list[Posterior]:
         return [
@@ -199,7 +210,7 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     if n_rests > 1.0:
         # All rests of a mounting share its offset: only the means of mountings determine the sd.
         fits, weight = solved(n_rests**0.5 * tried), of_norms
-    weight = weight + _LOG_DENSITY
+    weight = weight + log_density
     weight = np.exp(weight - weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
@@ -211,24 +222,54 @@ def _over_mountings(regression: Regression, posterior: Posterior) -> tuple[Float
     return covariance, float(np.sqrt(weight @ tried**2))
 
 
-def _turn_on_sd(regression: Regression, posterior: Posterior) -> float:
+def _excess_over_priors(
+    regression: Regression, posterior: Posterior, informative: Sequence[InformativePrior]
+) -> Floats:
+    """
+    Return by how much the covariance of the mixture of fits over the ageing since the prior
+    calibration exceeds that of the most probable ageing: a few rests do not show which constants
+    have aged.
+    """
+    n = posterior.layout.n_unit
+    if not informative:
+        return np.zeros((n, n))
+    fits = [
+        regression.solve(posterior.state, replace(posterior.prior, informative=each), n_steps=3)
+        for each in informative
+    ]
+    weight = np.array([fit.log_evidence for fit in fits])
+    weight = np.exp(weight - weight.max())
+    sd = np.sqrt(np.diag(posterior.covariance))
+    mode = as_vector(posterior.state, posterior.layout)[:n]
+    excess = -posterior.covariance
+    for share, fit in zip(weight / weight.sum(), fits, strict=True):
+        difference = as_vector(fit.state, fit.layout)[:n] - mode
+        excess = excess + share * (fit.covariance + np.outer(difference, difference))
+    # Directions in which the mixture is narrower are left as they are.
+    values, vectors = np.linalg.eigh(excess / np.outer(sd, sd))
+    root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(root @ root.T)
+
+
+def _turn_on_sd(
+    regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
+) -> float:
     """
     Return the sd of the bias offset of a turn-on beside that of a mounting [m/s^2]; 0 if each
     mounting has a turn-on of its own, whose offset that of the mounting contains.
 
     The norms show how well turn-ons repeat only if there are several; for a single turn-on the sd
-    is that of the prior.
+    is that of the prior; `tried` and `log_density` as in `_over_mountings`.
     """
     if (
         regression.windows.n_turn_ons == regression.windows.mounting[-1] + 1
         or not regression.gravity
     ):
         return 0.0
-    tried = posterior.prior.offset_scale * _GRID
     without_norms = replace(posterior.prior, offset_sd=float(tried[-1]))
     by_drifts = regression.solve(posterior.state, without_norms, n_steps=1).root
     evidence = _norm_evidence(regression, posterior, tried, by_drifts, of_turn_ons=True)
-    weight = evidence + _LOG_DENSITY
+    weight = evidence + log_density
     weight = np.exp(weight - weight.max())
     return float(np.sqrt(weight @ tried**2 / weight.sum()))
 

@@ -231,7 +231,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         selected, terms = choose(fit.regression, fit.selected, options)
         fit = fit._replace(selected=selected)
     claim = claim_of(
-        *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known))
+        *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known)),
+        informative=fit.selected.informative,
     )
     residuals, in_sample, left_out = residual_rows(fit)
     drift = within_positions(in_sample[:, None], fit.windows.data.position)

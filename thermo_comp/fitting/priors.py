@@ -8,6 +8,12 @@ prior of the regression, which has the calibration's columns. The mean and the c
 population are the mean and the scatter, over the units, of the parameters relative to the scale
 factors. The covariance of an earlier calibration of the unit is increased by the ageing of the
 unit.
+
+References
+----------
+.. [1] J. Schaefer, K. Strimmer, "A shrinkage approach to large-scale covariance matrix estimation
+   and implications for functional genomics", Stat. Appl. Genet. Mol. Biol. 4(1), 2005.
+
 """
 
 from __future__ import annotations
@@ -26,6 +32,7 @@ from ..thermal.memory import Lag
 from ..typing import Floats
 from ..unit.calibration import POPULATION, Calibration, RegimeSet, parameter_layout
 from ..unit.columns import FINE_TAUS, Column
+from ..unit.posterior import ParameterLayout
 from ..unit.provenance import Provenance, Source
 from ..unit.terms import LINE
 from .assembly import blank_terms, file_jacobian, parameters_of, union, with_parameters
@@ -39,6 +46,8 @@ from .windows import Model, Sets
 
 #: Smallest number of units of a population: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
+#: Smallest share by which correlations of the curves are reduced, so that a covariance is regular.
+LEAST_SHARE = 0.01
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
@@ -125,7 +134,7 @@ def informative_priors(
         # Candidates of the sd of ageing: of the biases [g], its multiple for the scale factors.
         tried += [
             (grown(ageing * options.gravity, multiple * ageing), 0.0)
-            for multiple in (0.0, 0.01, 1.0)
+            for multiple in (0.3, 1.0)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
     # Under a narrow prior the noise estimated by the first fit would absorb changes of the unit.
@@ -201,15 +210,35 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     vectors = np.array([vector for vector, _ in units])
     mean = vectors.mean(axis=0)
     away = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
-    # A share of the scatter is taken as uncorrelated between the parameters, since a few units do
-    # not show all directions in which another unit can differ.
-    share = 0.01
-    scatter = (1.0 - share) * away.T @ away
-    scatter[np.diag_indices_from(scatter)] += share * np.sum(away**2, axis=0)
-    scatter *= 1.0 + 1.0 / len(vectors)
+    scatter = (1.0 + 1.0 / len(vectors)) * _scatter(away, parameter_layout(like))
     # Parameters that none of the units determined keep the uncertainty of their own prior.
     scatter += np.mean([covariance for _, covariance in units], axis=0)
     return with_parameters(like, mean_K, mean, scatter)
+
+
+def _scatter(away: Floats, layout: ParameterLayout) -> Floats:
+    """
+    Return the covariance of units from their distances to the mean / sqrt(n - 1), (n, p).
+
+    The constants of a unit are taken as independent of each other and of its curves: in the
+    scatter of a few units they have correlations by chance, by which one position would determine
+    all of them. The correlations of the curves are multiplied by 1 - share [1]_.
+    """
+    kind = np.zeros(away.shape[1], np.int64)
+    levels = [[block.static, block.dynamic] for block in (*layout.bias, *layout.scale)]
+    for number, places in enumerate((*levels, *range(layout.misalignment, len(kind))), 1):
+        kind[places] = number
+    scatter: Floats = away.T @ away * (kind[:, np.newaxis] == kind)
+    curves = np.flatnonzero((kind == 0) & (np.diag(scatter) > 0.0))
+    sd = np.sqrt(np.diag(scatter))
+    relative, n = away[:, curves] / sd[curves], len(away)
+    correlation = relative.T @ relative
+    variance = n / (n - 1.0) * ((relative**2).T @ relative**2 - correlation**2 / n)
+    others = ~np.eye(len(curves), dtype=bool)
+    share = np.sum(variance, where=others) / max(np.sum(correlation**2, where=others), 1e-300)
+    is_pair = (kind == 0) & ~np.eye(len(kind), dtype=bool)
+    scatter[is_pair] *= 1.0 - np.clip(share, LEAST_SHARE, 1.0)
+    return scatter
 
 
 def _alike(column: Column) -> Column:

@@ -64,11 +64,15 @@ class Trial:
 
 @dataclass(frozen=True)
 class Selected:
-    """The chosen model: its completed fit, its left-out score, and all models that were tried."""
+    """
+    The chosen model: its completed fit, its left-out score, and all models that were tried;
+    `informative`: the priors from a calibration that were compared.
+    """
 
     posterior: Posterior
     score: Score
     trials: tuple[Trial, ...]
+    informative: tuple[InformativePrior, ...] = ()
 
 
 class Fit(NamedTuple):
@@ -343,7 +347,7 @@ def fit_all(
     score = score_of(regression, posterior)
     groups = tuple(dict.fromkeys(regression.windows.groups))
     trial = Trial(groups, score, posterior, candidates.typical, is_chosen=True)
-    return Selected(posterior, score, (trial,))
+    return Selected(posterior, score, (trial,), tuple(informative))
 
 
 def finish(
