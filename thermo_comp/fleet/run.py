@@ -28,7 +28,7 @@ from .units import FoundUnit, Storage, find_units, folders_of_tables
 from .work import FleetOptions, UnitOutcome, connected, run, sha256
 
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
-_FORMAT = 2
+_FORMAT = 3
 _LONGEST_NAME = 100
 # Largest number of rows listed on the page; the table has all rows.
 _MOST_ROWS = 60
@@ -178,17 +178,17 @@ def render_fleet(
     distances = ReportFigure(
         'distances',
         'Which units stand out, and in what?',
-        'Each stroke is a unit: its distance from the fleet’s median in robust standard '
-        'deviations. Diamonds beyond the dashed lines are the units listed above.',
+        'Each stroke is a unit: its distance from the fleet’s median in standard deviations of '
+        'the units and of its own fit. Diamonds beyond the lines are the units listed above.',
         partial(
             draw_distances,
             [spread.quantity.label for spread in summary.spreads],
             [spread.z for spread in summary.spreads],
-            summary.limit,
+            [spread.limit for spread in summary.spreads],
         ),
     )
     # With few units the spread is not known.
-    is_comparable = np.isfinite(summary.limit)
+    is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
     return render(
         'fleet.html',
         title='Fleet report',

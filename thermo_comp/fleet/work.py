@@ -149,7 +149,7 @@ def _fitted(
     evidence = evidence_of_fit(result, how.gravity_sd)
     evidence = replace(evidence, findings=(*evidence.findings, *lost))
     known = {
-        **fitted_cells(result, evidence.judgement),
+        **fitted_cells(result, evidence.judgement, has_prior=how.prior is not None),
         'reservations': '; '.join(evidence.findings),
         'calibration_sha256': sha256(calibration),
     }
