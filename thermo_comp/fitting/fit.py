@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ..errors import FitError
+from ..errors import FitError, UndeterminedError
 from ..recording.stillness import widened
 from ..text import valid_serial
 from ..typing import Floats
@@ -256,7 +256,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
             text = 'the unit rotated in some rests, so no gyroscope was fitted'
             findings.append(Finding('rate', 'advice', text))
     except ValueError as error:
-        raise _unusable(error) from error
+        raise _unusable(error, fit.posterior.state.up) from error
     least = least_known(calibration, fit.posterior.state.up)
     unseen = [*data_checks.judge_coverage(least), *judge_terms(calibration)]
     return FitResult(
@@ -292,10 +292,12 @@ def _judged(
     return kept, findings + raw_checks.judge_copies(copies)
 
 
-def _unusable(error: ValueError) -> FitError:
+def _unusable(error: ValueError, up: Floats) -> FitError:
     """Return the FitError for a calibration with values outside their ranges."""
     if 'misalignment' in str(error):
-        return FitError(
+        # Positions that determine the misalignment contradict an accelerometer.
+        kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
+        return kind(
             'the angle between two of its axes is less than 60 degrees, which no accelerometer '
             'has: is the topic the right one, did the axes stay the same in all positions, and '
             'are there at least 9 positions?'
