@@ -321,8 +321,8 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     serial = check_serial([bag.source for bag in bags], options)
     full_scale = options.saturated_at
     largest = max(bag.max_abs for bag in bags)
-    if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
-        full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
+    if full_scale == COUNTS_FULL_SCALE:
+        full_scale = widened(full_scale, np.array([[largest]]))
     if full_scale is None:
         # The smallest usual full scale of sensors in m/s^2 that contains the data.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))

@@ -126,8 +126,8 @@ def _judge_units(
             return
     yield advice(
         'compensated',
-        'the samples are not whole numbers: scaled or compensated before they were recorded? A '
-        'calibration made from scaled samples is valid for that scaling only',
+        'the samples are not whole numbers: averaged, scaled or compensated before they were '
+        'recorded? A calibration made from scaled samples is valid for that scaling only',
     )
 
 
