@@ -373,8 +373,8 @@ def test_a_prior_does_not_repair_units_that_contradict_themselves(client, tmp_pa
         ('recalibrate', 1, False),
         ('recalibrate', 0, False),
         ('no better than raw', 0, False),
-        ('thermometers probably exchanged: not judged', 1, False),
-        ('thermometers probably exchanged: not judged', 0, False),
+        ('thermometers exchanged or loose: not judged', 1, False),
+        ('thermometers exchanged or loose: not judged', 0, False),
         # A refusal of contradictory data, and one for missing data.
         ('refused', None, False),
         ('refused', 0, True),

@@ -39,6 +39,7 @@ from .evidence import PositionReport, ResidualRow, position_reports, residual_ro
 from .gyroscope import RateRow, add_gyroscope
 from .initial_triad import within_positions
 from .initialisation import Problem, initial_triad
+from .missing_readings import judge_missing
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of
@@ -224,6 +225,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     up = start.directions(windows.data)
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case, known), options)
+    findings += judge_missing(windows)
     progress(0.7)
     fit = regressed(windows, Problem(bags, options, start, up, progress))
     terms: tuple[NonlinearTerm, ...] = ()
