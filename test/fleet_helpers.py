@@ -30,8 +30,12 @@ def write_unit(
     names=None,
     is_exchanged=False,
     counts='accel/counts',
+    fault=lambda counts: counts,
 ):
-    """Simulate a thermal test of a unit, a bag per position; thermometers may be exchanged."""
+    """
+    Simulate a thermal test of a unit, a bag per position; thermometers may be exchanged, and
+    `fault` applied to the counts of each bag.
+    """
     unit = unit or preset('mems', seed)
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
@@ -47,7 +51,8 @@ def write_unit(
             board, case = ('case', 'board') if is_exchanged else ('board', 'case')
             bag.write_temperature(f'temperature/{board}', run.board_stamp_ns, run.board)
             bag.write_temperature(f'temperature/{case}', run.case_stamp_ns, run.case)
-            bag.write_counts(counts, run.accel_stamp_ns, run.counts.astype(np.float64), 'imu_link')
+            samples = fault(run.counts).astype(np.float64)
+            bag.write_counts(counts, run.accel_stamp_ns, samples, 'imu_link')
         paths.append(path)
     return paths
 

@@ -280,6 +280,25 @@ def test_accelerations_are_not_taken_for_counts(rng):
         fit(faces(1.0, 0.01, rng), FitOptions(gravity=9.81))
 
 
+@pytest.mark.parametrize('n_averaged', [0, 1, 4000])
+def test_counts_of_24_bits_that_a_driver_averages_are_fitted(n_averaged, rng):
+    # WHY: a single fractional sample made all samples exceed the full scale of 16 bits.
+    def counts(up):
+        whole = np.rint(4e5 * (up + 1e-3 * rng.standard_normal((4000, 3))))
+        whole[:n_averaged] += 0.25
+        return whole
+
+    celsius = np.linspace(10.0, 40.0, 40)
+    sources = [short(counts(up), celsius, name=f'face{k}') for k, up in enumerate(FACES)]
+    result = fit(sources, FitOptions(gravity=9.81))
+    messages = [finding.message for finding in result.findings]
+    is_named = any(message.startswith('the samples are not whole numbers') for message in messages)
+    assert is_named == (n_averaged > 0)
+    assert result.calibration.unit.full_scale == 2.0**23 - 1.0
+    scale = [axis.scale_factor for axis in result.calibration.axes]
+    np.testing.assert_allclose(scale, 4e5 / 9.81, rtol=1e-3)
+
+
 def test_saturated_samples_are_refused(rng):
     sources = faces(9.81, 0.01, rng)
     options = FitOptions(gravity=9.81, input='m/s^2', full_scale=9.815)

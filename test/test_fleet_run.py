@@ -21,8 +21,8 @@ from triads import sibling
 from thermo_comp.cli.app import run as run_command
 from thermo_comp.errors import ThermoCompError
 from thermo_comp.fitting import FitOptions
-from thermo_comp.fleet.run import Results, fit_fleet
-from thermo_comp.fleet.table import COLUMNS, read_parquet
+from thermo_comp.fleet.run import Results, fit_fleet, lacks_data
+from thermo_comp.fleet.table import COLUMNS, read_parquet, row_of
 from thermo_comp.fleet.units import Storage, find_units
 from thermo_comp.fleet.work import FleetOptions, connected, outcome_of
 from thermo_comp.recording.topics import Topics
@@ -336,3 +336,50 @@ def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
     assert (np.abs(errors[0] / scale - 1.0) < 3e-6 * sds[0]).all()
     assert (sds[0] < 0.5 * sds[1]).all()
     assert fit_fleet(*arguments, client=client, with_prior=True).n_done == 0
+
+
+def with_stuck_bit(bit):
+    def fault(counts):
+        counts = counts.copy()
+        counts[:, 1] |= 1 << bit
+        return counts
+
+    return fault
+
+
+def test_a_prior_does_not_repair_units_that_contradict_themselves(client, tmp_path):
+    # WHY: by the uncertainty of the prior, the errors of a stuck bit had become valid.
+    kind = unit_preset('mems', 1)
+    faults = {0: with_stuck_bit(7), 4: with_stuck_bit(10)}
+    for number in range(5):
+        keys = {'n_bags': 12, 'fault': faults[number]} if number in faults else {'n_bags': 9}
+        unit = sibling(kind, number)
+        write_unit(tmp_path / 'bags' / f'u{number}', number, unit=unit, serial='', **keys)
+    arguments = (str(tmp_path / 'bags'), tmp_path / 'out', OPTIONS)
+    alone = fit_fleet(*arguments, client=client)
+    assert alone.prior is not None
+    verdicts = [str(row['verdict']).split(',')[0] for row in alone.rows]
+    assert verdicts == ['no better than raw', 'valid', 'valid', 'valid', 'refused']
+    helped = fit_fleet(*arguments, client=client, with_prior=True)
+    assert (helped.n_done, helped.rows) == (0, alone.rows)
+
+
+@pytest.mark.parametrize(
+    ('verdict', 'is_whole', 'is_lacking'),
+    [
+        ('valid', 1, False),
+        ('valid', 0, True),
+        ('valid, but it only claims 5 mg', 0, True),
+        ('recalibrate', 1, False),
+        ('recalibrate', 0, False),
+        ('no better than raw', 0, False),
+        ('thermometers exchanged or loose: not judged', 1, False),
+        ('thermometers exchanged or loose: not judged', 0, False),
+        # A refusal of contradictory data, and one for missing data.
+        ('refused', None, False),
+        ('refused', 0, True),
+        ('failed', None, False),
+    ],
+)
+def test_only_units_that_lack_data_are_fitted_with_the_prior(verdict, is_whole, is_lacking):
+    assert lacks_data(row_of(name='u', verdict=verdict, is_whole=is_whole)) is is_lacking

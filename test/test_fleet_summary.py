@@ -79,9 +79,77 @@ class TestOutliers:
         assert outlier_limit(6, 20) == float('inf')
 
     def test_equal_units_give_no_outliers(self, rng):
-        rows = [{**row, 'm_10_urad': 0.0} for row in fleet_of(20, rng)]
-        spread = next(one for one in summarise(rows).spreads if one.quantity.name == 'm_10_urad')
+        spread = spread_of('noise_x', [{**row, NOISE_X: 4.0} for row in fleet_of(20, rng)])
         assert (spread.sd, set(spread.z.tolist())) == (0.0, {0.0})
+
+    def test_a_lag_of_the_board_is_compared(self, rng):
+        # WHY: a case thermometer off the case reads air: the board seemed to lead, unnoticed.
+        rows = fleet_of(20, rng)
+        rows[4] = {**rows[4], 'board_lag_s': -800.0}
+        (outlier,) = summarise(rows).outliers
+        assert (outlier.serial, outlier.label, outlier.unit) == ('S004', 'lag of the board', 's')
+
+
+NOISE_X = 'noise_x_ug_sqrt_hz'
+
+
+def spread_of(name, rows):
+    return next(one for one in summarise(rows).spreads if one.quantity.name.startswith(name))
+
+
+class TestUndetermined:
+    """
+    Units whose data do not determine a parameter state its prior with a large sd: such values say
+    nothing of the unit. WHY: M = -3950 urad with an sd of 9100 urad was ranked as -32 sd.
+    """
+
+    @staticmethod
+    def with_few_positions(n, rng):
+        rows = fleet_of(n + 12, rng)
+        few = {'m_sd_10_urad': 9100.0, 'bias_sd_x_ug': 23000.0, 'bias_slope_sd_z_ug_k': None}
+        for i in range(n):
+            drawn = {'m_10_urad': 4000.0 * rng.normal(), 'bias_x_ug': 20000.0 * rng.normal()}
+            rows[i] = {**rows[i], **few, **drawn, 'bias_slope_z_ug_k': 1e4}
+        return rows
+
+    @pytest.mark.parametrize('n', [1, 4, 16])
+    def test_they_are_no_outliers_and_leave_median_spread_and_limit_alone(self, n, rng):
+        rows = self.with_few_positions(n, rng)
+        summary = summarise(rows)
+        assert summary.outliers == ()
+        for name in ('m_10', 'bias_x', 'bias_slope_z'):
+            all_units, whole = spread_of(name, rows), spread_of(name, rows[n:])
+            assert (all_units.middle, all_units.sd) == (whole.middle, whole.sd)
+            assert all_units.counted.tolist() == whole.values.tolist()
+            n_comparisons = sum(len(spread.names) for spread in summary.spreads)
+            assert all_units.limit == outlier_limit(12, n_comparisons)
+        # A bias slope without an sd is not determined, so it is not compared at all.
+        assert len(spread_of('bias_slope_z', rows).names) == 12
+
+    def test_a_distance_is_divided_by_both_sds(self, rng):
+        rows = self.with_few_positions(1, rng)
+        rows[0] = {**rows[0], 'm_10_urad': -3950.0}
+        spread = spread_of('m_10', rows)
+        expected = (-3950.0 - spread.middle) / np.sqrt(spread.sd**2 + 9100.0**2)
+        assert spread.z[0] == pytest.approx(expected)
+
+    def test_a_unit_stands_out_beside_many_that_lack_data(self, rng):
+        rows = self.with_few_positions(16, rng)
+        rows[-1] = {**rows[-1], 'm_10_urad': 2000.0}
+        (outlier,) = summarise(rows).outliers
+        assert (outlier.serial, outlier.label) == ('S027', 'M[1][0]')
+
+    def test_a_parameter_that_no_unit_determines_is_not_compared(self, rng):
+        rows = [{**row, 'm_10_urad': 0.0, 'm_sd_10_urad': 9e3} for row in fleet_of(20, rng)]
+        names = [spread.quantity.name for spread in summarise(rows).spreads]
+        assert 'm_10_urad' not in names
+        assert 'm_20_urad' in names
+
+    def test_eight_units_must_determine_a_parameter(self, rng):
+        rows = self.with_few_positions(30, rng)[:37]
+        rows[-1] = {**rows[-1], 'bias_slope_z_ug_k': 1e6}
+        assert spread_of('bias_slope_z', rows).limit == float('inf')
+        assert summarise(rows).outliers == ()
 
 
 class TestDrift:

@@ -5,6 +5,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from fleet_helpers import OPTIONS, damage, write_unit
 
@@ -13,6 +14,7 @@ from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.fleet.table import COLUMNS
 from thermo_comp.fleet.units import Storage, find_units
 from thermo_comp.fleet.work import process_unit
+from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import parse_calibration
 
 pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
@@ -84,6 +86,17 @@ class TestRow:
         assert row['scale_slope_x_ppm_k'] == pytest.approx(
             (slope.value(1e-3) - slope.value(-1e-3)) / 2e-3 * 1e6, rel=1e-6
         )
+        # The sd of a slope must equal the scatter of slopes drawn from the posterior.
+        block = parameter_layout(calibration).scale[0]
+        n_drawn, rows = 4000, slice(block.static + 1, block.static + 1 + slope.n_free)
+        covariance = calibration.posterior.covariance()[rows, rows]
+        drawn = np.random.default_rng(1).multivariate_normal(
+            slope.free_coefficients, covariance, n_drawn
+        )
+        curves = [slope.with_free(tuple(one), 1.0) for one in drawn.tolist()]
+        slopes = [float(curve.value(1e-3) - curve.value(-1e-3)) / 2e-3 * 1e6 for curve in curves]
+        assert row['scale_slope_sd_x_ppm_k'] == pytest.approx(np.std(slopes), rel=0.05)
+        assert row['board_lag_s'] == calibration.board_lag_s
         assert row['lowest_c'] < 10.0
         assert row['highest_c'] > 40.0
         assert row['start'] == '2026-01-01T00:00:01Z'
@@ -121,3 +134,18 @@ class TestRow:
         row = processed(tmp_path).row
         assert (row['lot'], row['serial']) == ('L7', 'u')
         assert row['chosen'] == '/imu/raw, its only Vector3Stamped, is taken for counts'
+
+    def test_a_slope_that_the_positions_do_not_determine_has_no_sd(self, tmp_path):
+        # WHY: one position gives bias and scale together; the fit called all of it bias, +-0.06.
+        write_unit(tmp_path / 'u', 1, 1)
+        row = processed(tmp_path).row
+        assert [row[f'bias_slope_sd_{axis}_ug_k'] for axis in 'xyz'] == [None] * 3
+        assert [row[f'scale_slope_sd_{axis}_ppm_k'] for axis in 'xyz'] == [None] * 3
+
+    def test_the_lag_of_a_board_that_leads_is_negative(self, tmp_path):
+        # WHY: the file states the usual 900 s instead, which is no measurement of the unit.
+        write_unit(tmp_path / 'u', 1, 6, is_exchanged=True)
+        allowed = replace(OPTIONS.fit, allow=('swapped',))
+        outcome = processed(tmp_path, fit=allowed)
+        assert outcome.row['board_lag_s'] < -100.0
+        assert parse_calibration(outcome.calibration.encode()).board_lag_s == 900.0

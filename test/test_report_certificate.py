@@ -216,6 +216,44 @@ def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
             assert numbers[4] == pytest.approx(2e6 * math.hypot(scale_sd[k], gravity), rel=0.06)
 
 
+def without_uncertainty(calibration):
+    def plain(part):
+        axes = {name: replace(getattr(part, name), residual_sd_m_s2=0.0) for name in 'xyz'}
+        return replace(part, lack_of_fit=(), **axes)
+
+    static, dynamic = map(plain, calibration.regime_sets())
+    sds = {'posterior': None, 'misalignment_sd': (0.0, 0.0, 0.0)}
+    return replace(calibration, static=static, dynamic=dynamic, **sds)
+
+
+@pytest.mark.parametrize('is_known', [True, False])
+def test_values_and_deviations_have_one_place_where_u_is_withheld(is_known, tmp_path):
+    # WHY: a scale of -1777 ppm was printed beside its deviation of 23.12 ppm.
+    calibration = fitted().calibration
+    if not is_known:
+        calibration = without_uncertainty(calibration)
+        assert not calibration.has_uncertainty
+    withheld = over_temperature(replace(evidence(), calibration=calibration), CertificateInfo())
+    stated = over_temperature(evidence(), load_certificate_info(lab(tmp_path)))
+    n_withheld = 0
+    for table, whole in zip(withheld, stated, strict=True):
+        for row, other in zip(table.rows, whole.rows, strict=True):
+            cells, others = row[2:], other[2:]
+            for k in (0, 3):
+                text, expanded, deviation = cells[k : k + 3]
+                n_withheld += expanded == '–'
+                assert len(text.partition('.')[2]) == len(deviation.partition('.')[2])
+                # A withheld uncertainty does not change the numbers by more than their rounding.
+                for one, place in ((text, k), (deviation, k + 2)):
+                    half = 0.5 * 10.0 ** -len(one.partition('.')[2])
+                    number, expected = (
+                        float(cell.replace('−', '-')) for cell in (one, others[place])
+                    )
+                    tolerance = half + 0.06 * float(others[k + 1])
+                    assert number == pytest.approx(expected, abs=tolerance)
+    assert n_withheld == sum(len(table.rows) for table in withheld) * (1 if is_known else 2)
+
+
 @pytest.mark.parametrize(
     ('ends', 'expected'),
     [

@@ -45,3 +45,7 @@ class OutputError(ThermoCompError):
 
 class FitError(ThermoCompError):
     """Data that do not suffice for the fit; the text says what is missing and what to record."""
+
+
+class UndeterminedError(FitError):
+    """Data that do not determine all parameters, so that an estimate is outside its range."""

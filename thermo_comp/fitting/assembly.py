@@ -67,7 +67,7 @@ def build_calibration(
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     static, dynamic = _regime_sets(fit, claim, known)
     columns = _valid_columns(windows, state, used, known)
-    lag_s = known.board_lag_s if known else _board_lag(windows)
+    lag_s = known.board_lag_s if known else _usable_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     blank = Calibration(
@@ -327,19 +327,38 @@ def _rest_gradient_range(
     rate.
     """
     lower, upper = _range(windows.gradient - lag_s * windows.rate, 0.01)
-    has_ramps = windows.gradient.any() and 60.0 * float(windows.rate.std()) > RAMP_K_MIN
-    ranges = [(lower, upper)] if has_ramps and max(-lower, upper) < 100.0 else []
+    is_small = max(-lower, upper) < 100.0
+    ranges = [(lower, upper)] if _has_gradients(windows) and is_small else []
     if known is not None and known.rest_gradient_range_k is not None:
         ranges.append(known.rest_gradient_range_k)
     return union(ranges) if ranges else None
 
 
-def _board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case: slope of the gradient over the rate [s]."""
+def measured_board_lag(windows: ThermalWindows) -> float:
+    """
+    Return the lag of the board behind the case [s], negative if the board leads; NaN without ramps
+    or without a case temperature.
+    """
+    return _slope_of_gradient(windows) if _has_gradients(windows) else np.nan
+
+
+def _has_gradients(windows: ThermalWindows) -> bool:
+    """Whether the case temperature was recorded in ramps."""
+    has_ramps = 60.0 * float(windows.rate.std()) > RAMP_K_MIN
+    return bool(windows.gradient.any()) and has_ramps
+
+
+def _usable_lag(windows: ThermalWindows) -> float:
+    """Return the lag of the board behind the case [s], or the usual lag if it was not measured."""
+    lag = _slope_of_gradient(windows)
+    return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
+
+
+def _slope_of_gradient(windows: ThermalWindows) -> float:
+    """Return the slope of the gradient over the rate [s]; NaN at a constant rate."""
     rate = windows.rate - np.mean(windows.rate)
     power = float(rate @ rate)
-    lag = float(rate @ windows.gradient) / power if power > 0.0 else np.nan
-    return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
+    return float(rate @ windows.gradient) / power if power > 0.0 else np.nan
 
 
 def _numbers(values: Floats) -> tuple[float, ...]:

@@ -28,7 +28,6 @@ from .windows import ThermalWindows
 
 if TYPE_CHECKING:
     from .evidence import ResidualRow
-    from .reduction import ReducedBag
     from .selection import Fit
 
 #: Smallest numbers of positions that determine bias and scale factor (six constants), the
@@ -86,7 +85,6 @@ def judge_windows(
         text = f'{what}: the calibration holds at the temperature of the test'
         yield advice('temperature', text)
         return
-    yield from _judge_unmeasured(windows, used_bags)
     if prior is not None and prior.provenance.model != POPULATION:
         yield _judge_beyond(windows.temperature, prior)
     else:
@@ -108,7 +106,7 @@ def judge_windows(
                 'swapped',
                 'refusal',
                 f'the board temperature leads the case (correlation {correlation:.2f} of gradient '
-                'and rate): are the two sensors exchanged?',
+                'and rate): are the two sensors exchanged, or is that of the case loose?',
             )
 
 
@@ -135,36 +133,6 @@ def _judge_beyond(temperature: Floats, prior: Calibration) -> Finding:
         f'{text}; the bags reach {coldest:.0f} to {hottest:.0f} degC: fit them together with the '
         'bags of the prior',
     )
-
-
-def _judge_unmeasured(
-    windows: ThermalWindows, used_bags: Sequence[ReducedBag]
-) -> Iterator[Finding]:
-    """Report the samples at rest that are left out because their temperature is not known."""
-    n_still = sum(interval.count.sum() for bag in used_bags for interval in bag.intervals)
-    n_unsettled = 0.0
-    for bag, track in zip(used_bags, windows.tracks, strict=False):
-        for interval in bag.intervals:
-            since = (interval.time >= track.start_s) & (interval.time < track.settled_s)
-            n_unsettled += float(interval.count[since].sum())
-    n_used = float(windows.data.weight.sum()) * windows.typical_count
-    unsettled = n_unsettled / max(n_still, 1.0)
-    missing = 1.0 - n_used / max(n_still, 1.0) - unsettled
-    if used_bags and missing > 0.1:
-        yield advice(
-            'unmeasured',
-            f'{100.0 * missing:.0f} % of the time at rest has no temperatures and is left out: do '
-            'the thermometers and the accelerometer use the same clock?',
-        )
-    if unsettled > 0.1:
-        quantum = windows.model.detector.board.quantum_c
-        steps = f' (steps of {quantum:g} K)' if quantum else ''
-        yield advice(
-            'steps',
-            f'{100.0 * unsettled:.0f} % of the time at rest is left out: the board temperature is '
-            f'less certain than later until the reading of temperature/board{steps} changes for '
-            'the first time in a bag; begin with a ramp, or use a finer thermometer',
-        )
 
 
 def _has_drift(windows: ThermalWindows) -> bool:

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ..errors import FitError
+from ..errors import FitError, UndeterminedError
 from ..recording.stillness import widened
 from ..text import valid_serial
 from ..typing import Floats
@@ -39,6 +39,7 @@ from .evidence import PositionReport, ResidualRow, position_reports, residual_ro
 from .gyroscope import RateRow, add_gyroscope
 from .initial_triad import within_positions
 from .initialisation import Problem, initial_triad
+from .missing_readings import judge_missing
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of
@@ -224,6 +225,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     up = start.directions(windows.data)
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case, known), options)
+    findings += judge_missing(windows)
     progress(0.7)
     fit = regressed(windows, Problem(bags, options, start, up, progress))
     terms: tuple[NonlinearTerm, ...] = ()
@@ -257,7 +259,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
             text = 'the unit rotated in some rests, so no gyroscope was fitted'
             findings.append(Finding('rate', 'advice', text))
     except ValueError as error:
-        raise _unusable(error) from error
+        raise _unusable(error, fit.posterior.state.up) from error
     least = least_known(calibration, fit.posterior.state.up)
     unseen = [*data_checks.judge_coverage(least), *judge_terms(calibration)]
     return FitResult(
@@ -293,10 +295,12 @@ def _judged(
     return kept, findings + raw_checks.judge_copies(copies)
 
 
-def _unusable(error: ValueError) -> FitError:
+def _unusable(error: ValueError, up: Floats) -> FitError:
     """Return the FitError for a calibration with values outside their ranges."""
     if 'misalignment' in str(error):
-        return FitError(
+        # Positions that determine the misalignment contradict an accelerometer.
+        kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
+        return kind(
             'the angle between two of its axes is less than 60 degrees, which no accelerometer '
             'has: is the topic the right one, did the axes stay the same in all positions, and '
             'are there at least 9 positions?'
@@ -320,8 +324,8 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     serial = check_serial([bag.source for bag in bags], options)
     full_scale = options.saturated_at
     largest = max(bag.max_abs for bag in bags)
-    if full_scale == COUNTS_FULL_SCALE and bags[0].is_integer:
-        full_scale = widened(full_scale, np.array([[np.rint(largest)]]))
+    if full_scale == COUNTS_FULL_SCALE:
+        full_scale = widened(full_scale, np.array([[largest]]))
     if full_scale is None:
         # The smallest usual full scale of sensors in m/s^2 that contains the data.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))

@@ -47,14 +47,13 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
             'it can measure, or --full-scale is wrong',
         )
-    n_dropped = total('n_dropped')
-    if n_dropped > 0.01 * n_samples:
+    if n_dropped := total('n_dropped'):
         why = 'was a clock set back?'
         if 2 * total('n_repeated') > n_dropped:
             why = 'does the driver send several samples with one stamp?'
-        share = f'{100.0 * n_dropped / n_samples:.0f} % of the samples'
-        text = f'{share} are not finite, or have a stamp that does not rise, and are left out'
-        yield advice('dropped', f'{text}: {why}')
+        share = f'{n_dropped}, {100.0 * n_dropped / n_samples:.2g} % of all'
+        text = 'samples that are not finite, or have a stamp that does not rise, are left out'
+        yield advice('dropped', f'{text} ({share}): {why}')
     if n := total('n_glitches'):
         yield advice(
             'glitches',
@@ -126,8 +125,8 @@ def _judge_units(
             return
     yield advice(
         'compensated',
-        'the samples are not whole numbers: scaled or compensated before they were recorded? A '
-        'calibration made from scaled samples is valid for that scaling only',
+        'the samples are not whole numbers: averaged, scaled or compensated before they were '
+        'recorded? A calibration made from scaled samples is valid for that scaling only',
     )
 
 

@@ -20,18 +20,23 @@ import numpy as np
 from .. import files
 from ..errors import FitError, ThermoCompError
 from ..fitting.priors import UNITS_NEEDED, population
+from ..judging.verdicts import Verdict
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import load_calibration, save_calibration
 from .summary import Summary, summarise
-from .table import FAILED, Row, is_fitted, is_valid, row_of, write_tables
+from .table import Row, is_fitted, is_valid, row_of, write_tables
 from .units import FoundUnit, Storage, find_units, folders_of_tables
 from .work import FleetOptions, UnitOutcome, connected, run, sha256
 
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
-_FORMAT = 2
+_FORMAT = 3
 _LONGEST_NAME = 100
 # Largest number of rows listed on the page; the table has all rows.
 _MOST_ROWS = 60
+# Verdicts on the bags of the fit itself that no further data would change.
+_CONTRADICTIONS = tuple(
+    kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
+)
 CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'result.json'
 
 
@@ -102,12 +107,8 @@ def fit_fleet(
         rows = fitted(units, options)
         prior, no_prior = _common(list(rows.values()), results)
         if with_prior and prior is not None:
-            others = [
-                unit
-                for unit in units
-                if not _in_prior(row := rows[unit.name]) and row['verdict'] != FAILED
-            ]
-            again = fitted(others, replace(options, fit=replace(options.fit, prior=prior)))
+            lacking = [unit for unit in units if lacks_data(rows[unit.name])]
+            again = fitted(lacking, replace(options, fit=replace(options.fit, prior=prior)))
             for name, row in again.items():
                 notes = rows[name]['reservations'], f'not fitted with the prior: {row["problem"]}'
                 kept = {'reservations': '; '.join(map(str, filter(None, notes)))}
@@ -136,6 +137,16 @@ def _require_packages() -> None:
 def _in_prior(row: Row) -> bool:
     """Whether a unit may contribute to the prior: data complete, calibration valid."""
     return is_valid(row) and row['is_whole'] == 1
+
+
+def lacks_data(row: Row) -> bool:
+    """
+    Whether a unit's data are incomplete, so that the prior of the type replaces what is missing.
+
+    A test whose data contradict themselves or the fit lacks nothing: a prior would hide this.
+    """
+    is_contradicted = str(row['verdict']) in _CONTRADICTIONS
+    return row['is_whole'] == 0 and not is_contradicted
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
@@ -178,17 +189,17 @@ def render_fleet(
     distances = ReportFigure(
         'distances',
         'Which units stand out, and in what?',
-        'Each stroke is a unit: its distance from the fleet’s median in robust standard '
-        'deviations. Diamonds beyond the dashed lines are the units listed above.',
+        'Each stroke is a unit: its distance from the fleet’s median in standard deviations of '
+        'the units and of its own fit. Diamonds beyond the lines are the units listed above.',
         partial(
             draw_distances,
             [spread.quantity.label for spread in summary.spreads],
             [spread.z for spread in summary.spreads],
-            summary.limit,
+            [spread.limit for spread in summary.spreads],
         ),
     )
     # With few units the spread is not known.
-    is_comparable = np.isfinite(summary.limit)
+    is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
     return render(
         'fleet.html',
         title='Fleet report',

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..judging.evaluation import Drift
 from ..judging.verdicts import Verdict
-from ..typing import Floats
+from ..typing import Bools, Floats
 from .table import COLUMNS, Column, Row, is_fitted
 
 _FALSE_ALARMS = 0.05
@@ -22,19 +22,38 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation for a normal spread, relative to the sample sd.
 _MAD_EFFICIENCY = 0.37
+# Ratio of a unit's own sd to the spread of the units above which its data do not determine the
+# quantity: the value is (about) that of the prior of the fit.
+_LARGEST_SD = 5.0
+# Smallest size of a residual or noise, so that its logarithm is finite.
+_LEAST = 1e-12
 #: The columns in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
+#: The columns whose changes between two tests are drift.
+_CONSTANTS = tuple(one for one in QUANTITIES if one.sd and '_slope_' not in one.name)
 
 
 class Spread(NamedTuple):
-    """Spread of a quantity about its median, and each unit's distance in robust sd."""
+    """
+    Spread of a quantity about its median, and each unit's distance in standard deviations.
+
+    Only units whose data determine the quantity (`is_counted`) enter `middle`, `sd` and `limit`.
+    A distance is divided by the root of the sum of squares of `sd` and of the unit's own sd.
+    """
 
     quantity: Column
     names: tuple[str, ...]
     values: Floats
+    is_counted: Bools
     middle: float
     sd: float  # 1.4826 times the median absolute deviation (of the logarithm for sizes)
     z: Floats
+    limit: float = float('inf')  # smallest distance of an outlier; infinite with too few units
+
+    @property
+    def counted(self) -> Floats:
+        """The values of the units whose data determine the quantity."""
+        return np.asarray(self.values[self.is_counted])
 
 
 @dataclass(frozen=True)
@@ -48,6 +67,7 @@ class Outlier:
     middle: float
     z: float
     unit: str
+    limit: float
 
 
 @dataclass(frozen=True)
@@ -73,7 +93,6 @@ class Summary:
 
     verdicts: dict[str, int]
     spreads: tuple[Spread, ...]
-    limit: float  # smallest distance of an outlier in robust sd; infinite with too few units
     outliers: tuple[Outlier, ...]
     drifts: tuple[Retest, ...]
 
@@ -81,14 +100,19 @@ class Summary:
 def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
     """Compute the statistics of a fleet; drifts are changes since the rows of earlier tables."""
     fitted = [row for row in rows if is_fitted(row)]
-    spreads = tuple(spread for quantity in QUANTITIES if (spread := spread_of(quantity, fitted)))
-    limit = outlier_limit(len(fitted), len(spreads))
+    measured = [spread for quantity in QUANTITIES if (spread := spread_of(quantity, fitted))]
+    n_comparisons = sum(len(spread.names) for spread in measured)
+    spreads = tuple(
+        spread._replace(limit=outlier_limit(len(spread.counted), n_comparisons))
+        for spread in measured
+    )
     serials = {str(row['name']): str(row['serial']) for row in fitted}
     outliers = [
-        Outlier(name, serials[name], one.quantity.label, value, one.middle, z, one.quantity.unit)
+        Outlier(name, serials[name], label, value, one.middle, z, one.quantity.unit, one.limit)
         for one in spreads
+        for label in [one.quantity.label]
         for name, value, z in zip(one.names, one.values.tolist(), one.z.tolist(), strict=True)
-        if abs(z) > limit
+        if abs(z) > one.limit
     ]
     wide = Verdict.WIDE.value
     # Drop the amount from the verdict, so that equal verdicts count together.
@@ -97,37 +121,74 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
     return Summary(
         verdicts=dict(Counter(verdicts)),
         spreads=spreads,
-        limit=limit,
         outliers=tuple(sorted(outliers, key=lambda outlier: -abs(outlier.z))),
         drifts=tuple(_drifts(fitted, [row for row in earlier if is_fitted(row)])),
     )
 
 
 def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
-    """Measure the spread of a quantity over calibrated units; None if no unit has it."""
-    known = [row for row in rows if row[quantity.name] is not None]
-    if not known:
+    """Measure the spread of a quantity over calibrated units; None if no units determine it."""
+    columns = [name for name in (quantity.name, quantity.sd) if name]
+    known = [row for row in rows if all(row[name] is not None for name in columns)]
+    values = np.array([row[quantity.name] for row in known], np.float64)
+    own_sd = np.array([row[quantity.sd] if quantity.sd else 0.0 for row in known], np.float64)
+    is_counted = _determined(quantity, values, own_sd)
+    if not is_counted.any():
         return None
-    values = np.array([row[quantity.name] for row in known], dtype=np.float64)
-    if quantity.by == 'ppm':
-        values = (values / np.median(values) - 1.0) * 1e6
-    is_size = quantity.by == 'logarithm'
-    compared = np.log(np.maximum(values, 1e-12)) if is_size else values
-    away = compared - np.median(compared)
-    middle, sd = float(np.median(values)), 1.4826 * float(np.median(np.abs(away)))
-    z = away / sd if sd > 0.0 else np.zeros_like(away)
+    middle = float(np.median(values[is_counted]))
+    away = _away(quantity, values, middle)
+    sd = _robust_sd(away[is_counted])
+    claimed = np.hypot(sd, own_sd)
+    z = np.divide(away, claimed, out=np.zeros_like(away), where=claimed > 0.0)
     names = tuple(str(row['name']) for row in known)
-    return Spread(quantity, names, values, middle, sd * middle if is_size else sd, z)
+    if quantity.by == 'ppm':
+        values, middle = away, 0.0
+    elif quantity.by == 'logarithm':
+        sd *= middle
+    return Spread(quantity, names, values, is_counted, middle, sd, z)
 
 
-def outlier_limit(n_units: int, n_quantities: int) -> float:
-    """Return the limit of an outlier by Student's t; infinite below eight units."""
+def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
+    """
+    Choose the units whose data determine a quantity: in order of their own sd, all units before
+    the first whose own sd is more than five times the spread of the units up to it.
+    """
+    order = np.argsort(own_sd, kind='stable')
+    n = len(values)
+    # The spread of eight units or, in a small fleet, of most of them, is the first that is used.
+    first = min(_UNITS_NEEDED, n // 2 + 1)
+    n_counted = 0
+    for k in range(first, n + 1):
+        best = values[order[:k]]
+        spread = _robust_sd(_away(quantity, best, float(np.median(best))))
+        if own_sd[order[k - 1]] > _LARGEST_SD * spread:
+            break
+        n_counted = k
+    is_counted = np.zeros(n, dtype=np.bool_)
+    is_counted[order[:n_counted]] = True
+    return is_counted
+
+
+def _away(quantity: Column, values: Floats, middle: float) -> Floats:
+    """Return the distances of values from the median: by value, in ppm, or by logarithm."""
+    if quantity.by == 'ppm':
+        return (values / middle - 1.0) * 1e6
+    if quantity.by == 'logarithm':
+        return np.asarray(np.log(np.maximum(values, _LEAST) / max(middle, _LEAST)))
+    return values - middle
+
+
+def _robust_sd(away: Floats) -> float:
+    return 1.4826 * float(np.median(np.abs(away)))
+
+
+def outlier_limit(n_units: int, n_comparisons: int) -> float:
+    """Return the limit by Student's t for a spread of `n_units`; infinite below eight units."""
     from scipy.stats import t
 
-    if n_units < _UNITS_NEEDED or not n_quantities:
+    if n_units < _UNITS_NEEDED or not n_comparisons:
         return float('inf')
-    share = 0.5 * _FALSE_ALARMS / (n_units * n_quantities)
-    return float(t.isf(share, _MAD_EFFICIENCY * n_units))
+    return float(t.isf(0.5 * _FALSE_ALARMS / n_comparisons, _MAD_EFFICIENCY * n_units))
 
 
 def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
@@ -144,12 +205,11 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
         if before[0] == after[0]
         and before[3]['calibration_sha256'] != after[3]['calibration_sha256']
     ]
-    compared = [quantity for quantity in QUANTITIES if quantity.sd]
-    limit = norm.isf(0.5 * _FALSE_ALARMS / max(len(pairs) * len(compared), 1))
+    limit = norm.isf(0.5 * _FALSE_ALARMS / max(len(pairs) * len(_CONSTANTS), 1))
     drifts = []
     for (serial, begun, before, old), (_, again, after, new) in pairs:
         changes = []
-        for column in compared:
+        for column in _CONSTANTS:
             was, was_sd, now, now_sd = np.array(
                 [row[name] for row in (old, new) for name in (column.name, column.sd)], np.float64
             ).tolist()

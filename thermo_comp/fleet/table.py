@@ -5,7 +5,7 @@
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,12 +15,15 @@ import numpy as np
 from ..errors import ThermoCompError
 from ..files import CSV, PARQUET, write_atomically
 from ..fitting import FitResult
-from ..fitting.data_checks import determines_misalignment
+from ..fitting.assembly import measured_board_lag
+from ..fitting.coverage import distinct_directions
+from ..fitting.data_checks import POSITIONS_NEEDED, determines_misalignment
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
 from ..text import one_line
 from ..typing import Floats
-from ..unit.calibration import AXES
+from ..unit.calibration import AXES, Calibration, parameter_layout
+from ..unit.functions import basis_slopes
 from ..unit.gravity import MICRO_G
 from ..unit.prediction import in_a_soak
 
@@ -78,13 +81,15 @@ _TABLE = (
     ('scale_{0}', 'number', '{1}: scale factor at T_ref, input units per m/s^2'),
     ('scale_sd_{0}_ppm', 'number', '{1}: standard deviation of the scale factor'),
     ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the static scale at T_ref'),
+    ('scale_slope_sd_{0}_ppm_k', 'number', '{1}: its standard deviation; empty: not determined'),
     ('bias_{0}_ug', 'number', '{1}: bias in a soak at T_ref'),
     ('bias_sd_{0}_ug', 'number', '{1}: standard deviation of the bias'),
     ('bias_slope_{0}_ug_k', 'number', '{1}: slope of the static bias at T_ref'),
+    ('bias_slope_sd_{0}_ug_k', 'number', '{1}: its standard deviation; empty: not determined'),
     ('m_{0}_urad', 'number', '`{1}`'),
     ('m_sd_{0}_urad', 'number', 'standard deviation of `{1}`'),
     ('noise_{0}_ug_sqrt_hz', 'number', '{1}: white noise'),
-    ('board_lag_s', 'number', 'time constant of the board behind the case'),
+    ('board_lag_s', 'number', 'lag of the board behind the case in ramps; negative: it leads'),
     ('window_s', 'number', 'length of the windows at rest'),
     ('raw_ug', 'number', '|f| - g at rest, RMS, constants at T_ref only'),
     ('static_ug', 'number', '|f| - g at rest, RMS, static regime'),
@@ -100,11 +105,12 @@ _TABLE = (
 # Quantities compared between units: by value, in ppm of the median, or by logarithm.
 _COMPARED = {
     'scale_{0}': ('scale factor {1}', 'ppm', 'ppm', 'scale_sd_{0}_ppm'),
-    'scale_slope_{0}_ppm_k': ('slope of scale {1}', 'ppm/K'),
+    'scale_slope_{0}_ppm_k': ('slope of scale {1}', 'ppm/K', 'value', 'scale_slope_sd_{0}_ppm_k'),
     'bias_{0}_ug': ('bias {1}', 'µg', 'value', 'bias_sd_{0}_ug'),
-    'bias_slope_{0}_ug_k': ('slope of bias {1}', 'µg/K'),
+    'bias_slope_{0}_ug_k': ('slope of bias {1}', 'µg/K', 'value', 'bias_slope_sd_{0}_ug_k'),
     'm_{0}_urad': ('{1}', 'µrad', 'value', 'm_sd_{0}_urad'),
     'noise_{0}_ug_sqrt_hz': ('noise {1}', 'µg/√Hz', 'logarithm'),
+    'board_lag_s': ('lag of the board', 's'),
     'static_ug': ('residual, static', 'µg', 'logarithm'),
     'dynamic_ug': ('residual, dynamic', 'µg', 'logarithm'),
 }
@@ -150,12 +156,13 @@ def is_valid(row: Row) -> bool:
     return str(row['verdict']).startswith((Verdict.VALID.value, Verdict.WIDE.value))
 
 
-def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, Any]:
+def fitted_cells(
+    result: FitResult, judgement: Judgement | None, *, has_prior: bool = False
+) -> dict[str, Any]:
     """Return the cells of a unit's fit and of the verdict on its bags."""
     calibration, bags = result.calibration, result.bags
     start = datetime.fromtimestamp(min(bag.start_ns for bag in bags) // 10**9, timezone.utc)
     sets = calibration.regime_sets()
-    static = sets[0].axes()
     bias, bias_sd, scale, scale_sd = in_a_soak(calibration)
     up = np.array([position.up for position in result.positions])
     lacking = {finding.name for finding in result.findings if finding.level != 'good'}
@@ -163,17 +170,17 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
     parts: dict[str, Sequence[float] | Floats] = {
         'scale_{0}': scale,
         'scale_sd_{0}_ppm': scale_sd * 1e6,
-        'scale_slope_{0}_ppm_k': [float(axis.scale_function.slope(0.0)) * 1e6 for axis in static],
         'bias_{0}_ug': bias / MICRO_G,
         'bias_sd_{0}_ug': bias_sd / MICRO_G,
-        'bias_slope_{0}_ug_k': [
-            float(curves.bias_function.slope(0.0)) / (axis.scale_factor * MICRO_G)
-            for curves, axis in zip(static, calibration.axes, strict=True)
-        ],
         'm_{0}_urad': [calibration.misalignment[i][j] * 1e6 for i, j in _BELOW],
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
+    # Without a prior, fewer positions do not separate the slope of a bias from that of a scale.
+    is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
+    for quantity, unit, slope, sd in _slopes(calibration):
+        parts[f'{quantity}_slope_{{0}}_{unit}'] = slope
+        parts[f'{quantity}_slope_sd_{{0}}_{unit}'] = sd if is_separable else sd * np.nan
     cells = {
         'verdict': NOT_JUDGED,
         'n_positions': len(result.positions),
@@ -193,7 +200,7 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
             for pattern, values in parts.items()
             for name, value in zip(map(pattern.format, _places(pattern)), values, strict=True)
         },
-        'board_lag_s': calibration.board_lag_s,
+        'board_lag_s': measured_board_lag(result.fit.windows),
         'unseen_ug': unseen.rms / MICRO_G,
     }
     if judgement is not None:
@@ -209,6 +216,34 @@ def fitted_cells(result: FitResult, judgement: Judgement | None) -> dict[str, An
             'claimed_ug': whole.claimed_rms / MICRO_G,
         }
     return cells
+
+
+def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats]]:
+    """
+    Yield quantity, unit, slopes of its static curves at T_ref and their sd, shapes (3,).
+
+    The sd is NaN where the fit has left out the curve of an axis: its slope of 0 is the prior's.
+    """
+    layout, posterior = parameter_layout(calibration), calibration.posterior
+    K = np.array([axis.scale_factor for axis in calibration.axes])
+    biases, scales = zip(
+        *((axis.bias_function, axis.scale_function) for axis in calibration.static.axes()),
+        strict=True,
+    )
+    for quantity, unit, curves, blocks, size in (
+        ('bias', 'ug_k', biases, layout.bias, K * MICRO_G),
+        ('scale', 'ppm_k', scales, layout.scale, np.full(3, 1e-6)),
+    ):
+        variances = np.full(3, np.nan)
+        for axis, (curve, block) in enumerate(zip(curves, blocks, strict=True)):
+            by, first = np.array(basis_slopes(curve, 0.0)), block.static + 1
+            if posterior is not None and len(by):
+                rows = slice(first, first + len(by))
+                common = by @ posterior.matrix[rows]
+                variances[axis] = common @ common + by**2 @ posterior.variances[rows]
+        slopes = np.array([float(curve.slope(0.0)) for curve in curves])
+        sd = np.sqrt(np.where(variances > 0.0, variances, np.nan))
+        yield quantity, unit, slopes / size, sd / np.abs(size)
 
 
 def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:

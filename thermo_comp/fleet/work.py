@@ -14,7 +14,7 @@ from multiprocessing import forkserver
 from typing import Any, Literal
 
 from .. import __version__
-from ..errors import FitError, RecordingError, ThermoCompError
+from ..errors import FitError, RecordingError, ThermoCompError, UndeterminedError
 from ..fitting import FitOptions, ReducedBag, fit_bags, reduce_bag
 from ..fitting.sources import digest, recording_source
 from ..recording.topics import Topics
@@ -127,7 +127,9 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         how = replace(options.fit, input=next(iter(kinds)), serial=serial)
         row, calibration, page = _fitted(row, list(bags.values()), how, options.certificates)
     except FitError as refusal:
-        row.update(verdict=REFUSED, problem=one_line(str(refusal)))
+        # Missing data, unlike contradictory data, can be replaced by a prior.
+        is_whole = 0 if isinstance(refusal, UndeterminedError) else None
+        row.update(verdict=REFUSED, problem=one_line(str(refusal)), is_whole=is_whole)
     except ThermoCompError as failure:
         row.update(verdict=FAILED, problem=one_line(str(failure)))
     row['cpu_s'] = time.process_time() - began
@@ -149,7 +151,7 @@ def _fitted(
     evidence = evidence_of_fit(result, how.gravity_sd)
     evidence = replace(evidence, findings=(*evidence.findings, *lost))
     known = {
-        **fitted_cells(result, evidence.judgement),
+        **fitted_cells(result, evidence.judgement, has_prior=how.prior is not None),
         'reservations': '; '.join(evidence.findings),
         'calibration_sha256': sha256(calibration),
     }

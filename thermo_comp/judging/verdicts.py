@@ -36,7 +36,7 @@ class Verdict(Enum):
     RECALIBRATE = 'recalibrate'
     NO_BETTER = 'no better than raw'
     OUTSIDE = 'outside the calibrated range: not judged'
-    SWAPPED = 'thermometers probably exchanged: not judged'
+    SWAPPED = 'thermometers exchanged or loose: not judged'
     NO_CLAIM = 'no claim'
 
     @property

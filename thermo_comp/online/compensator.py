@@ -43,8 +43,8 @@ STALE_INTERVALS: Final = 5.0
 SHORTEST_STALE_S: Final = 0.5
 #: Texts about the status of a compensator, for diagnostics and offline reports.
 SWAPPED: Final = (
-    'the board leads the case in ramps: are temperature/board and temperature/case swapped, or is '
-    'the unit heated from inside?'
+    'the board leads the case in ramps: are temperature/board and temperature/case swapped, is '
+    'the case thermometer loose, or is the unit heated from inside?'
 )
 HELD: Final = 'outside the calibrated range, held at its edge'
 CONTINUED: Final = (

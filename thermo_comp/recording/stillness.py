@@ -237,9 +237,9 @@ class CellAccumulator:
 
 
 def widened(full_scale: float, samples: Floats) -> float:
-    """Return the full scale of 24- or 32-bit words if most samples exceed shorter words."""
+    """Return the full scale of 24- or 32-bit words (or means of them) if most exceed 16 bits."""
     size = np.max(np.abs(samples), axis=1) if len(samples) else np.zeros(1)
-    if np.median(size) < 2.0 * _WORD or (samples != np.rint(samples)).any():
+    if np.median(size) < 2.0 * _WORD:
         return full_scale
     return next(2.0**bits - 1.0 for bits in _LONGER if np.median(size) < 2.0**bits or bits == 31)
 

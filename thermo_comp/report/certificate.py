@@ -187,23 +187,33 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
     for program in programs(calibration):
         at = table_temperatures(*program.regime.temperature_range_c)
         value, sd = evaluate(calibration, program, at)[2:]
-        sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
+        # Where U is withheld, value and deviation have the digits of the known part of U.
+        digits = np.where(known * sd > 0.0, known * sd, _four_digits(value))
+        sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         for k, table in enumerate(tables):
             for row in range(len(at)):
                 cells: list[str] = []
                 for column in (k, k + 3):
                     expanded = float(known * sd[row, column])
-                    both = float(value[row, column]), float(off[row, column])
-                    if math.isfinite(expanded):
-                        text, deviation = (rounded(part, expanded)[0] for part in both)
-                        cells += text, rounded(both[0], expanded)[1], deviation
-                    else:
-                        cells += number(both[0], 4), '–', number(both[1], 4)
+                    place = expanded if math.isfinite(expanded) else float(digits[row, column])
+                    text, deviation = (
+                        rounded(float(part[row, column]), place)[0] for part in (value, off)
+                    )
+                    cells += text, rounded(0.0, expanded)[1], deviation
                 celsius = minus(f'{at[row]:.1f}')
                 table.rows.append(StateResult(program.name, celsius, *cells))
     return tables
+
+
+def _four_digits(value: Floats) -> Floats:
+    """
+    Return the uncertainties, shape (columns,), that leave four digits of the largest value of each
+    column, see `rounded`.
+    """
+    largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
+    return np.asarray(10.0 ** (np.floor(np.log10(largest)) - 2.0))
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:

@@ -130,19 +130,23 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
     return figure
 
 
-def draw_distances(labels: Sequence[str], distances: Sequence[Floats], limit: float) -> Figure:
-    """Draw each unit's distance from the middle, by quantity; beyond `limit` as a diamond."""
+def draw_distances(
+    labels: Sequence[str], distances: Sequence[Floats], limits: Sequence[float]
+) -> Figure:
+    """Draw each unit's distance from the middle, by quantity; beyond its limit as a diamond."""
     figure = style.new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
-    shown = min(max(1.15 * limit, 4.0), 12.0)
-    for row, z in enumerate(distances):
+    known = [limit for limit in limits if np.isfinite(limit)]
+    shown = min(max(1.15 * max(known, default=0.0), 4.0), 12.0)
+    for row, (z, limit) in enumerate(zip(distances, limits, strict=True)):
         at = np.clip(z, -1.04 * shown, 1.04 * shown)
         is_far = np.abs(z) > limit
         marks = ((~is_far, '|', style.GREY, 6.0), (is_far, 'D', style.RED, 3.5))
         for rows, mark, color, size in marks:
             axes.plot(at[rows], np.full(int(rows.sum()), row), mark, color=color, ms=size)
-    for edge in (-limit, limit):
-        axes.axvline(edge, color=style.BLACK, linewidth=0.8, linestyle=(0, (5, 2)))
+        for edge in (-limit, limit):
+            if abs(edge) < 1.1 * shown:
+                axes.plot([edge, edge], [row - 0.5, row + 0.5], color=style.BLACK, linewidth=0.8)
     axes.set_xlim(-1.1 * shown, 1.1 * shown)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_yticks(range(len(labels)), labels)
