@@ -86,6 +86,15 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     assert reduced([alone], full_scale=None).window_s == 30.0
 
 
+@pytest.mark.parametrize('cycle_s', [0.01, 0.02, 0.04, 0.05, 0.1, 0.3, 1.0])
+def test_the_interval_between_samples_is_exact(rng, cycle_s):
+    # WHY: 10 Hz was stated as 9.9 Hz, since a cell holds 33 or 34 samples.
+    n = round(1800.0 / cycle_s)
+    kept = rng.random(n) > 2.0 / n  # a few samples are lost
+    block = ArrayBlock(stamps(n, cycle_s)[kept], 9.8 + 0.01 * rng.standard_normal((n, 3))[kept])
+    assert reduced([block], full_scale=None).cycle_s == pytest.approx(cycle_s, rel=1e-3)
+
+
 def test_windows_are_means_of_their_samples(rng):
     samples = still(rng, 60.0, (0.0, 0.0, 3000.0))
     (interval,) = reduced([block(samples)]).intervals

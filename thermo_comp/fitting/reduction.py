@@ -246,7 +246,7 @@ def _reduced(
         n_still_cells=sum(upper - lower for lower, upper in ranges),
         # A bag without cells, that is, without a usable sample, has the windows of the options.
         window_s=round(per_window * cells.cell_s, 6) or window_s,
-        cycle_s=cells.cell_s / float(np.median(cells.count)) if len(cells.count) else np.nan,
+        cycle_s=_cycle_s(cells),
         is_integer=cells.is_integer,
         middle=cells.middle,
         max_abs=_max_abs(cells),
@@ -256,6 +256,19 @@ def _reduced(
     if (reader := source.reader()) is not None:
         bag = replace(bag, info=reader.info, since_s=reader.since_s)
     return bag, cells.cell_s
+
+
+def _cycle_s(cells: Cells) -> float:
+    """Return the typical interval between samples [s]; NaN without samples."""
+    if not len(cells.count):
+        return np.nan
+    # A cell may hold a sample more or less than the next one. Cells with lost samples do not count,
+    # unless the counts of most cells differ, as those of samples in bursts.
+    median = float(np.median(cells.count))
+    use = np.abs(cells.count - median) <= 1.0
+    if np.mean(use) < 0.5:
+        use = cells.count > 0.5 * median
+    return float(f'{cells.cell_s / float(cells.count[use].mean()):.5g}')
 
 
 def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
