@@ -91,7 +91,8 @@ def test_the_interval_between_samples_is_exact(rng, cycle_s):
     # WHY: 10 Hz was stated as 9.9 Hz, since a cell holds 33 or 34 samples.
     n = round(1800.0 / cycle_s)
     kept = rng.random(n) > 2.0 / n  # a few samples are lost
-    block = ArrayBlock(stamps(n, cycle_s)[kept], 9.8 + 0.01 * rng.standard_normal((n, 3))[kept])
+    samples = 9.8 + 0.01 * rng.standard_normal((n, 3))
+    block = ArrayBlock(stamps(n, 1.0 / cycle_s)[kept], samples[kept])
     assert reduced([block], full_scale=None).cycle_s == pytest.approx(cycle_s, rel=1e-3)
 
 

@@ -213,8 +213,8 @@ def fitted(request, all_bags):
     options = replace(OPTIONS, gravity_sd=1e-4, **({'model': 'golovach'} if is_paper else chosen))
     claims = []
 
-    def keep(*given):
-        claims.append(claim_of(*given))
+    def keep(*given, **options):
+        claims.append(claim_of(*given, **options))
         return claims[-1]
 
     with pytest.MonkeyPatch.context() as patch:

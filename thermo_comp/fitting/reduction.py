@@ -262,8 +262,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # A cell may hold a sample more or less than the next one. Cells with lost samples do not count,
-    # unless the counts of most cells differ, as those of samples in bursts.
+    # A cell may hold a sample more or less than the next one. Cells with lost samples do not
+    # count, unless the counts of most cells differ, as those of samples in bursts.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
