@@ -207,6 +207,18 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
     assert sd_cut == pytest.approx(sd, rel=0.1)
 
 
+def test_a_calibration_has_the_date_of_its_test(rng):
+    # WHY: old bags, fitted today, dated the calibration of today, and its ageing began today.
+    source = turned(rng, positions(9, 3))
+    provenance = fit([source], OPTIONS).calibration.provenance
+    assert provenance.date == provenance.tested == '2023-11-14T22:16:28Z'
+    assert provenance.created > provenance.tested
+    # Seconds since the start of a computer are not a date.
+    blocks = [replace(b, accel_stamp_ns=b.accel_stamp_ns - START_NS) for b in source.blocks()]
+    undated = fit([replace(source, blocks=lambda: blocks)], OPTIONS).calibration.provenance
+    assert (undated.tested, undated.date) == ('', undated.created)
+
+
 def test_a_prior_tells_how_well_turn_ons_repeat(rng):
     # WHY: six positions with a prior that states 8 ug claimed the 43 ug of a unit without prior.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=2e-4)).calibration

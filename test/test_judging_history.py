@@ -72,7 +72,7 @@ def test_commands_print_the_history(cli, tmp_path, monkeypatch):
     axes = dataclasses.replace(
         now.axes, x=dataclasses.replace(now.axes.x, bias=now.axes.x.bias + 10.0)
     )
-    provenance = dataclasses.replace(now.provenance, created='2020-01-01T00:00:00Z', sources=())
+    provenance = dataclasses.replace(now.provenance, tested='2020-01-01T00:00:00Z', sources=())
     save_calibration(
         dataclasses.replace(now, axes=axes, provenance=provenance), tmp_path / 'a.yaml'
     )

@@ -164,12 +164,13 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     Return the start of a calibration's validity [days since 1970], the time up to which its
     covariance is aged, and whether it is an update.
 
-    Validity begins at the last rest of an update, else at the file's date, or -inf without a date.
+    Validity begins at the last rest of an update, else at the end of the test or at the file's
+    date, or -inf without a date.
     """
     names = [
         source.name for source in calibration.provenance.sources if source.name.startswith(_UNTIL)
     ]
-    text = names[-1].removeprefix(_UNTIL) if names else calibration.provenance.created
+    text = names[-1].removeprefix(_UNTIL) if names else calibration.provenance.date
     date, _, aged = text.partition(_AGED)
     try:
         moment = np.datetime64(date.removesuffix('Z'), 'ns')

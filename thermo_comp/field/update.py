@@ -145,6 +145,7 @@ def update(
         provenance=replace(
             _with_update(before, series, judged),
             created=created or before.created,
+            tested='',
             sources=(*before.sources, *([source] if source else [])),
         ),
     )

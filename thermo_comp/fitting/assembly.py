@@ -41,6 +41,10 @@ from .windows import PART, Model, ThermalWindows
 
 Range = tuple[float, float]
 
+# The earliest stamp that is taken for a date: the start of the year 2000 [s since 1970].
+EARLIEST_DATE_S = 946684800.0
+_DATE = '%Y-%m-%dT%H:%M:%SZ'
+
 
 def build_calibration(
     fit: Fit,
@@ -171,8 +175,14 @@ def _provenance(
 ) -> Provenance:
     # The file states ``|f| - g`` of left-out positions only if all positions have a left-out norm.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
+    now = datetime.now(timezone.utc)
+    end_s = 1e-9 * max(bag.end_ns for bag in bags)
+    # Stamps since the start of a computer, or of a wrong clock, are not dates.
+    is_date = EARLIEST_DATE_S <= end_s <= now.timestamp()
+    tested = datetime.fromtimestamp(end_s if is_date else 0.0, timezone.utc)
     return Provenance(
-        created=datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ'),
+        created=now.strftime(_DATE),
+        tested=tested.strftime(_DATE) if is_date else '',
         tool_version=__version__,
         model=fit.windows.model.name,
         sources=tuple(

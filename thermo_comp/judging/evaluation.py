@@ -159,7 +159,7 @@ class Epoch:
     is NaN.
     """
 
-    created: str
+    date: str
     value: Floats
     sd: Floats
 
@@ -197,7 +197,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
         if cal.unit.serial == calibrations[0].unit.serial and not (sources and sources in known):
             ordered.append(cal)
         known.add(sources)
-    ordered.sort(key=lambda calibration: calibration.provenance.created)
+    ordered.sort(key=lambda cal: (cal.provenance.date, cal.provenance.created))
     epochs: list[Epoch] = []
     first = np.ones(3)
     for number, cal in enumerate(ordered):
@@ -205,8 +205,8 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
         first = first if number else scale
         value = np.concatenate((bias / MICRO_G, 1e6 * (scale / first - 1.0)))
         sd = np.concatenate((bias_sd / MICRO_G, 1e6 * scale_sd))
-        created = cal.provenance.created or f'no. {number + 1}'
-        epochs.append(Epoch(created, value, sd if cal.has_uncertainty else np.full(6, np.nan)))
+        date = cal.provenance.date or f'no. {number + 1}'
+        epochs.append(Epoch(date, value, sd if cal.has_uncertainty else np.full(6, np.nan)))
     return tuple(epochs)
 
 
@@ -214,8 +214,8 @@ def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
     """List the changes from each calibration to the next; their errors are assumed independent."""
     return [
         Drift(
-            earlier=before.created,
-            later=after.created,
+            earlier=before.date,
+            later=after.date,
             constant=f'{"scale" if k // 3 else "bias"} {AXES[k % 3]}',
             unit='ppm' if k // 3 else 'ug',
             change=float(after.value[k] - before.value[k]),

@@ -64,6 +64,12 @@ class Provenance:
     sources: tuple[Source, ...] = ()
     residuals: tuple[ResidualSummary, ...] = ()
     notes: tuple[str, ...] = ()
+    tested: Annotated[str, "End of the last bag (UTC), if the bags' stamps are dates."] = ''
+
+    @property
+    def date(self) -> str:
+        """The date of the test if known, else that of the fit; '' without a date."""
+        return self.tested or self.created
 
     @property
     def left_out_rms(self) -> float:
