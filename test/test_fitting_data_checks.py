@@ -12,6 +12,7 @@ from fitting_truth import Truth, table_of
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, ResidualRow
+from thermo_comp.fitting.assembly import _soak_gradient
 from thermo_comp.fitting.data_checks import (
     Finding,
     determines_misalignment,
@@ -215,3 +216,23 @@ def test_residuals_too_large_for_a_good_fit_are_reported(given, name, message):
 def test_options_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         FitOptions(**{'gravity': 9.81, **change})
+
+
+def test_the_gradient_of_a_soak_is_that_without_the_ramps(good, rng):
+    # The unit heats itself by 3 K; the board lags 600 s in ramps, 1500 s while a soak settles.
+    windows, _ = good
+    t = windows.data.time
+    rate = np.where(t < 3000.0, 1.0 / 60.0, 0.02 / 60.0 * np.exp(-(t - 3000.0) / 600.0))
+    lag = np.where(t < 3000.0, 600.0, 1500.0)
+    gradient = -3.0 + lag * rate + 0.01 * rng.standard_normal(len(t))
+    middle, sd = _soak_gradient(replace(windows, rate=rate, gradient=gradient), None)
+    assert middle == pytest.approx(-3.0, abs=0.01)
+    assert sd == pytest.approx(0.01, rel=0.2)
+    # Without a soak, and without the case, the gradient is not known.
+    assert (
+        _soak_gradient(replace(windows, rate=np.full_like(t, 0.5), gradient=gradient), None)
+        is None
+    )
+    assert _soak_gradient(replace(windows, rate=rate, gradient=np.zeros_like(t)), None) is None
+    known = calibration(soak_gradient_k=(-2.0, 0.1))
+    assert _soak_gradient(replace(windows, rate=rate), known) == (-2.0, 0.1)

@@ -181,7 +181,7 @@ def test_in_a_soak_the_gradient_is_that_of_the_unit_s_own_heat():
             term('gradient_lag', (0.0, 60.0, 0.0), tau_s=600.0),
             term('board', (0.0, 0.0, 90.0), tau_s=600.0, sensor_share=0.5),
         ),
-        rest_gradient_range_k=(-3.4, -2.6),
+        soak_gradient_k=(-3.0, 0.2),
     )
     bias, bias_sd, scale, scale_sd = in_a_soak(unit)
     # In a soak the lag of the gradient equals the gradient; the part with half the gradient lags

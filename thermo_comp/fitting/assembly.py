@@ -88,6 +88,7 @@ def build_calibration(
         response=blank_terms(columns),
         board_lag_s=lag_s,
         rest_gradient_range_k=_rest_gradient_range(windows, lag_s, known),
+        soak_gradient_k=_soak_gradient(windows, known),
         detector=model.detector,
         provenance=_provenance(fit, bags, residuals, findings),
         evidence=group_evidence(regression, posterior) if windows.was_measured else (),
@@ -326,6 +327,26 @@ def file_jacobian(
     # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the elements (a, b, c) of its inverse.
     of_a, of_b, of_c = unknown[layout.misalignment]
     return np.array([*rows, -of_a, c * of_a - of_b + a * of_c, -of_c])
+
+
+def _soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
+    """
+    Return the first sensor's gradient in soaks and its robust scatter [K]; that of a prior
+    calibration if it has one; None without the sensor or a soak.
+    """
+    if known is not None and known.soak_gradient_k is not None:
+        return known.soak_gradient_k
+    rate = 60.0 * np.abs(windows.rate)
+    # The slowest tenth of the windows, if the rate is noisy.
+    slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
+    is_soak = rate <= slowest
+    if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
+        return None
+    # While a soak settles, the gradient still changes with the rate.
+    gradient, by_rate = windows.gradient[is_soak], np.vander(windows.rate[is_soak], 2)
+    slope, middle = np.linalg.lstsq(by_rate, gradient, rcond=None)[0].tolist()
+    scatter = np.abs(gradient - by_rate @ (slope, middle))
+    return middle, 1.4826 * float(np.median(scatter))
 
 
 def _rest_gradient_range(

@@ -166,10 +166,10 @@ def results(
 
 def own_heat(calibration: Calibration | None) -> str:
     """State the gradient of a soak, by which the unit heats itself; '' if it is not known."""
-    if calibration is None or calibration.rest_gradient_range_k is None:
+    if calibration is None or calibration.soak_gradient_k is None:
         return ''
-    lower, upper = (minus(f'{edge:.1f}') for edge in calibration.rest_gradient_range_k)
-    return f' (T_{calibration.sensors[0]} − T_board from {lower} to {upper} K)'
+    gradient, sd = (minus(f'{part:.2f}') for part in calibration.soak_gradient_k)
+    return f' (T_{calibration.sensors[0]} − T_board: {gradient} ± {sd} K)'
 
 
 def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOverTemperature]:

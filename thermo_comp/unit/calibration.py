@@ -222,6 +222,11 @@ class Calibration:
         'T_case - T_board - lag * dT_board/dt in the bags, first sensor; null: unknown. A value '
         'far outside is claimed as an error of T_board: a thermometer may be loose.',
     ] = None
+    soak_gradient_k: Annotated[
+        tuple[_Kelvin, _Kelvin] | None,
+        'T_case - T_board in a soak, by which the unit heats itself, and its sd, first sensor; '
+        'null: unknown, 0 is assumed. For certificates and exported files.',
+    ] = None
     detector: Annotated[
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
     ] = field(default_factory=DetectorSettings)

@@ -7,9 +7,8 @@ by lags whose initial state is unknown), and hypothetical states: a soak and a r
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
 stop; in a soak (q = 0) all of them are 0. The gradient of the first sensor includes that by which
-the unit heats itself: the middle of `rest_gradient_range_k`. The static set applies in a soak, the
-dynamic set in a ramp. Predicted variances do not include noise and the uncertainty of the
-thermometers.
+the unit heats itself, `soak_gradient_k`. The static set applies in a soak, the dynamic set in a
+ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
 """
 
 from collections.abc import Callable
@@ -193,7 +192,7 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
 def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
     """
     Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3); the
-    gradient by self-heating is uncertain within the range of the fit.
+    gradient of a soak is uncertain by its sd.
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
@@ -202,10 +201,8 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     is_dynamic = np.rint(states[:, WEIGHT]) == 1.0
     both = np.broadcast_to(correction.curves.unexplained(states[:, BOARD]), (2, 3, len(states)))
     unexplained = np.where(is_dynamic, both[1], both[0]).T
-    # The range contains most soaks of the fit: about 4 sd.
-    lower, upper = calibration.rest_gradient_range_k or (0.0, 0.0)
     warmer = states.copy()
-    _add_gradient(warmer, calibration, (upper - lower) / 4.0)
+    _add_gradient(warmer, calibration, (calibration.soak_gradient_k or (0.0, 0.0))[1])
     by_gradient = correction.bias_scale(warmer.T) - correction.bias_scale(states.T)
     bias, scale = (by_gradient / correction.K).swapaxes(1, 2) ** 2
     a, c = variance[:, :, 0] + unexplained, np.maximum(variance[:, :, 2], 0.0)
@@ -220,7 +217,7 @@ def ramp_states(
 ) -> Floats:
     """
     Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s];
-    the gradient by self-heating is the middle of its range in the fit.
+    the gradient by self-heating is that of a soak.
     """
     layout = Layout(Correction(calibration).memory)
     states = np.zeros((len(temperature), layout.width))
@@ -235,7 +232,7 @@ def ramp_states(
                 states[:, place] += share * end * (1.0 - np.exp(-np.asarray(lasted_s) / tau))
         elif isinstance(quantity, Play):
             states[:, place] = -np.sign(rate) * quantity.width_k
-    _add_gradient(states, calibration, sum(calibration.rest_gradient_range_k or (0.0,)) / 2.0)
+    _add_gradient(states, calibration, (calibration.soak_gradient_k or (0.0, 0.0))[0])
     return states
 
 
