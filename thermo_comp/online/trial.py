@@ -44,8 +44,13 @@ def is_sound_sample(row: Corrected) -> bool:
     if not np.isfinite(row).all():
         return False
     xx, xy, xz, yy, yz, zz = row[3:]
-    of_ends = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return bool(of_ends[0] > 0.0)
+    if min(xx, yy, zz) <= 0.0:
+        return False
+    # The variances of two axes may differ by more than the 16 digits of a float, and a common
+    # unit would then leave the smaller one to rounding. Correlations are free of units.
+    sd = np.sqrt((xx, yy, zz))
+    correlations = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) / sd / sd[:, np.newaxis]
+    return bool(np.linalg.eigvalsh(correlations)[0] > 0.0)
 
 
 def _samples(model: Model) -> Iterator[Corrected]:

@@ -154,10 +154,18 @@ def _singles(lags: Iterable[Lag]) -> tuple[tuple[str, float], ...]:
 
 
 def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
-    """
-    Return the covariance of lags at their start, before any input was seen, (n, n) [K^2].
+    """Return the covariance of lags at their start, before any input was seen, (n, n) [K^2]."""
+    root = start_root(lags)
+    return np.asarray(root @ root.T)
 
-    The unseen input is modelled as a random walk that ends at the first reading, so that ``P_kl =
+
+def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
+    """
+    Return a factor of the covariance of `start_covariance`, which is the factor times its
+    transpose, shape (n, number of single lags) [K].
+
+    The covariance itself is singular if two sums of single lags are equal but for rounding. The
+    unseen input is modelled as a random walk that ends at the first reading, so that ``P_kl =
     D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different
     inputs. After the first reading the covariance decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
@@ -173,7 +181,7 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
     covariance = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
     shares = np.array([[lag.singles.get(single, 0.0) for single in singles] for lag in all_lags])
     shares = shares.reshape(len(all_lags), len(singles))
-    return np.asarray(shares @ covariance @ shares.T)
+    return np.asarray(shares @ np.linalg.cholesky(covariance))
 
 
 class LagBank:

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ..thermal.memory import BOARD_INPUT, Lag, Play, start_covariance
+from ..thermal.memory import BOARD_INPUT, Lag, Play, start_root
 from ..thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout, Rate
 from ..typing import Floats
 from .calibration import Calibration, parameter_layout
@@ -35,7 +35,7 @@ class SlowUncertainty:
         self._correction = correction
         self._K = correction.K[:, 0].tolist()
         lags = correction.memory.lags
-        self._root = np.asarray(np.linalg.cholesky(start_covariance(lags)))
+        self._root = start_root(lags)
         edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = max(edges) - min(edges)
         #: How far each lag's part is behind the board in a long ramp, per rate of the ramp [s].
@@ -83,27 +83,27 @@ class SlowUncertainty:
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
         of_misalignment, var_misalignment = self._misalignment
-        n_lags, (n, rank) = len(moved), (states.shape[1], of_misalignment.shape[1])
-        errors = np.zeros((9, n_lags + 1 + rank, n))
+        n_start, (n, rank) = len(by_root), (states.shape[1], of_misalignment.shape[1])
+        errors = np.zeros((9, n_start + 1 + rank, n))
         # A larger element of the misalignment increases the force, a larger bias or scale factor
         # decreases it.
-        errors[6:, n_lags + 1 :] = -of_misalignment[:, :, np.newaxis]
+        errors[6:, n_start + 1 :] = -of_misalignment[:, :, np.newaxis]
         added = np.zeros((3, 3, n))
         beyond: list[Floats] = []
         nonlinear = self._correction.of_force
         for axis, K in enumerate(self._K):
             on_bias, on_scale = errors[2 * axis : 2 * axis + 2]
-            on_bias[:n_lags], on_scale[:n_lags] = by_root[:, axis] / K, by_root[:, axis + 3]
-            on_bias[n_lags], on_scale[n_lags] = in_ramp[axis] / K, in_ramp[axis + 3]
+            on_bias[:n_start], on_scale[:n_start] = by_root[:, axis] / K, by_root[:, axis + 3]
+            on_bias[n_start], on_scale[n_start] = in_ramp[axis] / K, in_ramp[axis + 3]
             if self._blocks:
                 (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
                 by_bias, by_scale = regressors[axis] / K, regressors[axis + 3]
-                on_bias[n_lags + 1 :] = _combined(of_bias, by_bias)
-                on_scale[n_lags + 1 :] = _combined(of_scale, by_scale)
+                on_bias[n_start + 1 :] = _combined(of_bias, by_bias)
+                on_scale[n_start + 1 :] = _combined(of_scale, by_scale)
                 added[axis, 0] = in_order(var_bias[:, np.newaxis] * by_bias**2, 0)
                 added[axis, 2] = in_order(var_scale[:, np.newaxis] * by_scale**2, 0)
                 if nonlinear is not None:
-                    both = on_bias[n_lags + 1 :], on_scale[n_lags + 1 :]
+                    both = on_bias[n_start + 1 :], on_scale[n_start + 1 :]
                     beyond.append(
                         nonlinear.variance(nonlinear.held(states[BOARD]), *of_force, *both)
                     )
