@@ -213,6 +213,29 @@ def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_without_it():
     assert falls['bias', 'idle'] < 0.5
 
 
+def test_with_a_calibration_as_prior_the_loss_is_that_of_keeping_its_values():
+    truth = Truth()
+    windows, up = table_of(truth, 12, np.random.default_rng(8))
+    regression, state = begin(without_starts(windows), up)
+    prior = prior_of(truth, column_sd=column_sd(ALL, 3e-4, 3e-5))
+    layout = mode_of(regression, state, prior).layout
+    sd = regression.precision(prior, layout)[: layout.n_unit] ** -0.5
+    mean = 0.5 * sd
+    mean[layout.kappa] = prior.scale_mean
+
+    def posterior_of(sd):
+        known = InformativePrior(mean, np.diag(1.0 / sd))
+        return mode_of(regression, state, replace(prior, informative=known))
+
+    posterior = posterior_of(sd)
+    for one in group_evidence(regression, posterior):
+        kept = sd.copy()
+        part, of_group = ['bias', 'scale'].index(one.part), np.array(GROUPS) == one.group
+        kept[layout.weights[part][:, of_group]] *= 1e-4
+        fall = posterior.log_evidence - posterior_of(kept).log_evidence
+        assert one.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), one
+
+
 def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
     regression, chosen, truth = calm
     columns = regression.windows.columns[:, 2:4]

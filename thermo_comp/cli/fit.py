@@ -204,7 +204,7 @@ def _print_fit(
             f'each axis is a curve of the temperature of its part, which lags {source} by '
             f'{", ".join(f"{tau:.0f}" for tau in taus)} s (x, y, z)'
         )
-    _print_groups(out, calibration)
+    _print_groups(out, calibration, has_prior=result.fit.posterior.prior.informative is not None)
     tell_nonlinearity(out, calibration)
     _print_residuals(out, result, n_positions)
     if gyroscope is not None:
@@ -251,8 +251,9 @@ def _print_positions(out: Output, result: 'FitResult') -> None:
     )
 
 
-def _print_groups(out: Output, calibration: 'Calibration') -> None:
+def _print_groups(out: Output, calibration: 'Calibration', has_prior: bool) -> None:
     if calibration.evidence:
+        instead = "keeps the prior's values" if has_prior else 'is removed'
         out.table(
             ('group', 'of', 'explains ug', 'parameters', 'log evidence'),
             [
@@ -262,7 +263,7 @@ def _print_groups(out: Output, calibration: 'Calibration') -> None:
                 )
                 for group in calibration.evidence
             ],
-            title='groups kept; log evidence: its loss if the group is removed',
+            title=f'groups kept; log evidence: its loss if the group {instead}',
         )
     white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
     walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)

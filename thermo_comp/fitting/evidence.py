@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats
 from ..unit.metrics import ResidualStatistics, norm_residual, statistics_by_regime
@@ -152,10 +153,19 @@ def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[Posi
 
 
 def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupEvidence, ...]:
-    """Return RMS contribution, effective parameters and log Bayes factor of each group in use."""
+    """
+    Return RMS contribution, effective parameters and log Bayes factor of each group in use.
+
+    The factor compares with a fit without the group, or, with an informative prior, with a fit in
+    which the group keeps the prior's mean: the prior knows that the group is not 0.
+    """
     names = np.array(regression.windows.groups)
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
-    mode = as_vector(state, layout)[: layout.n_unit]
+    change = as_vector(state, layout)[: layout.n_unit]
+    of_prior = None
+    if prior.informative is not None:
+        change = change - prior.informative.mean
+        of_prior = solve_triangular(prior.informative.root, np.eye(layout.n_unit))
     force = (regression.norms(state)[:, None] * state.up)[regression.windows.position]
     effective = posterior.effective_parameters
     parts: tuple[Literal['bias', 'scale'], ...] = ('bias', 'scale')
@@ -169,8 +179,12 @@ def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupE
             if part == 'scale':
                 correction = correction * force
             places, sd = layout.weights[k][:, used].ravel(), prior.column_sd[k][used]
-            weight_sd = regression.weight_sd(prior)[k][:, used].ravel()
-            (gain,) = log_bayes_factors(mode, posterior.covariance, places[None], weight_sd[None])
+            if of_prior is None:
+                weight_sd = regression.weight_sd(prior)[k][:, used].ravel()
+            else:
+                weight_sd = np.full(len(places), _mean_sd(of_prior[places]))
+            cases = places[None], weight_sd[None]
+            (gain,) = log_bayes_factors(change, posterior.covariance, *cases)
             result.append(
                 GroupEvidence(
                     group,
@@ -182,3 +196,8 @@ def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupE
                 )
             )
     return tuple(result)
+
+
+def _mean_sd(root: Floats) -> float:
+    """Return the geometric mean of the sd along the axes of the covariance ``root @ root.T``."""
+    return float(np.exp(np.linalg.slogdet(root @ root.T)[1] / (2.0 * len(root))))

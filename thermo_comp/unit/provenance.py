@@ -24,7 +24,9 @@ class GroupEvidence:
         float, QUANTITIES['number'], 'Effective number of weights determined by the data.'
     ]
     log_evidence_change: Annotated[
-        float, QUANTITIES['log evidence'], 'Loss of log evidence without the group.'
+        float,
+        QUANTITIES['log evidence'],
+        'Loss of log evidence without the group, or, in a fit with a prior, with its values.',
     ]
     prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
 
