@@ -12,7 +12,6 @@ from fitting_truth import Truth, table_of
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, ResidualRow
-from thermo_comp.fitting.assembly import _soak_gradient
 from thermo_comp.fitting.data_checks import (
     Finding,
     determines_misalignment,
@@ -22,6 +21,7 @@ from thermo_comp.fitting.data_checks import (
     judge_result,
     judge_windows,
 )
+from thermo_comp.fitting.thermal_ranges import soak_gradient
 from thermo_comp.fitting.windows import Model, Sets, ThermalWindows
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.thermal.settings import DetectorSettings
@@ -225,14 +225,13 @@ def test_the_gradient_of_a_soak_is_that_without_the_ramps(good, rng):
     rate = np.where(t < 3000.0, 1.0 / 60.0, 0.02 / 60.0 * np.exp(-(t - 3000.0) / 600.0))
     lag = np.where(t < 3000.0, 600.0, 1500.0)
     gradient = -3.0 + lag * rate + 0.01 * rng.standard_normal(len(t))
-    middle, sd = _soak_gradient(replace(windows, rate=rate, gradient=gradient), None)
+    middle, sd = soak_gradient(replace(windows, rate=rate, gradient=gradient), None)
     assert middle == pytest.approx(-3.0, abs=0.01)
     assert sd == pytest.approx(0.01, rel=0.2)
     # Without a soak, and without the case, the gradient is not known.
     assert (
-        _soak_gradient(replace(windows, rate=np.full_like(t, 0.5), gradient=gradient), None)
-        is None
+        soak_gradient(replace(windows, rate=np.full_like(t, 0.5), gradient=gradient), None) is None
     )
-    assert _soak_gradient(replace(windows, rate=rate, gradient=np.zeros_like(t)), None) is None
+    assert soak_gradient(replace(windows, rate=rate, gradient=np.zeros_like(t)), None) is None
     known = calibration(soak_gradient_k=(-2.0, 0.1))
-    assert _soak_gradient(replace(windows, rate=rate), known) == (-2.0, 0.1)
+    assert soak_gradient(replace(windows, rate=rate), known) == (-2.0, 0.1)

@@ -11,8 +11,6 @@ from datetime import datetime, timezone
 import numpy as np
 
 from .. import __version__
-from ..thermal.settings import RAMP_K_MIN
-from ..thermal.state import USUAL_BOARD_LAG_S
 from ..typing import Bools, Floats
 from ..unit.calibration import (
     FORMAT_VERSION,
@@ -36,14 +34,19 @@ from .evidence import ResidualRow, group_evidence
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
+from .thermal_ranges import (
+    rest_gradient_range,
+    soak_gradient,
+    temperature_range,
+    union,
+    usable_board_lag,
+    valid_range,
+)
 from .unknowns import Layout, State
 from .windows import PART, Model, ThermalWindows
 
-Range = tuple[float, float]
-
 # The earliest stamp that is taken for a date: the start of the year 2000 [s since 1970].
 EARLIEST_DATE_S = 946684800.0
-_DATE = '%Y-%m-%dT%H:%M:%SZ'
 
 
 def build_calibration(
@@ -71,7 +74,7 @@ def build_calibration(
     values[-3:] = np.linalg.inv(state.inverse)[[1, 2, 2], [0, 0, 1]]
     static, dynamic = _regime_sets(fit, claim, known)
     columns = _valid_columns(windows, state, used, known)
-    lag_s = known.board_lag_s if known else _usable_lag(windows)
+    lag_s = known.board_lag_s if known else usable_board_lag(windows)
     sensors = {*model.sensors[:1], *(column.sensor for column in columns)}
     window_s = windows.typical_count * float(np.median([bag.cycle_s for bag in bags]))
     blank = Calibration(
@@ -87,8 +90,8 @@ def build_calibration(
         sensors=tuple(name for name in model.sensors if name in sensors),
         response=blank_terms(columns),
         board_lag_s=lag_s,
-        rest_gradient_range_k=_rest_gradient_range(windows, lag_s, known),
-        soak_gradient_k=_soak_gradient(windows, known),
+        rest_gradient_range_k=rest_gradient_range(windows, lag_s, known),
+        soak_gradient_k=soak_gradient(windows, known),
         detector=model.detector,
         provenance=_provenance(fit, bags, residuals, findings),
         evidence=group_evidence(regression, posterior) if windows.was_measured else (),
@@ -105,18 +108,11 @@ def build_calibration(
     return with_parameters(blank, state.kappa * regression.nominal_scale, values, covariance)
 
 
-def _temperature_range(windows: ThermalWindows) -> Range:
-    """Return the valid range of board temperatures."""
-    # The calibration of a test at one temperature is valid within 0.5 K. Without a thermometer the
-    # covariance of the slope covers the unknown curve.
-    return _range(windows.temperature, 0.5 if windows.was_measured else 50.0)
-
-
 def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[RegimeSet]:
     """Return the static and the dynamic set with their ranges, all coefficients 0."""
     windows, prior = fit.windows, fit.posterior.prior
-    temperatures = _temperature_range(windows)
-    rates = _range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
+    temperatures = temperature_range(windows)
+    rates = valid_range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
     # The sd of mounting offset plus slow noise of each axis [m/s^2].
     slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.ratio).tolist()
     lacks = lack_of_fit(fit, claim) if fit.regression.gravity else ((), ())
@@ -138,7 +134,7 @@ def _valid_columns(
     windows: ThermalWindows, state: State, used: Sequence[int], known: Calibration | None
 ) -> list[Column]:
     """Return the response columns in use with their valid ranges."""
-    lower, upper = _temperature_range(windows)
+    lower, upper = temperature_range(windows)
     is_weighed = np.any(state.weights != 0.0, axis=(0, 1))
     alone = is_weighed[len(windows.model.sets.groups) :]
     weighed = _of_columns(windows, is_weighed)
@@ -148,7 +144,7 @@ def _valid_columns(
         valid = column.range
         if column.term.bounds is None:
             order = column.term.order
-            valid = _range(windows.raw[:, k], 0.01, order)
+            valid = valid_range(windows.raw[:, k], 0.01, order)
             if k not in weighed:
                 # A column with zero weight contributes only to the covariance, and is valid at any
                 # value.
@@ -182,8 +178,8 @@ def _provenance(
     is_date = EARLIEST_DATE_S <= end_s <= now.timestamp()
     tested = datetime.fromtimestamp(end_s if is_date else 0.0, timezone.utc)
     return Provenance(
-        created=now.strftime(_DATE),
-        tested=tested.strftime(_DATE) if is_date else '',
+        created=_date_text(now),
+        tested=_date_text(tested) if is_date else '',
         tool_version=__version__,
         model=fit.windows.model.name,
         sources=tuple(
@@ -203,6 +199,10 @@ def _provenance(
         ),
         notes=tuple(str(finding) for finding in findings if finding.level != 'good'),
     )
+
+
+def _date_text(date: datetime) -> str:
+    return date.strftime('%Y-%m-%dT%H:%M:%SZ')
 
 
 def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
@@ -329,69 +329,6 @@ def file_jacobian(
     return np.array([*rows, -of_a, c * of_a - of_b + a * of_c, -of_c])
 
 
-def _soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
-    """
-    Return the first sensor's gradient in soaks and its robust scatter [K]; that of a prior
-    calibration if it has one; None without the sensor or a soak.
-    """
-    if known is not None and known.soak_gradient_k is not None:
-        return known.soak_gradient_k
-    rate = 60.0 * np.abs(windows.rate)
-    # The slowest tenth of the windows, if the rate is noisy.
-    slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
-    is_soak = rate <= slowest
-    if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
-        return None
-    # While a soak settles, the gradient still changes with the rate.
-    gradient, by_rate = windows.gradient[is_soak], np.vander(windows.rate[is_soak], 2)
-    slope, middle = np.linalg.lstsq(by_rate, gradient, rcond=None)[0].tolist()
-    scatter = np.abs(gradient - by_rate @ (slope, middle))
-    return middle, 1.4826 * float(np.median(scatter))
-
-
-def _rest_gradient_range(
-    windows: ThermalWindows, lag_s: float, known: Calibration | None
-) -> Range | None:
-    """
-    Return the range of the first sensor's gradient without that of ramps; None without the sensor,
-    without ramps, which determine the lag, or for a range beyond 100 K, as in bags too short for a
-    rate.
-    """
-    lower, upper = _range(windows.gradient - lag_s * windows.rate, 0.01)
-    is_small = max(-lower, upper) < 100.0
-    ranges = [(lower, upper)] if _has_gradients(windows) and is_small else []
-    if known is not None and known.rest_gradient_range_k is not None:
-        ranges.append(known.rest_gradient_range_k)
-    return union(ranges) if ranges else None
-
-
-def measured_board_lag(windows: ThermalWindows) -> float:
-    """
-    Return the lag of the board behind the case [s], negative if the board leads; NaN without ramps
-    or without a case temperature.
-    """
-    return _slope_of_gradient(windows) if _has_gradients(windows) else np.nan
-
-
-def _has_gradients(windows: ThermalWindows) -> bool:
-    """Whether the case temperature was recorded in ramps."""
-    has_ramps = 60.0 * float(windows.rate.std()) > RAMP_K_MIN
-    return bool(windows.gradient.any()) and has_ramps
-
-
-def _usable_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s], or the usual lag if it was not measured."""
-    lag = _slope_of_gradient(windows)
-    return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
-
-
-def _slope_of_gradient(windows: ThermalWindows) -> float:
-    """Return the slope of the gradient over the rate [s]; NaN at a constant rate."""
-    rate = windows.rate - np.mean(windows.rate)
-    power = float(rate @ rate)
-    return float(rate @ windows.gradient) / power if power > 0.0 else np.nan
-
-
 def _numbers(values: Floats) -> tuple[float, ...]:
     return tuple(float(v) + 0.0 for v in values)  # no -0.0
 
@@ -399,24 +336,3 @@ def _numbers(values: Floats) -> tuple[float, ...]:
 def _triple(values: Floats) -> tuple[float, float, float]:
     a, b, c = _numbers(values)
     return a, b, c
-
-
-def union(ranges: Iterable[Range]) -> Range:
-    """Return the smallest range that contains all given ranges."""
-    lower, upper = zip(*ranges, strict=True)
-    return min(lower), max(upper)
-
-
-def _range(values: Floats, smallest_margin: float, order: int = 0) -> Range:
-    """
-    Return the valid range of a quantity that is a power (`order`) of a heat flow: the range of its
-    values with a margin, extended to ramps twice as fast, since the response to a heat flow is
-    linear. A quantity of order 0 is a temperature and valid only within the data.
-    """
-    ratio = 2.0**order
-    lower, upper = float(np.min(values)), float(np.max(values))
-    # The margin is 2 % of the span, so that thermometer noise does not put the fitted data outside
-    # the valid range.
-    margin = max(0.02 * (upper - lower), smallest_margin)
-    lower, upper = lower - margin, upper + margin
-    return min(lower, ratio * lower), max(upper, ratio * upper)

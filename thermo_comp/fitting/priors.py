@@ -35,12 +35,13 @@ from ..unit.columns import FINE_TAUS, Column
 from ..unit.posterior import ParameterLayout
 from ..unit.provenance import Provenance, Source
 from ..unit.terms import LINE
-from .assembly import blank_terms, file_jacobian, parameters_of, union, with_parameters
+from .assembly import blank_terms, file_jacobian, parameters_of, with_parameters
 from .equations import as_vector
 from .initial_triad import ConstantCalibration
 from .nonlinear import without_terms
 from .options import FitOptions
 from .regression import Regression
+from .thermal_ranges import union
 from .unknowns import InformativePrior, State
 from .windows import Model, Sets
 

@@ -15,9 +15,9 @@ import numpy as np
 from ..errors import ThermoCompError
 from ..files import CSV, PARQUET, write_atomically
 from ..fitting import FitResult
-from ..fitting.assembly import measured_board_lag
 from ..fitting.coverage import distinct_directions
 from ..fitting.data_checks import POSITIONS_NEEDED, determines_misalignment
+from ..fitting.thermal_ranges import measured_board_lag
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
 from ..text import one_line
