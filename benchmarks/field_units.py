@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermo_comp.field.rest import Rest, Start
-from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.thermal.lags import MemorySpec
 from thermo_comp.unit.calibration import (
     Axes,
     AxisReference,

@@ -10,7 +10,7 @@ from builders import SECOND_NS, calibration, term
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.thermal.memory import Lag, MemorySpec
+from thermo_comp.thermal.lags import Lag, MemorySpec
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.thermal.state import BOARD, GRADIENT, Layout, Rate
 from thermo_comp.thermal.tracker import ThermalTracker

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
-from thermo_comp.thermal.memory import start_covariance
+from thermo_comp.thermal.lags import start_covariance
 from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Layout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.calibration import (

@@ -17,7 +17,8 @@ from thermo_comp.fitting.reduction import Readings
 from thermo_comp.fitting.windows import N_SECTIONS, Model, thermal_windows
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions
 from thermo_comp.simulation.run import arrays
-from thermo_comp.thermal.memory import Lag, MemorySpec, Play, ThermalMemory, memory_on_grid
+from thermo_comp.thermal.lags import Lag, MemorySpec, Play
+from thermo_comp.thermal.memory import ThermalMemory, memory_on_grid
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
 from thermo_comp.thermal.state import Gradient, Layout
 from thermo_comp.thermal.tracker import ThermalTracker

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline as ReferenceSpline
 
 from thermo_comp.convert.exchange import export_calibration
-from thermo_comp.thermal.memory import Lag, Play, memory_on_grid
+from thermo_comp.thermal.lags import Lag, Play
+from thermo_comp.thermal.memory import memory_on_grid
 from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction

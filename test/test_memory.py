@@ -9,15 +9,8 @@ import pytest
 from builders import SECOND_NS
 from scipy.integrate import solve_ivp
 
-from thermo_comp.thermal.memory import (
-    START_JITTER,
-    Lag,
-    LagBank,
-    MemorySpec,
-    ThermalMemory,
-    memory_on_grid,
-    start_covariance,
-)
+from thermo_comp.thermal.lags import START_JITTER, Lag, MemorySpec, start_covariance
+from thermo_comp.thermal.memory import LagBank, ThermalMemory, memory_on_grid
 
 TAUS = (60.0, 900.0, 7680.0)
 

@@ -14,7 +14,7 @@ from simulation_helpers import rippled
 from thermo_comp.simulation.campaign import parse_cyclogram
 from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import simulate
-from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.thermal.lags import MemorySpec
 from thermo_comp.thermal.plausibility import STILL_READINGS, Fault, still_readings
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig, ThermometerSettings

@@ -25,7 +25,7 @@ from thermo_comp.field.gather import RestFinder
 from thermo_comp.field.rest import Rest, Start, decode, encode, thinned
 from thermo_comp.ros import rest_log
 from thermo_comp.ros.rest_log import RestLog
-from thermo_comp.thermal.memory import MemorySpec
+from thermo_comp.thermal.lags import MemorySpec
 from thermo_comp.unit.calibration_file import save_calibration
 
 RATE_HZ, CYCLE_NS = 50, 20_000_000

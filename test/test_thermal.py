@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from builders import SECOND_NS
 
-from thermo_comp.thermal.memory import Lag, MemorySpec
+from thermo_comp.thermal.lags import Lag, MemorySpec
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
 from thermo_comp.thermal.state import GRADIENT, MEMORY_SETTLED_SD, VAR_GRADIENT, Layout, Rate

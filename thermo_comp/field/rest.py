@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
 
-from ..thermal.memory import Lag, MemorySpec, Play
+from ..thermal.lags import Lag, MemorySpec, Play
 from ..thermal.state import Layout
 
 #: Suffix of the files of a rest log; the name of a file is the day, as in 2026-11-25.rests.

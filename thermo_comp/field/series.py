@@ -23,7 +23,7 @@ import numpy as np
 from ..errors import RecordingError
 from ..files import read_bounded
 from ..text import counted
-from ..thermal.memory import MemorySpec
+from ..thermal.lags import MemorySpec
 from ..thermal.state import BOARD, Layout
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration, parameter_layout

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.interpolate import BSpline, CubicSpline
 from scipy.optimize import minimize, minimize_scalar
 
-from ..thermal.memory import Lag
+from ..thermal.lags import Lag
 from ..typing import Floats
 from ..unit.columns import Part
 from .hyperparameters import undisturbed

@@ -28,7 +28,7 @@ from scipy.linalg import solve_triangular
 
 from .. import __version__
 from ..errors import FitError
-from ..thermal.memory import Lag
+from ..thermal.lags import Lag
 from ..typing import Floats
 from ..unit.calibration import POPULATION, Calibration, RegimeSet, parameter_layout
 from ..unit.columns import FINE_TAUS, Column

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import FitError
-from ..thermal.memory import Lag, MemorySpec, memory_on_grid, start_covariance
+from ..thermal.lags import Lag, MemorySpec, start_covariance
+from ..thermal.memory import memory_on_grid
 from ..thermal.settings import DetectorSettings, ThermalConfig
 from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Gradient, Layout
 from ..thermal.tracker import ThermalTracker

@@ -18,7 +18,7 @@ from copy import copy
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from ..thermal.memory import BOARD_INPUT
+from ..thermal.lags import BOARD_INPUT
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..thermal.state import GRADIENT

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ..thermal.memory import BOARD_INPUT
+from ..thermal.lags import BOARD_INPUT
 from ..thermal.reading_queue import NEVER_NS, ReadingQueue
 from ..thermal.regime import Regime
 from ..thermal.settings import ThermalConfig

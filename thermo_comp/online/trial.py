@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from ..errors import CalibrationError
-from ..thermal.memory import BOARD_INPUT
+from ..thermal.lags import BOARD_INPUT
 from ..unit.calibration import Calibration
 from .compensator import Compensator, Corrected
 from .segments import Model

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..fitting.reduction import ReducedBag
 from ..fitting.sensors import readings_in_order
-from ..thermal.memory import BOARD_INPUT
+from ..thermal.lags import BOARD_INPUT
 from ..thermal.regime import Regime
 from ..thermal.settings import DetectorSettings
 from ..thermal.tracker import ThermalTracker

@@ -1,187 +1,28 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the thermal memory: lags of the board, lags of the gradients, play operators.
+Owns the thermal memory: the states of lags and play operators, by readings or on a grid of times.
 
-A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The state stored is ``m = u - L``. With u
-linear between two readings (first-order hold) the exact step of m over dt is
+The state m of a lag (see `lags`) with the input u obeys ``dm/dt = du/dt - m / tau``. With u linear
+between two readings (first-order hold) the exact step of m over dt is
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
-
-A part may exchange heat with another part that lags the board: the lag then has two stages in
-series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of
-two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
-
-A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind ``T + v g`` is the lag
-of the board less v times the lag of the gradient.
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from ..typing import Floats
-from .quantity import Quantity
+from .lags import BOARD_INPUT, MemorySpec, singles_of
 
-#: Name of the board temperature as the input of a lag or play.
-BOARD_INPUT: Final = 'board'
-#: Relative jitter on the diagonal of the start covariance: lags of similar time constants are
-#: almost collinear, and their covariance would not be invertible.
-START_JITTER: Final = 3e-4
-#: Prior sd of a lag's initial state [K], for lags of the board temperature and of a gradient with
-#: the time constant `START_TAU_S` [s].
-START_TAU_S: Final = 3600.0
-BOARD_START_SD: Final = 3.0
-GRADIENT_START_SD: Final = 1.0
 #: Interval between readings / time constant beyond which the input between the readings is
 #: unknown.
 SPARSE_SHARE: Final = 0.1
 #: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
 _FADED: Final = 1e-18
-
-
-class _Lag(NamedTuple):
-    input: str
-    tau_s: float
-    second_tau_s: float = 0.0
-    sensor: str = ''
-    sensor_share: float = 0.0
-
-
-class Lag(_Lag, Quantity):
-    """
-    The board temperature less that of a part which lags it, or the lag of the gradient of a sensor
-    (`input`) [K], with the time constants of its two stages [s]; the second is shorter, or 0 for a
-    lag of one stage. A part may lag a temperature between board and sensor: that of the board plus
-    `sensor_share` of the gradient of `sensor`.
-    """
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The thermometers that the quantity is computed from."""
-        return (self.input, self.sensor) if self.sensor else (self.input,)
-
-    @property
-    def singles(self) -> dict[tuple[str, float], float]:
-        """Share of each single lag in a lag of two stages, by input and time constant."""
-        stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
-        return {
-            (name, tau): factor * share
-            for name, factor in zip(self.inputs, (1.0, -self.sensor_share), strict=False)
-            for tau, share in stages
-            if tau
-        }
-
-    @property
-    def shares(self) -> tuple[float, float]:
-        """Shares of the single lags of both time constants in this lag."""
-        difference = self.tau_s - self.second_tau_s
-        return self.tau_s / difference, -self.second_tau_s / difference
-
-    def start_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the RMS share of the initial value that remains at an age [s], from 1 to 0."""
-        first = exp(-age_s / self.tau_s)
-        if not self.second_tau_s:
-            return first
-        # The variance of the sum of both single lags follows from `start_covariance`.
-        second = exp(-age_s / self.second_tau_s)
-        a, b = self.shares
-        tau, tau_2 = self.tau_s, self.second_tau_s
-        both = 4.0 * a * b * tau * tau_2 / (tau + tau_2)
-        remaining = a * a * tau * first * first + both * first * second
-        remaining = remaining + b * b * tau_2 * second * second
-        return (remaining / (a * a * tau + both + b * b * tau_2)) ** 0.5
-
-
-class _Play(NamedTuple):
-    tau_s: float
-    width_k: float
-    second_tau_s: float = 0.0
-    sensor: str = ''
-    sensor_share: float = 0.0
-
-
-class Play(_Play, Quantity):
-    """
-    A play of half-width `width_k` less its input, a lag of the board (0 s: the board itself) [K].
-    A play less its input has no variance: an error of the input shifts the play by the same
-    amount.
-    """
-
-    input = BOARD_INPUT
-
-    @property
-    def lag(self) -> Lag | None:
-        """The lag that the play follows; None if it follows the board."""
-        return Lag(BOARD_INPUT, self.tau_s, *self[2:]) if self.tau_s else None
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The thermometers that the quantity is computed from."""
-        return self.lag.inputs if self.lag else (self.input,)
-
-
-@dataclass(frozen=True)
-class MemorySpec:
-    """
-    Contents of the thermal state of a tracker. `sensors`: thermometers by name; the detector uses
-    the first as the leading sensor.
-    `lags`: in the order of `inputs`. `rates`: sensors whose rate of change is in the state.
-    """
-
-    sensors: tuple[str, ...] = ('case',)
-    lags: tuple[Lag, ...] = ()
-    plays: tuple[Play, ...] = ()
-    rates: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'lags', tuple(Lag(*lag) for lag in self.lags))
-        object.__setattr__(self, 'plays', tuple(Play(*play) for play in self.plays))
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The board and the sensors, in the order of their lags."""
-        return (BOARD_INPUT, *self.sensors)
-
-
-def _singles(lags: Iterable[Lag]) -> tuple[tuple[str, float], ...]:
-    """Return the input and the time constant of each single lag that the lags contain."""
-    return tuple(dict.fromkeys(single for lag in lags for single in lag.singles))
-
-
-def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
-    """Return the covariance of lags at their start, before any input was seen, (n, n) [K^2]."""
-    root = start_root(lags)
-    return np.asarray(root @ root.T)
-
-
-def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
-    """
-    Return a factor of the covariance of `start_covariance`, which is the factor times its
-    transpose, shape (n, number of single lags) [K].
-
-    The covariance itself is singular if two sums of single lags are equal but for rounding. The
-    unseen input is modelled as a random walk that ends at the first reading, so that ``P_kl =
-    D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different
-    inputs. After the first reading the covariance decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
-    """
-    all_lags = [Lag(*lag) for lag in lags]
-    singles = _singles(all_lags)
-    tau = np.array([tau for _, tau in singles])
-    names = np.array([name for name, _ in singles])
-    sd = np.where(names == BOARD_INPUT, BOARD_START_SD, GRADIENT_START_SD)
-    with np.errstate(invalid='ignore'):
-        shape = tau[:, np.newaxis] * tau / (tau[:, np.newaxis] + tau)
-    is_same = names[:, np.newaxis] == names
-    shape[np.diag_indices_from(shape)] *= 1.0 + START_JITTER
-    covariance = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
-    shares = np.array([[lag.singles.get(single, 0.0) for single in singles] for lag in all_lags])
-    shares = shares.reshape(len(all_lags), len(singles))
-    return np.asarray(shares @ np.linalg.cholesky(covariance))
 
 
 class LagBank:
@@ -291,7 +132,7 @@ class ThermalMemory:
 
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
-        singles = sorted(_singles(spec.lags), key=lambda single: spec.inputs.index(single[0]))
+        singles = sorted(singles_of(spec.lags), key=lambda single: spec.inputs.index(single[0]))
         #: The single lags of each input, by the input's name.
         self.banks = {
             name: LagBank(tuple(tau for of, tau in singles if of == name)) for name in spec.inputs
@@ -418,7 +259,7 @@ def memory_on_grid(
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
     single: dict[tuple[str, float], Floats] = {}
-    for name, tau in _singles(spec.lags):
+    for name, tau in singles_of(spec.lags):
         u = inputs[name]
         lost = -math.expm1(-step_s / tau)
         driven = np.diff(u, prepend=u[:1]) * (lost * tau / step_s)

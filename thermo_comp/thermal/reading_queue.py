@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from .memory import BOARD_INPUT
+from .lags import BOARD_INPUT
 
 #: A waiting reading: stamp [ns], whether the thermometer is not the board's, name of the
 #: thermometer, order of arrival, temperature [degC].

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from ..quantities import QUANTITIES
-from .memory import BOARD_INPUT, MemorySpec
+from .lags import BOARD_INPUT, MemorySpec
 from .quantity import Quantity
 
 #: Sd of every lag below which the thermal memory counts as settled [K].

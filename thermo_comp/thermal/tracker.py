@@ -12,7 +12,8 @@ from copy import copy
 from math import inf, sqrt
 from typing import Final
 
-from .memory import BOARD_INPUT, MemorySpec, ThermalMemory, start_covariance
+from .lags import BOARD_INPUT, MemorySpec, start_covariance
+from .memory import ThermalMemory
 from .plausibility import Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAli
 import numpy as np
 
 from ..quantities import QUANTITIES
-from ..thermal.memory import BOARD_INPUT, Lag, MemorySpec, Play
+from ..thermal.lags import BOARD_INPUT, Lag, MemorySpec, Play
 from ..thermal.quantity import Quantity
 from ..thermal.state import BOARD, WEIGHT, Gradient, Layout, Rate
 from ..typing import Floats

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..thermal.memory import BOARD_INPUT, MemorySpec
+from ..thermal.lags import BOARD_INPUT, MemorySpec
 from ..thermal.state import BOARD, UNKNOWN, VAR_BOARD, WEIGHT, Layout
 from ..typing import Floats
 from .calibration import Calibration

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ..thermal.memory import BOARD_INPUT, Lag, Play, start_root
+from ..thermal.lags import BOARD_INPUT, Lag, Play, start_root
 from ..thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout, Rate
 from ..typing import Floats
 from .calibration import Calibration, parameter_layout

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..thermal import memory, state
+from ..thermal import lags, state
 from ..thermal.quantity import Quantity
 from ..typing import Floats
 from .functions import by_element
@@ -93,9 +93,9 @@ class Term(ABC):
         return float(self.order * largest ** (self.order - 1)) * column.source.per_kelvin
 
 
-def _lag_of_part(column: Column) -> memory.Lag:
+def _lag_of_part(column: Column) -> lags.Lag:
     sensor = column.sensor if column.sensor_share else ''
-    return memory.Lag(memory.BOARD_INPUT, *column.part[:2], sensor, column.sensor_share)
+    return lags.Lag(lags.BOARD_INPUT, *column.part[:2], sensor, column.sensor_share)
 
 
 class Gradient(Term):
@@ -151,7 +151,7 @@ class GradientLag(Term):
 
     def source(self, column: Column) -> Quantity:
         """Return ``L_tau(g_s)``."""
-        return memory.Lag(column.sensor, *column.part[:2])
+        return lags.Lag(column.sensor, *column.part[:2])
 
 
 class Square(Term):
@@ -204,7 +204,7 @@ class Play(Term):
     def source(self, column: Column) -> Quantity:
         """Return ``P(v) - v``, P the play of half-width `width_k`, v = t or t less its lag."""
         lag = _lag_of_part(column)
-        return memory.Play(lag.tau_s, column.width_k, *lag[2:])
+        return lags.Play(lag.tau_s, column.width_k, *lag[2:])
 
 
 class Bend(Board):
