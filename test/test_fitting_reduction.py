@@ -170,6 +170,9 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     assert noise == pytest.approx(0.02, rel=0.1)
     (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'spikes')
     assert '33 readings' in finding.message
+    # The first and the last reading of a bag may be wrong, too.
+    at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
+    assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
     # Slow readings of a fast change are not spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
 

@@ -53,6 +53,36 @@ def test_the_first_reading_of_a_sensor_may_be_wrong():
     assert tracker.board.temperature == pytest.approx(20.0, abs=0.1)
 
 
+@pytest.mark.parametrize('wrong', [85.0, 24.2, -40.0])
+@pytest.mark.parametrize('sensor', ['board', 'case'])
+def test_a_wrong_first_reading_leaves_no_trace(sensor, wrong):
+    # WHY: one reading of 85 degC after power-up cost 1 mg for 20 min.
+    memory = MemorySpec(lags=(('board', 900.0), ('case', 600.0)))
+    tracker, without = tracker_of(memory=memory), tracker_of(memory=memory)
+    for second in range(0, 900, 5):
+        board = 20.0 + max(second - 300, 0) / 60.0 + 0.004 * (-1) ** (second // 5)
+        for name, celsius in (('board', board), ('case', board + 0.5)):
+            is_wrong = name == sensor and second == 0
+            tracker.read(name, second * SECOND_NS, wrong if is_wrong else celsius)
+            if name != sensor or second >= 10:
+                without.read(name, second * SECOND_NS, celsius)
+    state = tracker.sample(900 * SECOND_NS)
+    np.testing.assert_allclose(state, without.sample(900 * SECOND_NS), rtol=1e-9, atol=1e-12)
+    shares = tracker.memory.start_shares(900 * SECOND_NS)
+    assert shares == without.memory.start_shares(900 * SECOND_NS)
+    assert tracker.checks['board'].fault is tracker.checks['case'].fault is Fault.NONE
+
+
+@pytest.mark.parametrize('lag_s', [0.0, 300.0])
+def test_a_ramp_or_a_step_of_the_air_at_the_start_is_no_wrong_reading(lag_s):
+    tracker = tracker_of(memory=LAG)
+    for second in range(0, 60, 5):
+        # A ramp of 12 K/min, and the answer to a step of 40 K with a lag of 300 s.
+        changed = 40.0 * (1.0 - math.exp(-second / lag_s)) if lag_s else 0.2 * second
+        tracker.read('board', second * SECOND_NS, 20.0 + changed)
+    assert tracker.memory.board.start_ns == 0
+
+
 @pytest.mark.parametrize('sensor', SENSORS)
 @pytest.mark.parametrize('frozen', ['board', 'case'])
 def test_a_frozen_sensor_is_found_by_changes_of_the_second_sensor(sensor, frozen):

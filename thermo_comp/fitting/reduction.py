@@ -27,6 +27,7 @@ from ..recording import stillness
 from ..recording.blocks import RecordingInfo
 from ..recording.causes import CauseCounter
 from ..recording.stillness import CellAccumulator, Cells
+from ..thermal.plausibility import CONTINUED_SHARE
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..typing import Bools, Floats, Ints
 from .coverage import best_rests, directions, distinct_directions, rough_centre
@@ -295,7 +296,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 def is_spike(value: Floats) -> Bools:
     """
-    Return which readings are more than 10 K from the median of five readings, shape (n,).
+    Return which readings are more than 10 K from the readings before and after, shape (n,).
 
     A thermometer without contact reads -127 or 85 degC for a moment. The tracker rejects spikes,
     unless spikes have increased the noise that a fit expects of the thermometer.
@@ -304,6 +305,11 @@ def is_spike(value: Floats) -> Bools:
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
+        # The first and the last reading have neighbours on one side only, where the change of a
+        # ramp continues.
+        for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
+            step, after = np.abs(np.diff(nearest)).tolist()
+            far[place] = step > 10.0 and after < CONTINUED_SHARE * step
     return far
 
 

@@ -166,6 +166,14 @@ class ThermalMemory:
             bank.forget()
         self._held = []
 
+    def forget_input(self, name: str) -> None:
+        """Forget the gradient of a sensor, or all inputs if it is the board."""
+        if name == BOARD_INPUT:
+            self.forget()
+        else:
+            self.banks[name].forget()
+            self._held = [] if self._needs_sensors else self._held
+
     def board_step(self, stamp_ns: int, board: float, sd: float = 0.0) -> None:
         """Take the next estimate of the board temperature [degC], with an error `sd`."""
         self.board.step(stamp_ns, board, sd)

@@ -24,6 +24,10 @@ LARGEST_RATE: Final = 0.2
 #: readings may be wrong.
 SETTLED_READINGS: Final = 5
 
+#: The first reading is wrong if its change to the second reading does not continue: if the next
+#: change is less than this share of it.
+CONTINUED_SHARE: Final = 0.25
+
 #: A sensor's readings count as standing still after this number of equal readings over at least
 #: this time [s]; the number is larger if the declared noise makes the run more probable than
 #: `STILL_PROBABILITY`.
@@ -103,6 +107,35 @@ class SensorCheck:
         self._expected = 0.0
         self._moved = 0.0
         self._seen_ns: int | None = None
+        #: The first readings [degC] and their stamps, until the third reading judges the first.
+        self._first: list[tuple[int, float]] | None = []
+
+    def forget_other(self) -> None:
+        """Forget the other sensor's change: its readings were wrong."""
+        self._other_then = nan
+
+    def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
+        """
+        Judge the sensor's first reading by the two that follow; call with each reading. A sensor
+        may have a wrong reading after power-up, which no earlier reading contradicts.
+        """
+        first = self._first
+        if first is None or not isfinite(celsius):
+            return False
+        if first and stamp_ns <= first[-1][0]:
+            return False
+        if len(first) < 2:
+            first.append((stamp_ns, celsius))
+            return False
+        self._first = None
+        (first_ns, wrong), (second_ns, second) = first
+        step, after = second - wrong, celsius - second
+        possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
+        # In a ramp, or after a real step, the change continues.
+        continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
+        return abs(step) > possible + _SIGMAS * self.sensor.settings.noise_sd_c and abs(
+            after
+        ) < CONTINUED_SHARE * min(abs(step), continued)
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
         """Judge a reading [degC] before it is used: return whether the estimator may use it."""

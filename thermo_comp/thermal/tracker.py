@@ -18,7 +18,7 @@ from .plausibility import Fault, LeadCheck, SensorCheck
 from .regime import Regime, RegimeDetector
 from .settings import DetectorSettings, ThermalConfig
 from .state import BOARD, GRADIENT, MEMORY_SETTLED_SD, USUAL_BOARD_LAG_S
-from .thermometer import Thermometer
+from .thermometer import RESTART_READINGS, Thermometer
 
 #: Relative sd of the gradient that is estimated from the board's rate while a sensor is lost.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
@@ -155,7 +155,10 @@ class ThermalTracker:
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
         """Update a thermometer; a jump adds to the memory's variance, a gap resets the memory."""
+        if check.has_wrong_start(stamp_ns, celsius):
+            self._begin_again(name, sensor)
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
+        n_before = sensor.n_in_row
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
             # After a step, a sensor whose readings stay at the new value for long enough starts
@@ -174,6 +177,12 @@ class ThermalTracker:
         has_restarted = sensor.n_restarts != n_restarts
         if before_ns is not None and (is_new or has_restarted):
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
+            if has_restarted and not is_gap and n_before < 2 * RESTART_READINGS:
+                # The few readings before the restart were wrong, not those after it.
+                self._begin_again(name, sensor)
+                sensor.update(stamp_ns, celsius)
+                self.updated_ns = max(self.updated_ns or stamp_ns, stamp_ns)
+                return True
             memory = self.memory if sensor is self.board else self.memory.banks[name]
             if memory is self.memory and (is_anew or is_gap):
                 memory.forget()
@@ -184,6 +193,15 @@ class ThermalTracker:
         if self.updated_ns is None or stamp_ns > self.updated_ns:
             self.updated_ns = stamp_ns
         return True
+
+    def _begin_again(self, name: str, sensor: Thermometer) -> None:
+        """Forget a sensor's readings, which were wrong, and all that followed from them."""
+        sensor.reset()
+        self.memory.forget_input(name)
+        self._rest_gradients.clear()
+        self._begin_watch()
+        for check in self.checks.values():
+            check.forget_other()
 
     def _decide(self, stamp_ns: int, case: Thermometer | None) -> None:
         board = self.board if self.board.stamp_ns is not None else None
