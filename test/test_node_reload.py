@@ -4,6 +4,7 @@
 
 import sys
 import threading
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -246,3 +247,18 @@ def test_a_calibration_that_cannot_be_applied_changes_nothing(peer, tmp_path):
         assert parameter.string_value == str(first)
         flow.stop()
     assert {flow.bias(index) for index in range(len(flow.heard))} == {1.0}
+
+
+def test_a_calibration_of_another_unit_is_named(peer, tmp_path, capfd):
+    # WHY: it was used without a word, with errors of 890 claimed sd.
+    first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
+    save_calibration(of_bias(1.0), first)
+    one = of_bias(1.0).unit
+    save_calibration(of_bias(77.0, unit=replace(one, serial='Z-9')), second)
+    with node_in_thread(*lossless(), '-p', f'calibration_file:={first}'):
+        for path in (first, second):
+            (result,) = peer.set_parameters(calibration_file=str(path))
+            assert result.successful, result.reason
+    said = capfd.readouterr().err
+    assert said.count('replaces unit') == 1
+    assert f'unit Z-9 replaces unit {one.serial}: set the parameter `serial`' in said

@@ -318,7 +318,7 @@ def findings_of(
         if status.is_refuted:
             yield _ERROR, f'{missed}: another unit, or an axis reversed? Nothing is published'
         elif abs(gravity.residual) > GRAVITY_SIGMAS * gravity.residual_sd:
-            yield _WARN, f'{missed}: has the unit aged?'
+            yield _WARN, f'{missed}: has the unit aged, or is it another unit?'
     is_expected = loaded.calibration.needs_case or math.isfinite(status.case_age_s)
     if status.state and status.is_case_lost and needs_board and is_expected:
         yield _WARN, 'case temperature lost, the board sensor decides the regime'

@@ -148,7 +148,7 @@ class CompensationNode:
             if not result.successful:
                 raise parameters.ParameterError(result.reason)
             if new:
-                self._print_calibration()
+                self._print_calibration(before.loaded.calibration.unit.serial)
             self._loop.call_soon(partial(self._relay.release, before.samples))
             # A failure before this line restores the previous calibration.
             return result  # noqa: TRY300
@@ -188,10 +188,13 @@ class CompensationNode:
         if message:
             raise CalibrationError(message, loaded.path, key)
 
-    def _print_calibration(self) -> None:
+    def _print_calibration(self, serial_before: str = '') -> None:
         loaded = self._relay.running.loaded
         serial = loaded.calibration.unit.serial
         self._log.info(f'unit {serial}: {loaded.path} ({loaded.sha256[:12]})')
+        if serial_before not in ('', serial):
+            advice = 'set the parameter `serial` to refuse calibrations of other units'
+            self._log.warning(f'unit {serial} replaces unit {serial_before}: {advice}')
 
 
 def main(args: list[str] | None = None) -> int:
