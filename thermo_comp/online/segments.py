@@ -40,10 +40,14 @@ UNMEASURED_SD_K: Final = 10.0
 
 
 class SlowState(NamedTuple):
-    """The thermal state that determines the slow part of the variance, and the lags' shares."""
+    """
+    What determines the slow part of the variance: the thermal state, and of the lags' unknown
+    initial states the remaining shares and `ThermalMemory.start_rate`.
+    """
 
     state: tuple[float, ...]
     start_shares: list[float]
+    start_rate: float
 
 
 class Segment(NamedTuple):
@@ -59,7 +63,7 @@ class Segment(NamedTuple):
     slow: SlowState  # the same object in all segments with the same slow part of the variance
 
 
-_NO_STATE: Final = SlowState((), [])
+_NO_STATE: Final = SlowState((), [], 0.0)
 
 
 class Model:
@@ -83,9 +87,8 @@ class Model:
         Evaluate the slow part of the variance of the force, `Correction.n_slow` rows, then that of
         the angular rate, shape (rows, len(held)).
         """
-        states = np.array([one.state for one in held]).T
-        shares = np.array([one.start_shares for one in held]).T
-        return np.concatenate([part.at(states, shares) for part in self.uncertainty])
+        states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
+        return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 
 
 class ThermalSide:
@@ -253,6 +256,7 @@ class ThermalSide:
                 # Without a temperature reading, evaluate the variance one sd of the temperature
                 # from the reference temperature.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
-            shares = self.tracker.memory.start_shares(start_ns + SEGMENT_NS)
-            self._slow = SlowState(end_state, shares)
+            memory = self.tracker.memory
+            shares = memory.start_shares(start_ns + SEGMENT_NS)
+            self._slow = SlowState(end_state, shares, memory.start_rate)
         return self._slow

@@ -159,12 +159,15 @@ class ThermalMemory:
         self._needs_sensors = any(play.inputs != (BOARD_INPUT,) for play in spec.plays)
         self._widths = [play.width_k for play in spec.plays]
         self._held: list[float] = []
+        #: Largest rate of the board temperature since the start, less two sd [K/s].
+        self.start_rate = 0.0
 
     def forget(self) -> None:
         """Forget all inputs; each play starts again in the middle of its width."""
         for bank in self.banks.values():
             bank.forget()
         self._held = []
+        self.start_rate = 0.0
 
     def forget_input(self, name: str) -> None:
         """Forget the gradient of a sensor, or all inputs if it is the board."""

@@ -138,6 +138,8 @@ class ThermalTracker:
             leading, _ = self._gradient(name, stamp_ns, board.temperature, board.rate)
             error = sqrt(self._board_error(leading))
             memory.board_step(stamp_ns, board.temperature, error)
+            rate = abs(board.rate) - 2.0 * sqrt(board.var_rate)
+            memory.start_rate = max(memory.start_rate, rate)
             for name, bank in memory.banks.items():
                 sensor = self.thermometers[name]
                 if sensor is board or not bank.taus or bank.stamp_ns is None:

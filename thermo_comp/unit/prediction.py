@@ -58,27 +58,34 @@ class SlowUncertainty:
             self._blocks.append([(matrix[part], diagonal[part]) for part in parts])
         self._misalignment = matrix[layout.misalignment :], diagonal[layout.misalignment :]
 
-    def at(self, states: Floats, start_shares: Floats) -> Floats:
+    def at(
+        self, states: Floats, start_shares: Floats, start_rates: Floats | None = None
+    ) -> Floats:
         """
         Evaluate the rows of the error covariance (see `unit.covariance`) at thermal states, shape
-        (width, n), with the remaining shares of the lags' initial states, (n_lags, n); each state
-        alone. Returns `Correction.n_slow` rows: a, b, c of each axis' error variance
+        (width, n), each state alone, with the remaining shares of the lags' initial states,
+        (n_lags, n), and with `ThermalMemory.start_rate` of each state, (n,), which is 0 if it is
+        not given. Returns `Correction.n_slow` rows: a, b, c of each axis' error variance
         ``v(x) = a + b x + c x^2`` [m^2/s^4], then the rows between axes and misalignment; with a
         nonlinearity then its part of the coefficients of x^2 to x^6 of each axis' variance.
         """
         cuts = range(_CHUNK, states.shape[1], _CHUNK)
-        parts = zip(np.split(states, cuts, 1), np.split(start_shares, cuts, 1), strict=True)
+        rates = np.abs(states[RATE])
+        if start_rates is not None:
+            rates = np.maximum(rates, start_rates)
+        arrays = states, start_shares, rates
+        parts = zip(*(np.split(array, cuts, -1) for array in arrays), strict=True)
         return np.hstack([self._at(*part) for part in parts])
 
-    def _at(self, states: Floats, start_shares: Floats) -> Floats:
+    def _at(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         phi = table.held(table.raw(states)) * factors
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
         # If the start was in a ramp, the parts were behind the board, by an unknown amount up to
-        # that of a long ramp at the present rate, within the calibrated temperatures.
-        behind = hold(self._behind_s[:, np.newaxis] * states[RATE], -self._span, self._span)
+        # that of a long ramp at the largest rate since then, within the calibrated temperatures.
+        behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
         regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
