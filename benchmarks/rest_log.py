@@ -117,8 +117,8 @@ def _compared(with_log: Floats, without: Floats, unit: str) -> str:
     more, usual = with_log[:n] - without[:n], float(np.median(without))
     # Use the median: a second in which the host stops the machine has a large latency.
     sd = 1.2533 * 1.4826 * float(np.median(np.abs(more - np.median(more)))) / np.sqrt(n)
-    away = float(np.median(more))
-    return f'{usual:.3g} {unit} without, {away / usual:+.1%} +- {sd / usual:.1%} with the log'
+    change = float(np.median(more))
+    return f'{usual:.3g} {unit} without, {change / usual:+.1%} +- {sd / usual:.1%} with the log'
 
 
 def main() -> None:

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import second_simulator
-import strangers
+import unmodelled
 from accuracy import errors, fit_and_correct
-from strangers_baselines import minutes
-from strangers_cases import (
+from unmodelled_baselines import minutes
+from unmodelled_cases import (
     FULL_SCALE,
     HALF,
     HELD,
     Study,
-    cheap,
+    consumer_grade,
     gradient,
     navigation,
     one_test,
@@ -25,7 +25,7 @@ from strangers_cases import (
     soaks,
     third_node,
 )
-from strangers_units import GRAVITY, UG, rng_of, spread
+from unmodelled_units import GRAVITY, UG, rng_of, spread
 
 from thermo_comp.fitting.priors import population
 from thermo_comp.fitting.windows import Model, Sets
@@ -50,7 +50,7 @@ def study_of(name, n=9, corners=HALF, **given):
 def parts():
     """Fit a unit with a part of another time constant on each axis."""
     unit, study = study_of('parts', part_s=PARTS_S)
-    return unit, study, strangers.fitted(study)
+    return unit, study, unmodelled.fitted(study)
 
 
 def taus_of(calibration):
@@ -62,8 +62,8 @@ def taus_of(calibration):
 
 def judged(calibration, study):
     (bags,) = study.tests.values()
-    outs = [strangers.corrected(calibration, bag) for bag in bags]
-    return strangers.score(outs, [minutes(bag) for bag in bags], is_drift=False)
+    outs = [unmodelled.corrected(calibration, bag) for bag in bags]
+    return unmodelled.score(outs, [minutes(bag) for bag in bags], is_drift=False)
 
 
 def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
@@ -77,7 +77,7 @@ def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
 def test_a_part_between_board_and_case():
     case_share = np.array([0.6, 0.3, 0.0])
     unit, study = study_of('between', part_s=PARTS_S, case_share=case_share)
-    calibration = strangers.fitted(study)
+    calibration = unmodelled.fitted(study)
     parts = {one.part for one in calibration.response if one.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares = np.array(sorted(parts)).T
@@ -95,7 +95,7 @@ def test_a_noisy_sensor_in_one_warm_up():
     unit = replace(unit, density=30.0, bias_curve=5.0 * unit.bias_curve, counts=0.0)
     bags = positions(unit, thaw, spread(12, rng), rng)
     study = Study('', bags, {}, {'input': 'm/s^2'})
-    taus = np.array(taus_of(strangers.fitted(study)))
+    taus = np.array(taus_of(unmodelled.fitted(study)))
     assert taus == pytest.approx(unit.part_s[:, None], rel=0.03)
 
 
@@ -107,7 +107,7 @@ def test_bags_of_one_warm_up_predict_another():
     bags = positions(unit, thaw, spread(10, rng), rng)
     held = positions(unit, program(-15.0, 10.0, (20.0, 20.0, 90.0)), spread(2, rng), rng)
     study = Study('', bags, one_test(held), FULL_SCALE)
-    calibration = strangers.fitted(study)
+    calibration = unmodelled.fitted(study)
     assert {one.group for one in calibration.response if any(one.bias)} == {'part'}
     # 0.65 ug is the noise of a mean of a minute.
     assert judged(calibration, study).norm < 2.0
@@ -134,14 +134,14 @@ def test_a_curve_over_a_part_is_a_sum_of_columns():
 
 def test_one_thermometer_is_sufficient():
     unit, study = study_of('parts', n=12, part_s=PARTS_S, sensors=('board',))
-    calibration = strangers.fitted(study)
+    calibration = unmodelled.fitted(study)
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     assert judged(calibration, study).norm < 2.0
 
 
 def test_a_unit_without_lags_gets_none():
     _, study = study_of('no lag', part_s=np.zeros(3))
-    calibration = strangers.fitted(study)
+    calibration = unmodelled.fitted(study)
     assert not any(term.tau_s for term in calibration.response)
     assert judged(calibration, study).norm < 1.5
 
@@ -150,7 +150,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
     # WHY: a time constant absorbed a part of the effect of the gradient (223 s instead of 163 s),
     # and the columns that balanced this failed in a soak: error 167 ug, claimed sd 15 ug.
     (study,) = gradient(1)
-    calibration = strangers.fitted(study)
+    calibration = unmodelled.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
     assert judged(calibration, study).norm < 2.0
 
@@ -160,7 +160,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
     bump = np.array([450.0, -400.0, 500.0])
     _, study = study_of('bump', bump=bump, bump_c=17.0)
     # The groups that the fit chooses from all groups, which takes three times as long.
-    calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
+    calibration = unmodelled.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The fit approximates a bell with an sd of 0.85 K by lines between knees every 0.5 K.
     assert judgement.norm < 60.0
@@ -193,7 +193,8 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
 
 
 @pytest.mark.parametrize(
-    ('grade', 'rate_hz', 'full_scale'), [(cheap, 10.0, 32767.0), (navigation, 0.5, 8388607.0)]
+    ('grade', 'rate_hz', 'full_scale'),
+    [(consumer_grade, 10.0, 32767.0), (navigation, 0.5, 8388607.0)],
 )
 def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     # The board drifts by 0.01 K within a soak; 26 K between the soaks move the norms by milli-g.
@@ -202,11 +203,11 @@ def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     bags = positions(unit, SOAKS, spread(18, rng), rng, rate_hz=rate_hz)
     held = positions(unit, HELD, spread(2, rng), rng, rate_hz=rate_hz)
     study = Study('', bags, one_test(held), {'full_scale': full_scale})
-    score = judged(strangers.fitted(study), study)
+    score = judged(unmodelled.fitted(study), study)
     means = [minutes(bag) for bag in held]
-    forces = [strangers.by_hand(study)['constants'](mean) for mean in means]
+    forces = [unmodelled.scipy_baselines(study)['constants'](mean) for mean in means]
     # A part of the error remains, because soaks do not show the lags of the held-out ramps.
-    assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
+    assert score.norm < 0.5 * unmodelled.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
 
@@ -215,23 +216,23 @@ def test_six_faces_in_three_soaks(given):
     # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
     # unit with drifts of 10 mg left 40 mg. With a stated repeatability the fit divided by zero.
     rng = rng_of('faces in soaks', 1)
-    unit = replace(cheap(rng), skew=np.zeros(3))
+    unit = replace(consumer_grade(rng), skew=np.zeros(3))
     faces = np.vstack((np.eye(3), -np.eye(3))).repeat(3, axis=0)
     bags = positions(unit, SOAKS, faces, rng, rate_hz=10.0)
     held = positions(unit, program(19.0, 90.0), spread(2, rng), rng, rate_hz=10.0)
     study = Study('', bags, one_test(held), {'full_scale': 32767.0, **given})
     # The noise of a mean of 25 min is 4 ug, and quanta of 0.5 mg leave some ten times as much.
-    assert judged(strangers.fitted(study), study).vector < 100.0
+    assert judged(unmodelled.fitted(study), study).vector < 100.0
 
 
 def test_a_curve_between_two_soaks_is_claimed():
     # WHY: without the powers that the soaks do not determine the claimed sd was 1/8 of the error.
     rng = rng_of('two soaks')
-    unit = cheap(rng)
+    unit = consumer_grade(rng)
     bags = positions(unit, SOAKS[::2], spread(18, rng), rng, rate_hz=10.0)
     held = positions(unit, program(19.0, 90.0), spread(3, rng), rng, rate_hz=10.0)
     study = Study('', bags, one_test(held), {'full_scale': 32767.0})
-    assert judged(strangers.fitted(study), study).ratio < 2.0
+    assert judged(unmodelled.fitted(study), study).ratio < 2.0
 
 
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
@@ -242,7 +243,7 @@ def test_a_curve_that_the_soaks_do_not_show_is_claimed():
     bags = positions(unit, SOAKS, faces, rng)
     held = positions(unit, HELD, spread(2, rng), rng)
     study = Study('', bags, one_test(held), FULL_SCALE)
-    assert judged(strangers.fitted(study), study).ratio < 1.5
+    assert judged(unmodelled.fitted(study), study).ratio < 1.5
 
 
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
@@ -254,16 +255,16 @@ def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
     held = positions(unit, HELD, spread(2, rng), rng)
     alone = Study('', soaked, one_test(held), FULL_SCALE)
     study = replace(alone, bags=(*soaked, replace(*ramps, name='ramps')))
-    calibration = strangers.fitted(study)
+    calibration = unmodelled.fitted(study)
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.02)
-    assert judged(calibration, study).norm < 0.5 * judged(strangers.fitted(alone), alone).norm
+    assert judged(calibration, study).norm < 0.5 * judged(unmodelled.fitted(alone), alone).norm
 
 
 @pytest.mark.parametrize('case', [soaks, third_node])
 def test_without_parts_or_ramps_the_fit_has_a_bank_of_lags(case):
     # Soaks do not determine a time constant; with a third node no axis is a curve of one part.
     study = next(case(0))
-    calibration = strangers.fitted(replace(study, bags=study.bags[:8]))
+    calibration = unmodelled.fitted(replace(study, bags=study.bags[:8]))
     assert {term.tau_s for term in calibration.response if term.kind == 'board'} <= {*FINE_TAUS}
 
 
@@ -280,7 +281,7 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     assert {term.tau_s for term in mean.response if term.tau_s} <= {*FINE_TAUS}
     (bags,) = study.tests.values()
     for bag in bags:
-        off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
+        off = unmodelled.corrected(mean, bag).force - unmodelled.corrected(calibration, bag).force
         # The units' lags, 10 K at 20 ug/K, differ by up to 7 % from their mean.
         assert np.sqrt(np.mean(off**2)) < 5.0 * UG
 
@@ -308,4 +309,4 @@ def test_fit_says_how_far_the_parts_lag(parts, tmp_path, cli):
 def test_soaks_alone_do_not_tell_a_loose_thermometer():
     # Soaks do not show the lag of the board, so the gradient of a ramp does not indicate a fault.
     study = next(soaks(1))
-    assert strangers.fitted(replace(study, bags=study.bags[:9])).rest_gradient_range_k is None
+    assert unmodelled.fitted(replace(study, bags=study.bags[:9])).rest_gradient_range_k is None

@@ -88,7 +88,11 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
     """Return the roles of the topics that a recording must have to be corrected."""
-    return ('accel', 'board') if any(one.needs_temperature for one in calibrations) else ('accel',)
+    return (
+        ('accel', 'board')
+        if any(calibration.needs_temperature for calibration in calibrations)
+        else ('accel',)
+    )
 
 
 def replay(

@@ -247,12 +247,12 @@ class Acquisition:
                 Position(up, rest.still_s, rest.n_rests, float(sd), rest.surveys, reason)
             )
         known = [position for position in positions if np.isfinite(position.up).all()]
-        seen = np.array([position.up for position in known]).reshape(-1, 3)
+        up = np.array([position.up for position in known]).reshape(-1, 3)
         sds = np.array([position.sd_g for position in known])
-        covariance = coverage.constants_covariance(seen, sds, misalignment_sd)
-        next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, seen)
+        covariance = coverage.constants_covariance(up, sds, misalignment_sd)
+        next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, up)
         now, is_still = self._now(cells)
-        hole, hole_deg = coverage.farthest(seen)
+        hole, hole_deg = coverage.farthest(up)
         n_good = sum(not position.reason for position in positions)
         thermometers = _together([rest.surveys for rest in rests])
         missing = self._n_wanted - n_good

@@ -198,8 +198,8 @@ def _print_fit(
     if taus and shares:
         source = 'the board'
         if any(shares):
-            away = ', '.join(f'{share:.2f}' for share in shares)
-            source = f'a temperature between board and case (case share {away})'
+            case_shares = ', '.join(f'{share:.2f}' for share in shares)
+            source = f'a temperature between board and case (case share {case_shares})'
         out.line(
             f'each axis is a curve of the temperature of its part, which lags {source} by '
             f'{", ".join(f"{tau:.0f}" for tau in taus)} s (x, y, z)'

@@ -67,7 +67,9 @@ def evaluate(
         kind = TABLES.get(csv.suffix, CSV)
         check_output(csv, kind, overwrite=force, others=[*bags, *calibration])
     is_named = len({path.stem for path in calibration}) == len(calibration)
-    models = [(one.stem if is_named else str(one), load_calibration(one)) for one in calibration]
+    models = [
+        (path.stem if is_named else str(path), load_calibration(path)) for path in calibration
+    ]
     with out.progress('evaluating') as done:
         result = run(bags, models, **judging, topics=topics, force=known_force, progress=done)
     out.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
@@ -79,7 +81,11 @@ def evaluate(
     tell_sections(out, result.judgements)
     _print_axes(out, judged)
     _print_levels(out, judged)
-    rates = {name: one.rate for name, one in result.judgements.items() if one.rate is not None}
+    rates = {
+        name: judgement.rate
+        for name, judgement in result.judgements.items()
+        if judgement.rate is not None
+    }
     if rows := _sections(rates, millidegrees):
         out.table(
             ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),

@@ -268,10 +268,10 @@ def _lines(account: 'Account') -> list[str]:
     if account.hole_deg > 0.0:
         where = direction_text(account.hole)
         lines.append(f'no position within {account.hole_deg:.0f} deg of {where}')
-    for name, one in account.thermometers.items():
+    for name, survey in account.thermometers.items():
         lines.append(
-            f'{name} {one.lowest:.1f} .. {one.highest:.1f} degC, ramps '
-            f'{one.steepest_cooling_k_min:+.2f} .. {one.steepest_heating_k_min:+.2f} K/min'
+            f'{name} {survey.lowest:.1f} .. {survey.highest:.1f} degC, ramps '
+            f'{survey.steepest_cooling_k_min:+.2f} .. {survey.steepest_heating_k_min:+.2f} K/min'
         )
     if not account.is_complete:
         lines.append(_next(account))

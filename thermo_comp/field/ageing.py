@@ -179,13 +179,13 @@ class Model:
             factor = cho_factor(self.covariance(Ageing(*sd)), lower=True)
             inverse = cho_solve(factor, np.eye(len(self.rows.y)))
             alpha = inverse @ self.rows.y
-            away = (logs - middle) / _LOG_SD
-            value = np.log(np.diag(factor[0])).sum() + 0.5 * (self.rows.y @ alpha + away @ away)
+            shift = (logs - middle) / _LOG_SD
+            value = np.log(np.diag(factor[0])).sum() + 0.5 * (self.rows.y @ alpha + shift @ shift)
             slope = [
                 v**2 * float((inverse * part).sum() - alpha @ part @ alpha)
                 for v, part in zip(sd, self.parts, strict=True)
             ]
-            return float(value), np.array(slope) + away / _LOG_SD
+            return float(value), np.array(slope) + shift / _LOG_SD
 
         # The evidence has almost no gradient where variances are small, so the search has two
         # initial points: all scatter is due to the starts, or all scatter to the random walks.

@@ -77,10 +77,10 @@ class RestFinder:
                 if self._second is not None:
                     rests += self._close(self._second, number)
                 self._second = _Second(number, part[0], total=np.zeros(part.shape[1]))
-            second, away = self._second, part - self._second.origin
+            second, centred = self._second, part - self._second.origin
             second.n += len(part)
-            second.total += away.sum(axis=0)
-            second.squares += (away[:, :3] ** 2).sum(axis=0)
+            second.total += centred.sum(axis=0)
+            second.squares += (centred[:, :3] ** 2).sum(axis=0)
         return rests
 
     def _close(self, second: _Second, following: int) -> list[Rest]:

@@ -218,7 +218,7 @@ def series_of(
     white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
     noise = (v**2 * white).sum(axis=1) / sizes
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
-    bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
+    bare, full = (SlowUncertainty(part, correction) for part in (without, calibration))
     slow, claim = (_along(correction, states, shares, model, u, x) for model in (bare, full))
     of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
     slow, claim = slow - of_one_sample, claim - of_one_sample

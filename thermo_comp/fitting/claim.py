@@ -110,8 +110,8 @@ def claim_of(
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
     covariance[layout.bias, layout.bias] += shared
     if candidates is not None:
-        wider = _with_unseen(regression, posterior, candidates)
-        with_unseen = regression.solve(posterior.state, wider, n_steps=0)
+        widened = _with_unseen(regression, posterior, candidates)
+        with_unseen = regression.solve(posterior.state, widened, n_steps=0)
         # The covariance with unseen columns is computed at the mode's mounting sd. Add the excess
         # of the mixture's covariance over that of the mode.
         at = _places(posterior.layout, with_unseen.layout)
@@ -126,12 +126,12 @@ def claim_of(
     return Claim(layout, covariance, offset_sd)
 
 
-def _places(layout: Layout, wider: Layout) -> Ints:
+def _places(layout: Layout, widened: Layout) -> Ints:
     """Return the places of the unit's unknowns in a layout with more columns, (n_unit,)."""
     places = np.empty(layout.n_unit, dtype=np.int64)
     for name in ('kappa', 'bias', 'weights', 'nonlinear', 'shared'):
         at = getattr(layout, name)
-        places[at[at >= 0]] = getattr(wider, name)[at >= 0]
+        places[at[at >= 0]] = getattr(widened, name)[at >= 0]
     return places
 
 
@@ -152,10 +152,10 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
-    seen = np.diag(inactive.S).reshape(-1, 3)
-    seen = seen.sum(axis=1) / np.maximum((seen > 0.0).sum(axis=1), 1)
+    information = np.diag(inactive.S).reshape(-1, 3)
+    information = information.sum(axis=1) / np.maximum((information > 0.0).sum(axis=1), 1)
     sd = np.zeros_like(typical)
-    sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
+    sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
@@ -311,7 +311,7 @@ def _norm_evidence(
             along[:, weights] @ by_drifts[weights],
         ))  # fmt: skip
     else:
-        errors += along @ point.away[: layout.n_unit]
+        errors += along @ point.deviation[: layout.n_unit]
         of_prior = solve_triangular(prior.informative.root, along.T, trans='T').T
     noise = float(np.mean(prior.sigma**2)) * (1.0 / weight + prior.noise.ratio)
     known = of_prior @ of_prior.T

@@ -180,10 +180,10 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
                 f'unknown; five temperatures determine a cubic',
             )
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
-        seen, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
+        recorded, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
         yield advice(
             'directions',
-            f'only {seen} was recorded; errors in a ramp change sign with its direction, so '
+            f'only {recorded} was recorded; errors in a ramp change sign with its direction, so '
             f'record {missing}, too',
         )
     calm = windows.weight <= 0.5

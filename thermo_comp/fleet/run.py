@@ -92,7 +92,7 @@ def fit_fleet(
 
         def fitted(some: Sequence[FoundUnit], how: FleetOptions) -> dict[str, Row]:
             nonlocal client
-            rows = {one.name: row for one in some if (row := results.look_up(one, how))}
+            rows = {unit.name: row for unit in some if (row := results.look_up(unit, how))}
             missing = [unit for unit in some if unit.name not in rows]
             if missing and client is None:
                 most = min(n_workers or os.cpu_count() or 1, len(some))

@@ -83,8 +83,8 @@ class Model:
         Evaluate the slow part of the variance of the force, `Correction.n_slow` rows, then that of
         the angular rate, shape (rows, len(held)).
         """
-        states = np.array([one.state for one in held]).T
-        shares = np.array([one.start_shares for one in held]).T
+        states = np.array([slow.state for slow in held]).T
+        shares = np.array([slow.start_shares for slow in held]).T
         return np.concatenate([part.at(states, shares) for part in self.uncertainty])
 
 

@@ -220,9 +220,9 @@ def select_topics(
     named = {**topics.further, 'board': topics.board, 'case': topics.case}
     fields = {role: split_field(named.get(role, ''))[1] for role in name_of if role != 'accel'}
     fields = {
-        role: one or PLAIN.get(present[name_of[role]][0], '') for role, one in fields.items()
+        role: field or PLAIN.get(present[name_of[role]][0], '') for role, field in fields.items()
     }
-    fields = {role: one for role, one in fields.items() if one}
+    fields = {role: field for role, field in fields.items() if field}
     _check_twins(name_of, fields)
     text = '; '.join(filter(None, chosen)) or None
     return Selected(name_of, fields, cast(Any, keys.get('accel')), text)

@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The generators and the judge of benchmarks/strangers.py against closed forms."""
+"""The generators and the judge of benchmarks/unmodelled.py against closed forms."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import strangers
-import strangers_cases as cases
-import strangers_units as units
+import unmodelled
+import unmodelled_cases as cases
+import unmodelled_units as units
 from builders import axis_set, calibration, regime_set
 from conftest import ROOT
-from strangers_baselines import Minutes, by_drift, by_norm, minutes
-from strangers_limits import LIMITS, Limit, Result, Score, best_baseline, misses, rows_of
-from strangers_recorded import blocks_of, part, rests_of
-from strangers_units import GRAVITY, UG, Bag, record, rng_of, spread
+from unmodelled_baselines import Minutes, by_drift, by_norm, minutes
+from unmodelled_limits import LIMITS, Limit, Result, Score, best_baseline, misses, rows_of
+from unmodelled_recorded import blocks_of, part, rests_of
+from unmodelled_units import GRAVITY, UG, Bag, record, rng_of, spread
 
 from thermo_comp.unit.calibration import Axes, AxisReference
 
@@ -148,7 +148,7 @@ def test_held_out_bags_take_no_part_in_the_fit(case, recorded):
         assert study.prior_of in ('', *labels)
         for name in study.tests or ('',):
             title = f'{case} {study.label}'.strip() + (f': {name}' if name else '')
-            strangers.misses(strangers.rows_of([Result(title, 1)])[0], [])
+            unmodelled.misses(unmodelled.rows_of([Result(title, 1)])[0], [])
     assert len(set(labels)) == len(labels)
 
 
@@ -209,7 +209,7 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
         of_attitudes(given, np.array([8.0, 29])),
     )
     cubic, constants = (
-        strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
+        unmodelled.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
         for order in (3, 0)
     )
     # The cubic neglects products of small terms, such as misalignment times bias: below 5 ug.
@@ -235,7 +235,7 @@ def test_a_bias_at_the_reference_is_held_against_its_bound():
     # The calibration claims an sd of 2e-3 m/s^2 in addition to its white noise.
     claimed = axis_set(residual_sd_m_s2=2e-3)
     known = regime_set(x=claimed, y=claimed, z=claimed)
-    score = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
+    score = unmodelled.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
     assert score.ratio == pytest.approx(1 / 0.6 / np.sqrt(3.0))
     assert score.vector == pytest.approx(1 / 300.0 / UG)
     assert score.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
@@ -251,7 +251,7 @@ def test_a_cubic_by_hand_finds_a_pose_s_drift():
                 one.force[: len(one.board) // 18])
         for one in minutes_
     )  # fmt: skip
-    error = strangers.error_of([by_drift([fit], 1.0, order=3)(held)], [held], is_drift=True)
+    error = unmodelled.error_of([by_drift([fit], 1.0, order=3)(held)], [held], is_drift=True)
     assert error.vector < 1e-6
 
 
@@ -271,8 +271,8 @@ def test_a_ratio_is_1_where_errors_are_as_claimed():
     root = 20.0 * UG * np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.2, -0.3, 2.0]])
     error = rng.standard_normal((n, 3)) @ root.T
     claim = np.broadcast_to(root @ root.T, (n, 3, 3))
-    out = strangers.Corrected(truth + error, claim, np.zeros(3))
-    scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
+    out = unmodelled.Corrected(truth + error, claim, np.zeros(3))
+    scores = unmodelled.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
     # 20000 windows determine an RMS to half a percent.
     assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
     assert scores.claim == pytest.approx(scores.vector, rel=0.02)
@@ -284,7 +284,7 @@ def test_a_claim_of_a_minute_is_the_noise_of_its_mean():
     samples[::2] += 1.0
     samples[1::2] -= 1.0
     bag = Bag('', np.arange(1, 30001) * 0.01, samples, {})
-    out = strangers.corrected(calibration(), bag)
+    out = unmodelled.corrected(calibration(), bag)
     assert np.sqrt(np.diagonal(out.claim, axis1=1, axis2=2)) == pytest.approx(1e-4 / np.sqrt(60.0))
     assert out.white == pytest.approx([1e-8 / 60.0] * 3)
     assert out.force == pytest.approx(np.tile(GRAVITY * LEVEL, (5, 1)))
@@ -296,8 +296,8 @@ def test_minutes_that_are_not_published_may_be_few():
     claim = np.broadcast_to(UG**2 * np.eye(3), (100, 3, 3))
     for n_missing, expected in ((1, 1.0), (3, np.inf)):
         force[:n_missing] = np.nan
-        out = strangers.Corrected(force, claim, np.zeros(3))
-        scores = strangers.score([out], [Minutes(truth, np.zeros(100), truth)], is_drift=False)
+        out = unmodelled.Corrected(force, claim, np.zeros(3))
+        scores = unmodelled.score([out], [Minutes(truth, np.zeros(100), truth)], is_drift=False)
         assert scores.ratio == pytest.approx(expected)
 
 
@@ -326,14 +326,14 @@ def test_a_row_with_more_data_is_compared_with_the_row_without():
 
 @pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
 def test_generators_and_judge_share_no_code_with_the_package(name):
-    source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
+    source = (ROOT / 'benchmarks' / f'unmodelled_{name}.py').read_text(encoding='utf-8')
     imports = [line for line in source.splitlines() if 'import ' in line]
     assert imports
     assert not [line for line in imports if 'thermo_comp' in line]
 
 
 def test_each_case_has_a_limit_and_each_limit_a_case():
-    names = (*strangers.RECORDED, *cases.CASES)
+    names = (*unmodelled.RECORDED, *cases.CASES)
     assert all(any(key.startswith(name) for key in LIMITS) for name in names)
     assert all(any(key.startswith(name) for name in names) for key in LIMITS)
     assert all(isinstance(limit, Limit) for limit in LIMITS.values())

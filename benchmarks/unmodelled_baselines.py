@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the baselines fitted by scipy to one-minute means, for the benchmark `strangers.py`.
+Owns the baselines fitted by scipy to one-minute means, for the benchmark `unmodelled.py`.
 
 Constants are nine numbers: bias, scale and misalignment. A cubic has in addition to the constants,
 for each axis, a cubic of the bias and a line of the scale over board temperature. Constants and
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
-from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
+from unmodelled_units import GRAVITY, REFERENCE_C, Bag, Floats
 
 Ints = npt.NDArray[np.int64]
 

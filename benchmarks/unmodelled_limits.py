@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the limits of the benchmark `strangers.py`: rows over several units, and the limits that each
+Owns the limits of the benchmark `unmodelled.py`: rows over several units, and the limits that each
 row exceeds.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from strangers_units import Floats
+from unmodelled_units import Floats
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the units and recordings of the benchmark `strangers.py`: physics by numpy and scipy alone.
+Owns the units and recordings of the benchmark `unmodelled.py`: physics by numpy and scipy alone.
 
 Case, board, the part of each axis and one hidden node are nodes of a linear thermal network. The
 input of the network is the air temperature of the chamber, which is linear in time between two

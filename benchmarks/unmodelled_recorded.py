@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the recorded cases of the benchmark `strangers.py`: sample bags, without the case thermometer,
-and the recording of a real unit, which is distributed with another package and not with this one.
+Owns the recorded cases of the benchmark `unmodelled.py`: the sample bags, with and without the
+case thermometer, and a recording of a real unit, which another package distributes.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from strangers_cases import Study
-from strangers_units import GRAVITY, Bag
+from unmodelled_cases import Study
+from unmodelled_units import GRAVITY, Bag
 
 import thermo_comp
 from thermo_comp.recording.reader import read_recording
@@ -109,7 +109,7 @@ def cats(path: Path) -> Iterator[Study]:
     for parity, name in enumerate(('even to odd', 'odd to even')):
         tests = {'': tuple(still[1 - parity])}
         bags = tuple(bag for number, bag in blocks.items() if number % 2 == parity)
-        yield Study(name, bags, tests, options, by_hand=tuple(still[parity]))
+        yield Study(name, bags, tests, options, baseline_bags=tuple(still[parity]))
     for k, rest in enumerate(rests):
         others = tuple(rests[:k] + rests[k + 1 :])
         yield Study('rests left out', others, {'': (rest,)}, options)

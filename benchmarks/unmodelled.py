@@ -4,17 +4,17 @@
 Owns the accuracy on bags of units that the package has not modelled, beside that of curves fitted
 by scipy.
 
-Run ``python benchmarks/strangers.py`` for every case (many hours), or a part with fewer units:
-``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A colon
+Run ``python benchmarks/unmodelled.py`` for every case (many hours), or a part with fewer units:
+``python benchmarks/unmodelled.py --cases kink,soaks --units 2 --json unmodelled.json``. A colon
 selects one study of a case: ``--cases 'turn-on:9 at 30 ug'``.
 
-Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
+Units and recordings come from `unmodelled_units.py` and `unmodelled_cases.py`, which share no code
 with the package; the package is used only through its fit and its correction of arrays. Every row
 is measured on recordings that were not fitted, unless the row states otherwise. Errors are RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
 is the RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
-`strangers_limits.py` that a row exceeds; the exit code is then 1. The baselines fitted by the
-package take most of the time; ``--baselines strangers.json`` reads them from an earlier run.
+`unmodelled_limits.py` that a row exceeds; the exit code is then 1. The baselines fitted by the
+package take most of the time; ``--baselines unmodelled.json`` reads them from an earlier run.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from strangers_baselines import WINDOW_S, Minutes, by_drift, by_norm, means, minutes, slots
-from strangers_cases import CASES, Study
-from strangers_limits import Result, Row, Score, misses, rms, rows_of
-from strangers_recorded import cats, samples
-from strangers_units import GRAVITY, REFERENCE_C, UG, Bag, Floats, rng_of
+from unmodelled_baselines import WINDOW_S, Minutes, by_drift, by_norm, means, minutes, slots
+from unmodelled_cases import CASES, Study
+from unmodelled_limits import Result, Row, Score, misses, rms, rows_of
+from unmodelled_recorded import cats, samples
+from unmodelled_units import GRAVITY, REFERENCE_C, UG, Bag, Floats, rng_of
 
 import thermo_comp
 from thermo_comp import CompensatorConfig
@@ -176,9 +176,9 @@ def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
     return np.concatenate([error - error.mean(axis=0) for error in errors])
 
 
-def by_hand(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
+def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
     """Fit constants and a cubic per axis by scipy."""
-    bags = [minutes(bag) for bag in study.by_hand or study.bags]
+    bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
         # One pose does not determine the scale factors: take the norm of the samples over gravity.
@@ -297,7 +297,7 @@ def run(
         for test, result in scored(study, calibration, tests).items():
             scores[test][model] = result
     if has_baselines and not all(known.values()):
-        for model, correct in by_hand(study).items():
+        for model, correct in scipy_baselines(study).items():
             for test, bags in tests.items():
                 forces = [correct(bag) for bag in bags]
                 scores[test][model] = error_of(forces, bags, is_drift=study.is_drift)
