@@ -142,14 +142,12 @@ def tell_nonlinearity(out: Output, calibration: 'Calibration') -> None:
         cells = [f'{value:.4g}' + f' +- {sd:.2g}' * isfinite(sd) for value, sd in axes]
         rows.append((coefficient.name, coefficient.unit, *cells))
     terms = calibration.nonlinearity.terms
-    losses = (
-        ', '.join(f'{term.kind} {term.log_evidence_change:.1f}' for term in terms) or 'no term'
-    )
+    loss = ', '.join(f'{term.kind} {term.log_evidence_change:.1f}' for term in terms) or 'no term'
     low, high = calibration.nonlinearity.force_range_m_s2
     out.table(
         ('coefficient', 'unit', 'x', 'y', 'z'),
         rows,
-        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {losses}',
+        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {loss}',
     )
 
 

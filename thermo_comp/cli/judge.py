@@ -67,9 +67,8 @@ def evaluate(
         kind = TABLES.get(csv.suffix, CSV)
         check_output(csv, kind, overwrite=force, others=[*bags, *calibration])
     is_named = len({path.stem for path in calibration}) == len(calibration)
-    models = [
-        (path.stem if is_named else str(path), load_calibration(path)) for path in calibration
-    ]
+    names = [path.stem if is_named else str(path) for path in calibration]
+    models = list(zip(names, map(load_calibration, calibration), strict=True))
     with out.progress('evaluating') as done:
         result = run(bags, models, **judging, topics=topics, force=known_force, progress=done)
     out.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
@@ -81,11 +80,7 @@ def evaluate(
     tell_sections(out, result.judgements)
     _print_axes(out, judged)
     _print_levels(out, judged)
-    rates = {
-        name: judgement.rate
-        for name, judgement in result.judgements.items()
-        if judgement.rate is not None
-    }
+    rates = {k: judged.rate for k, judged in result.judgements.items() if judged.rate is not None}
     if rows := _sections(rates, millidegrees):
         out.table(
             ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),

@@ -30,9 +30,7 @@ _LEAST = 1e-12
 #: The columns in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
 #: The columns whose changes between two tests are drift.
-_CONSTANTS = tuple(
-    quantity for quantity in QUANTITIES if quantity.sd and '_slope_' not in quantity.name
-)
+_CONSTANTS = tuple(column for column in QUANTITIES if column.sd and '_slope_' not in column.name)
 
 
 class Spread(NamedTuple):
@@ -111,17 +109,10 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
     serials = {str(row['name']): str(row['serial']) for row in fitted}
     outliers = [
         Outlier(
-            name,
-            serials[name],
-            quantity.label,
-            value,
-            spread.middle,
-            z,
-            quantity.unit,
-            spread.limit,
+            name, serials[name], column.label, value, spread.middle, z, column.unit, spread.limit
         )
         for spread in spreads
-        for quantity in [spread.quantity]
+        for column in [spread.quantity]
         for name, value, z in zip(
             spread.names, spread.values.tolist(), spread.z.tolist(), strict=True
         )

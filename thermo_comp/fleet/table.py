@@ -253,10 +253,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
     types = {'text': pa.string(), 'whole': pa.int64(), 'number': pa.float64()}
     schema = pa.schema(
-        [
-            pa.field(column.name, types[column.kind], metadata={'meaning': column.meaning})
-            for column in COLUMNS
-        ]
+        [pa.field(c.name, types[c.kind], metadata={'meaning': c.meaning}) for c in COLUMNS]
     )
     buffer = pa.BufferOutputStream()
     parquet.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer)

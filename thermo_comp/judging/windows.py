@@ -219,11 +219,8 @@ def _table(
             rows['bag'], rows['position'] = number, n_positions
             begin_s = rest.begin_s + bag.window_s * np.arange(n)
             rows['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
-            rows['count'], rows['time'], rows['mean'] = (
-                rest.count[:n],
-                rest.time[:n],
-                rest.mean[:n],
-            )
+            rows['count'], rows['time'] = rest.count[:n], rest.time[:n]
+            rows['mean'] = rest.mean[:n]
             rows['gyro'] = np.nan
             rows['size'] = gravity
             if (known := bag.source.force) is not None:

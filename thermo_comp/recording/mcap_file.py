@@ -147,9 +147,7 @@ class McapFile(BagFile):
         except Exception:  # noqa: BLE001 - damaged bytes surface as nearly any exception type
             return
         counts, n_messages = text.channel_message_counts, text.message_count
-        channels: dict[int, Channel] = {
-            channel.id: channel for channel in records_of.get(Channel, [])
-        }
+        channels: dict[int, Channel] = {c.id: c for c in records_of.get(Channel, [])}
         chunks = sorted(records_of.get(ChunkIndex, []), key=lambda index: index.chunk_start_offset)
         spans = [Span(*_SPAN_FIELDS(chunk)) for chunk in chunks]
         if (

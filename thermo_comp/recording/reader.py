@@ -193,9 +193,7 @@ class RecordingReader(ExitStack):
         if not self._files:
             raise RecordingError('the recording is closed', self.info.path)
         for file in self._files:
-            channels = {
-                number: topic for number, topic in file.topics.items() if topic.name in names
-            }
+            channels = {k: topic for k, topic in file.topics.items() if topic.name in names}
             for topic in channels.values():
                 if topic.encoding not in encodings:
                     reason = f'its messages are encoded as {shown(topic.encoding)!r}, expected cdr'

@@ -170,8 +170,7 @@ class CellAccumulator:
         spread = np.maximum(square - count[:, None] * mean**2, 0.0)
         variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
         rate, rate_variance = (
-            values[:, 3:] if values.shape[1] > 3 else np.zeros((len(values), 3))
-            for values in (mean, variance)
+            x[:, 3:] if x.shape[1] > 3 else np.zeros((len(x), 3)) for x in (mean, variance)
         )
         cell_s = self._cell_ns * 1e-9
         return Cells(

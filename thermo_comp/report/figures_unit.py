@@ -59,9 +59,7 @@ def draw_rates(evidence: Evidence) -> Figure:
     panels[0].set_ylabel('bias less the line, mdeg/s')
     # In the triad of a gyroscope m/s^2 stands for rad/s.
     factor = MICRO_G / MILLIDEGREE
-    drawn = [
-        curve._replace(value=factor * curve.value, sd=factor * curve.sd) for curve in curves(triad)
-    ]
+    drawn = [c._replace(value=factor * c.value, sd=factor * c.sd) for c in curves(triad)]
     for i, axes in enumerate(panels):
         axes.set_xlabel(_BOARD)
         _draw_less_line(axes, triad, drawn, i, 'mdeg/s')

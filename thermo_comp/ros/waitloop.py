@@ -222,11 +222,7 @@ class WaitLoop:
         """Wait and serve until the entities change or the loop stops."""
         node, self._is_stale = self.node, False
         raw = [subscription.subscription for subscription in self._raw]
-        others = {
-            subscription: partial(_take_message, subscription)
-            for subscription in node.subscriptions
-            if subscription not in raw
-        }
+        others = {sub: partial(_take_message, sub) for sub in node.subscriptions if sub not in raw}
         others |= {service: partial(self._take_request, service) for service in node.services}
         waking = next((subscription for subscription in self._raw if subscription.wakes), None)
         rest_ns = 0
