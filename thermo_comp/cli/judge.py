@@ -40,7 +40,7 @@ def evaluate(
 
     The verdict compares the RMS residual with your --tolerance or, without
     one, with the uncertainty that the calibration claims for the same
-    windows; six positions or more show which axis has moved. Exit code 0
+    windows; six positions or more show which axis has shifted. Exit code 0
     only if the calibration is shown to be valid. Rest logs of the node
     instead of bags show the drift over the days, and when it exceeds the
     claimed uncertainty.

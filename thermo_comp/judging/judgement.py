@@ -201,7 +201,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
     if kind is Verdict.SWAPPED:
         parts.insert(0, SWAPPED)
     if judgement.moved:
-        parts.append('moved: ' + ', '.join(judgement.moved))
+        parts.append('shifted: ' + ', '.join(judgement.moved))
     if outside.n:
         parts.append(
             f'{_windows(outside.n, windows)} outside the calibrated ranges not judged: '
