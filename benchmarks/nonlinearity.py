@@ -93,7 +93,7 @@ class Run:
 def run(
     unit: Unit, inward: Floats, rng: np.random.Generator, levels: tuple[float, ...] = LEVELS_G
 ) -> Run:
-    """Run a mounting through the soaks and levels."""
+    """Simulate a centrifuge run of one mounting: in each soak 1 g, then the levels of |f|."""
     knots, air = [0.0], [SOAKS_C[0]]
     for last, target in zip((SOAKS_C[0], *SOAKS_C), (*SOAKS_C, SOAKS_C[-1]), strict=False):
         if target != last:

@@ -9,8 +9,8 @@ log.
 The node runs in this process, source and sink of samples in two others; the rest log is on in even
 seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because a shared
 machine changes its pace. The latency runs from the source's publish call to the arrival in the
-sink's middleware. The wall time of one block of sums is the longest time for which the block can
-delay a sample.
+sink's middleware. A block of samples that is summed delays the next sample by at most the wall
+time of the sum, which is printed.
 """
 
 from __future__ import annotations

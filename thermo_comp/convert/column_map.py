@@ -47,7 +47,7 @@ _FASTEST_K_S = 0.5
 # boards or sensors whose rows alternate change more often.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
-#: Last and first part of a counter's range; a step from the last to the first is a new start.
+#: Last and first part of a counter's range; a step from the last to the first is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
 _GIVE_MAP = f'give {_A_MAP}'

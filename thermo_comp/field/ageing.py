@@ -78,8 +78,8 @@ class Change:
 @dataclass(frozen=True)
 class Rows:
     """
-    Equations of the rests, in order of time, at most `_ROWS` of a start: orthogonal sums with all
-    information of its rests about the six levels.
+    Equations of the rests, in order of time, at most `_ROWS` for each start of the node:
+    orthogonal sums with all information of its rests about the six levels.
 
     noise, scatter: variance of the noise, and factor of the rests' scatter variance in a row
     rank: number of the row within its start

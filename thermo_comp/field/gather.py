@@ -21,8 +21,7 @@ from .rest import Rest
 
 SECONDS = 10  # length of a window of a rest [s]
 _SECOND_NS = 1_000_000_000
-#: Number of a window in its rest, and n: from the window with this number on, every n-th window is
-#: kept.
+#: Pairs (k, n): from the window number k of a rest on, every n-th window is kept.
 _SPACING = ((360, 30), (60, 6), (0, 1))
 
 

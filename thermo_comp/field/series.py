@@ -153,7 +153,7 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Describe rests for the provenance of an update: the name holds their end and `ahead`."""
+    """Describe the rests of an update; its name has the time of the last rest, and `ahead`."""
     end = np.datetime64(rests[-1][1].stamp_ns, 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)

@@ -47,8 +47,8 @@ _GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
 #: above, and falling to 0 below a hundredth of the scale, which few mountings reach.
 _LOG_DENSITY = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_GRID**2 / STUDENT_NU)
 _LOG_DENSITY += np.log(np.minimum(_GRID / 0.01, 1.0))
-#: The same about the sd of a prior calibration: a Student's density of the logarithm, whose scale
-#: is a factor of 1.5, to which twelve positions determine an sd.
+#: Grid and log prior density about the sd of a prior calibration: a Student's density of the
+#: logarithm; its scale is a factor of 1.5, to which twelve positions determine an sd.
 _KNOWN_GRID = 10.0 ** np.arange(-1.5, 1.51, 0.125)
 _KNOWN_LOG_DENSITY = (
     -0.5 * (STUDENT_NU + 1.0) * np.log1p(np.log(_KNOWN_GRID) ** 2 / np.log(1.5) ** 2 / STUDENT_NU)
@@ -84,10 +84,10 @@ def claim_of(
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
     `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
-    `informative`: priors from a calibration that differ in the ageing since then
+    `informative`: priors from one calibration, with different ageings since that calibration
     """
     # The rests of one mounting have one offset, but the regression has one for each rest. The mean
-    # of k offsets with k times the variance has the variance of one.
+    # of k offsets with k times the variance has the variance of a single offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -199,9 +199,8 @@ def _over_mountings(
         ]
 
     fits = solved(tried)
-    # A large mounting sd leaves the attitudes free to absorb errors of the model. Therefore the
-    # drifts may increase the log evidence of an sd, over that of the mode, by at most
-    # `TRIAL_GAIN`.
+    # A large mounting sd leaves the attitudes free to absorb errors of the model, so the drifts
+    # may increase the log evidence of an sd, over that of the mode, by at most `TRIAL_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))

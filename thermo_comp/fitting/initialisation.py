@@ -179,8 +179,9 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
-    Their effect is nearly collinear with the curve, and its final value would be extrapolated. No
-    model uses slow columns; those linear in temperature enter the covariance, see `claim`.
+    The effect of a slow column is nearly collinear with the curve, and its final value would be
+    extrapolated. No model uses slow columns; those linear in temperature enter the covariance, see
+    `claim`.
     """
     model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])

@@ -301,8 +301,8 @@ def _grown(
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
     if is_without_bends and not chosen.is_complete:
         # A change of slope of a part is visible only in a model with the lag of this part, not in
-        # a model whose products and squares approximate the lag. A model of bends is continued if
-        # its drift is less than three times that of the chosen model.
+        # a model whose products and squares approximate the lag. Further groups are added to a
+        # model with bends if its drift is less than three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
             last, tried = growth.added(with_bends[0], progress)

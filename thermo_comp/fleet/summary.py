@@ -159,7 +159,7 @@ def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)
-    # The spread of eight units or, in a small fleet, of most of them, is the first that is used.
+    # The first spread is that of eight units or, in a small fleet, of more than half of the units.
     first = min(_UNITS_NEEDED, n // 2 + 1)
     n_counted = 0
     for k in range(first, n + 1):

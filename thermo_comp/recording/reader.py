@@ -88,7 +88,7 @@ class RecordingReader(ExitStack):
         #: Time from the bag's first sample to the part of the bag that is read [s]; set when
         #: the first sample is read.
         self.since_s = 0.0
-        self.apart = ''  # warning, if any so far, about a thermometer on another clock
+        self.apart = ''  # warning about a thermometer on another clock, if found so far
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
         for role, path in selected.fields.items():

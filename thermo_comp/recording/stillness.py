@@ -196,8 +196,8 @@ class CellAccumulator:
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
             # Samples that are stamped on their arrival come in bursts at a constant interval, of 5
-            # s at most, as of a buffer that is polled; the pauses of a tumble by hand differ. Two
-            # bursts are in a cell.
+            # s at most, as of a buffer that is polled; the pauses of a tumble by hand differ. A
+            # cell contains two bursts.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -312,7 +312,7 @@ def still_runs(
         quiet = plausible & (cells.variance <= ratio * noise + by_drift).all(axis=1)
         roughest = roughest_at_rest(cells, quiet, colour > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
-        # Noise of the roughness `roughest` changes between cells by at most `_STEP_SDS` sd.
+        # Successive samples of noise as rough as `roughest` differ by `_STEP_SDS` sd at most.
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
         # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.

@@ -31,7 +31,7 @@ _POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8
 
 
 def draw_functions(evidence: Evidence) -> Figure:
-    """Draw bias and scale over temperature, less a line, with bands and measurements."""
+    """Draw bias and scale over temperature, less a straight line, with bands and measurements."""
     calibration = given(evidence.calibration)
     figure = style.new_figure(4.4)
     panels = figure.subplots(2, 3, sharex=True)
@@ -52,7 +52,7 @@ def draw_functions(evidence: Evidence) -> Figure:
 
 
 def draw_rates(evidence: Evidence) -> Figure:
-    """Draw the bias of the angular rate over temperature, less a line, with bands."""
+    """Draw the bias of the angular rate over temperature, less a straight line, with bands."""
     triad = rate_triad(given(evidence.calibration))
     figure = style.new_figure(2.5)
     panels = figure.subplots(1, 3, sharex=True)
@@ -133,7 +133,7 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
 def draw_distances(
     labels: Sequence[str], distances: Sequence[Floats], limits: Sequence[float]
 ) -> Figure:
-    """Draw each unit's distance from the middle, by quantity; beyond its limit as a diamond."""
+    """Draw each unit's distance from the fleet's median, by quantity; an outlier is a diamond."""
     figure = style.new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
     known = [limit for limit in limits if np.isfinite(limit)]

@@ -3,8 +3,8 @@
 """
 Owns the thermal memory: lags of the board, lags of the gradients, play operators.
 
-A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The state stored is ``m = u - L``. With u
-linear between two readings (first-order hold) the exact step of m over dt is
+A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The stored state is ``m = u - L``, the input
+less its lag. With u linear between two readings (first-order hold) the exact step of m over dt is
 ``m' = m e + (u' - u) (tau / dt) (1 - e)``, ``e = exp(-dt / tau)``.
 
 A part may exchange heat with another part that lags the board: the lag then has two stages in
