@@ -91,7 +91,7 @@ def _calibration(out: Output, path: Path) -> None:
     out.line(f'{path}: unit {unit.serial}, {unit.input} up to {unit.full_scale:g}')
     out.line(
         f'  fitted {provenance.created or "at an unknown time"} by thermo_comp '
-        f'{provenance.tool_version or "?"} from {len(provenance.sources)} bags, '
+        f'{provenance.tool_version or "?"} from {counted(len(provenance.sources), "bag")}, '
         f'model {provenance.model or "?"}'
     )
     out.line(

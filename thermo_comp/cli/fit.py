@@ -41,7 +41,7 @@ def fit(
         "Curve of bias and scale over temperature; default: the model's.", metavar='CURVE'
     ),
     dynamic_curve: Curve | None = option('Curve of the dynamic set alone.', metavar='CURVE'),
-    groups: str | None = option('Groups allowed in the fit.', metavar='A,B'),
+    groups: str | None = option('Groups of columns allowed in the fit.', metavar='A,B'),
     force_groups: str = option('Groups kept regardless of the evidence.', '', metavar='A,B'),
     prior: Path | None = option(
         'Prior: a calibration of the type, or an old calibration of the unit.', metavar='YAML'

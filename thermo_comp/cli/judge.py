@@ -24,7 +24,7 @@ def evaluate(
         'Bags of one unit, any positions, or its rest logs.', metavar='BAG...'
     ),
     calibration: list[Path] = option(
-        'Calibration; the first is judged, more are compared.', ..., '--calibration', '-c'
+        'Calibration; further ones are compared with the first.', ..., '--calibration', '-c'
     ),
     judging: dict[str, Any] = options.judging,
     known_force: Any = options.force,

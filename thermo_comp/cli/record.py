@@ -32,7 +32,7 @@ _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 def record(
     context: typer.Context,
     output: Path = option(
-        'Folder of the bags; existing bags are continued.', ..., '--output', '-o'
+        'Folder of the bags; existing bags belong to the test.', ..., '--output', '-o'
     ),
     bag: Path | None = argument(
         'Bag that another recorder writes, instead of topics.', None, metavar='[BAG]'
@@ -92,7 +92,7 @@ def record(
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
     if bag is None and live.n_lost:
-        out.note(f'{live.n_lost} messages were lost on the way')
+        out.note(f'{live.n_lost} messages from the drivers were lost')
     _end(out, test.account(), output, [*known, *bags.written], offset, over.is_set())
 
 

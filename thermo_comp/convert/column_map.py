@@ -59,7 +59,7 @@ class Accel:
     The accelerometer's three columns, which become `output`: ``counts`` or ``imu`` (m/s^2).
 
     `clip`: lowest and highest reading, at which the sensor is saturated, in the table's unit;
-    `offset`: reading without a force, which is subtracted, such as 32768 in offset binary.
+    `offset`: reading at zero force, which is subtracted, such as 32768 in offset binary.
     """
 
     columns: Triple
@@ -111,7 +111,7 @@ class Further(Thermometer):
         super().__post_init__()
         if not is_thermometer(self.name):
             raise ValueError(
-                f'`name` must serve in a topic, as temperature/magnet, got {self.name!r}'
+                f'`name` must fit into a topic, as temperature/magnet, got {self.name!r}'
             )
 
 

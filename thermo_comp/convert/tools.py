@@ -190,7 +190,7 @@ def _choose(numbers: set[int], number: int | None, is_in_use: Callable[[int], bo
     if number is None:
         live = [n for n in sorted(numbers) if is_in_use(n)] or sorted(numbers)
         if len(live) > 1:
-            raise CalibrationError(f'several sets of parameters {live}: choose one')
+            raise CalibrationError(f'several sets of parameters {live}: choose one by its number')
         return live[0]
     if number not in numbers:
         raise CalibrationError(f'no set of parameters {number}, there is {sorted(numbers)}')

@@ -106,7 +106,7 @@ def judge_windows(
                 'swapped',
                 'refusal',
                 f'the board temperature leads the case (correlation {correlation:.2f} of gradient '
-                'and rate): are the two sensors exchanged, or is that of the case loose?',
+                'and rate): are the two sensors exchanged, or is the case thermometer loose?',
             )
 
 

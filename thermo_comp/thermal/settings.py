@@ -53,7 +53,7 @@ class ThermometerSettings:
 
     @property
     def has_cells(self) -> bool:
-        """Whether the quantum far exceeds the noise; a reading then states an interval, its cell."""
+        """Whether the quantum far exceeds the noise; then a reading is an interval, a cell."""
         return self.quantum_c > CELL_SIGMAS * self.noise_sd_c
 
     @property
