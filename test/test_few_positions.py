@@ -173,7 +173,7 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
 
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: with positions cut into rests, which agree, the claimed sd of the offset was 1/20.
+    # WHY: positions cut into rests, which agree, had 1/20 of the true sd of the offset.
     whole, cut = (
         fit([turned(rng, np.repeat(positions(9, 3), n, axis=0))], OPTIONS) for n in (1, 5)
     )
@@ -195,7 +195,7 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
         ]
         return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
 
-    # The cut is in the middle of the fifth position.
+    # The second bag begins in the middle of the fifth position.
     source = turned(rng, positions(9, 3))
     whole = fit([source], OPTIONS)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))

@@ -183,8 +183,8 @@ def export(
     to: Tool = option('Tool whose file to write.', ...),
     output: Path = option('File to write.', ..., '--output', '-o'),
     number: int | None = option(
-        'Number of the set of parameters: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), '
-        'imu0.. of Kalibr (0).',
+        'Number of the set of parameters: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot '
+        '(1), imu0.. of Kalibr (0).',
         min=0,
     ),
     device_id: int = option("PX4's id of the sensor (TC_An_ID), used to match it.", 0),

@@ -70,7 +70,7 @@ def draw_rates(evidence: Evidence) -> Figure:
 def _draw_less_line(
     axes: Axes, calibration: Calibration, drawn: list[Curve], k: int, unit: str
 ) -> None:
-    """Draw column `k` of the curves, with bands, less the line of the soak."""
+    """Draw column `k` of the curves, with bands, less the straight line through the soak."""
     reference, slope = calibration.reference_temperature_c, slopes(drawn[0])[k]
     widest = 0.0
     for curve in drawn:
