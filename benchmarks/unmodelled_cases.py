@@ -111,7 +111,7 @@ def navigation(rng: np.random.Generator, **given: Any) -> Unit:
     drawn = {
         'bias': 1500.0 * rng.standard_normal(3),
         'gain': 0.01 * rng.standard_normal(3),
-        'skew': 1e-3 * rng.standard_normal(3),
+        'misalignment': 1e-3 * rng.standard_normal(3),
         'bias_curve': np.array([signed(rng, 5, 20), 0.08 * rng.standard_normal(3)]),
         'scale_curve': np.array([rng.uniform(30, 90, 3), 0.2 * rng.standard_normal(3)]),
         'case_s': rng.uniform(120, 300),
@@ -127,7 +127,7 @@ def consumer_grade(rng: np.random.Generator) -> Unit:
     return Unit(
         bias=2e4 * rng.standard_normal(3),
         gain=0.01 * rng.standard_normal(3),
-        skew=5e-3 * rng.standard_normal(3),
+        misalignment=5e-3 * rng.standard_normal(3),
         bias_curve=np.array([signed(rng, 50, 400), 2.0 * rng.standard_normal(3)]),
         scale_curve=np.array([signed(rng, 30, 120)]),
         case_s=rng.uniform(100, 200),
@@ -377,7 +377,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     x = np.concatenate(temperatures)[:, None]
     position = np.repeat(np.arange(n), [len(celsius) for celsius in temperatures])
     p = np.concatenate((
-        1e-6 * unit.bias, unit.gain, unit.skew, 1e-6 * unit.bias_curve.ravel(),
+        1e-6 * unit.bias, unit.gain, unit.misalignment, 1e-6 * unit.bias_curve.ravel(),
         1e-6 * unit.scale_curve.ravel(), np.zeros(2 * n),
     ))  # fmt: skip
 

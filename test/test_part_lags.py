@@ -216,7 +216,7 @@ def test_six_faces_in_three_soaks(given):
     # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
     # unit with drifts of 10 mg left 40 mg. With a stated repeatability the fit divided by zero.
     rng = rng_of('faces in soaks', 1)
-    unit = replace(consumer_grade(rng), skew=np.zeros(3))
+    unit = replace(consumer_grade(rng), misalignment=np.zeros(3))
     faces = np.vstack((np.eye(3), -np.eye(3))).repeat(3, axis=0)
     bags = positions(unit, SOAKS, faces, rng, rate_hz=10.0)
     held = positions(unit, program(19.0, 90.0), spread(2, rng), rng, rate_hz=10.0)

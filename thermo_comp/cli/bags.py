@@ -125,12 +125,12 @@ def _calibration(out: Output, path: Path) -> None:
                 for n in provenance.residuals
             ],
         )
-    tell_nonlinearity(out, calibration)
+    print_nonlinearity(out, calibration)
     out.points(provenance.notes)
     out.end(path=path, calibration=calibration)
 
 
-def tell_nonlinearity(out: Output, calibration: 'Calibration') -> None:
+def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
     """Print the nonlinear terms, if rests of a fit were not all at 1 g."""
     from ..unit.prediction import nonlinear_coefficients
 

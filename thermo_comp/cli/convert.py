@@ -85,7 +85,7 @@ def convert(
     with out.progress('converting') as done:
         with flags_named():
             read = read_log(log, **given)
-        tell_guess(out, read, {})
+        print_guess(out, read, {})
         report = write_log(read, output, force, done)
     _print_conversion(out, report, output)
     written, further = report.log, dict(report.messages)
@@ -146,7 +146,7 @@ def flags_named() -> Iterator[None]:
             raise ValueError(flag) from mistake
 
 
-def tell_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
+def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     """
     Print a guessed column map, or name the log of `shown` whose printed map is the same; print the
     columns of a table that are not used, unless they are those of a log of `shown`.

@@ -65,7 +65,7 @@ def fleet_fit(
     state = 'no test has begun'
     with out.progress('fitting') as show:
 
-        def tell(n: int, total: int, _row: object) -> None:
+        def progress(n: int, total: int, _row: object) -> None:
             nonlocal state
             state = f'{n} of {counted(total, "test")} done'
             show(n / total)
@@ -79,7 +79,7 @@ def fleet_fit(
                 scheduler=scheduler,
                 n_workers=workers,
                 earlier=before,
-                tell=tell,
+                progress=progress,
             )
         except KeyboardInterrupt:
             out.note(f'interrupted: {state}, kept in {output}; the same command continues')

@@ -77,7 +77,7 @@ def evaluate(
         with table_writer(csv, {}, overwrite=force) as write:
             write(columns_of(judged.windows, list(map(shown_name, bags))))
     drifts = drifts_of(history_of([model for _, model in models]))
-    tell_sections(out, result.judgements)
+    print_sections(out, result.judgements)
     _print_axes(out, judged)
     _print_levels(out, judged)
     rates = {k: judged.rate for k, judged in result.judgements.items() if judged.rate is not None}
@@ -148,7 +148,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
         )
 
 
-def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:
+def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     """Print the residuals of |f| of each calibration."""
     (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(

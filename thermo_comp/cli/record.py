@@ -265,9 +265,9 @@ def _lines(account: 'Account') -> list[str]:
     from ..fitting.coverage import direction_text
 
     lines = [_accuracy(account)]
-    if account.hole_deg > 0.0:
-        where = direction_text(account.hole)
-        lines.append(f'no position within {account.hole_deg:.0f} deg of {where}')
+    if account.farthest_deg > 0.0:
+        where = direction_text(account.farthest_up)
+        lines.append(f'no position within {account.farthest_deg:.0f} deg of {where}')
     for name, survey in account.thermometers.items():
         lines.append(
             f'{name} {survey.lowest:.1f} .. {survey.highest:.1f} degC, ramps '

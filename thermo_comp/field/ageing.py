@@ -116,7 +116,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
         # rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
-        summed = (series.miss, series.by_parameter, series.by_level, series.lack)
+        summed = (series.residual, series.by_parameter, series.by_level, series.lack)
         parts.append(
             (
                 *(np.full(n, series.time[at].mean()), np.full(n, start)),

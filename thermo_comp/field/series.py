@@ -46,10 +46,10 @@ class Series:
     """
     Rests in order of time, (n,) and (n, ...); accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the start; `direction`: v; `force`: x; `miss`:
+    `time`: days since 1970; `start`: number of the start; `direction`: v; `force`: x; `residual`:
     ``|f| - g``; `by_parameter`: H, (n, n_parameters); `by_level`: derivatives by the bias of each
     axis and by its scale times g, (n, 6); `noise`: variance of one rest by samples and
-    thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of `miss`.
+    thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of `residual`.
     """
 
     time: Floats
@@ -58,7 +58,7 @@ class Series:
     state: Floats
     direction: Floats
     force: Floats
-    miss: Floats
+    residual: Floats
     by_parameter: Floats
     by_level: Floats
     noise: Floats
@@ -232,7 +232,7 @@ def series_of(
         state=states,
         direction=v,
         force=x,
-        miss=size - local,
+        residual=size - local,
         by_parameter=_by_parameter(calibration, correction, states, u, v, x, scale),
         by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
         noise=noise + np.maximum(slow, 0.0),

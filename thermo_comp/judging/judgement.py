@@ -247,10 +247,10 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     rows = np.vstack(
         (rows, np.eye(9)[6:] / np.maximum(misalignment_sd, _SMALLEST_MISALIGNMENT_SD)[:, None])
     )
-    misses = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
-    shift = np.linalg.lstsq(rows, misses, rcond=None)[0]
+    residuals = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
+    shift = np.linalg.lstsq(rows, residuals, rcond=None)[0]
     # Residuals in excess of the claimed errors increase the sd of the shifts.
-    freedom, left = len(sd) - 6, float(np.sum((misses - rows @ shift) ** 2))
+    freedom, left = len(sd) - 6, float(np.sum((residuals - rows @ shift) ** 2))
     excess = max(1.0, left / freedom) if freedom > 0 else 1.0
     spread = np.sqrt(np.diag(np.linalg.pinv(rows.T @ rows)) * excess)
     bias, scale = (np.stack((shift[k], spread[k]), axis=1) for k in (slice(3), slice(3, 6)))

@@ -18,7 +18,7 @@ from ..recording.topics import Topics, is_thermometer, split_field
 from ..recording.wire import Feed, decode_blocks
 from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .messages import LiveField, live_field, message_class
-from .waitloop import RawSubscription, WaitLoop, own_node
+from .waitloop import RawSubscription, WaitLoop, separate_node
 
 #: Interval of the search for publishers, and of the blocks [s].
 SEARCH_S, BLOCK_S = 0.5, 1.0
@@ -44,7 +44,7 @@ class LiveTopics:
 
     def __enter__(self) -> LiveTopics:
         with ExitStack() as stack:
-            self._node = stack.enter_context(own_node(NODE_NAME, self._ros_args))
+            self._node = stack.enter_context(separate_node(NODE_NAME, self._ros_args))
             self._loop = WaitLoop(self._node)
             self._find_topics()
             self._loop.call_every(SEARCH_S, self._find_topics)

@@ -342,7 +342,7 @@ def _take_message(subscription: Subscription) -> bool:
 
 
 @contextmanager
-def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
+def separate_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
     """Open a node in a separate context."""
     context = rclpy.context.Context()
     rclpy.init(args=['--ros-args', *ros_args], context=context)

@@ -134,10 +134,10 @@ class ThermalNetwork:
         """
         i = self.nodes.index(node)
 
-        def miss(air: Floats) -> float:
+        def error(air: Floats) -> float:
             return float(self.equilibrium(air[0])[i] - temperature)
 
-        return float(root(miss, 0.0, tol=1e-13).x[0])
+        return float(root(error, 0.0, tol=1e-13).x[0])
 
 
 class ThermalResponse:

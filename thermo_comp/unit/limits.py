@@ -36,7 +36,7 @@ _GRID = 513
 _AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
 
 
-def check_reach(calibration: Calibration, layout: ParameterLayout) -> None:
+def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
     """Raise ValueError, with the key's name, if a part of a calibration exceeds its limits."""
     reference, sets = calibration.reference_temperature_c, calibration.regime_sets()
     most = FULL_SCALES * calibration.unit.full_scale
