@@ -186,7 +186,7 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
 
 
 def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
-    # WHY: twelve recordings, three cut in two, claimed half the sd of the bias.
+    # WHY: a fit of twelve recordings, three cut in two, claimed half the true sd of the bias.
     def cut(source, at, pause_s):
         (whole,) = source.blocks()
         arrays = [

@@ -333,7 +333,7 @@ class Tool:
     write: Callable[[Content, int | None, int], str]
     read: Callable[[str, int | None], Content | None]  # None for a text of another kind
     is_thermal: bool = False
-    reference_c: float | None = None  # the fixed reference of an autopilot
+    reference_c: float | None = None  # the fixed reference temperature of an autopilot
 
 
 TOOLS = {
