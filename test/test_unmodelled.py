@@ -202,7 +202,7 @@ def curved_unit():
     )  # fmt: skip
 
 
-def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
+def test_a_cubic_by_scipy_finds_a_cubic_and_constants_do_not():
     given = curved_unit()
     fit, held = (
         of_attitudes(given, np.linspace(5, 35, 7)),
@@ -217,7 +217,7 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
     assert constants.vector > 50.0
 
 
-def test_constants_by_hand_bound_the_scale_of_few_attitudes():
+def test_constants_by_scipy_bound_the_scale_of_few_attitudes():
     # Without a bound on the scale, a fit to one noisy attitude makes all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
@@ -241,7 +241,7 @@ def test_a_bias_at_the_reference_is_held_against_its_bound():
     assert score.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
 
 
-def test_a_cubic_by_hand_finds_a_pose_s_drift():
+def test_a_cubic_by_scipy_finds_a_pose_s_drift():
     given = replace(curved_unit(), scale_curve=ZEROS)
     minutes_ = [
         of_attitudes(given, board) for board in (np.linspace(5, 35, 31), np.array([9.0, 22]))

@@ -95,7 +95,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
             continue
         sizes = 3000, len(data.time)
         subset, full = (_PartCurves(windows, start, shape, n) for n in sizes)
-        lags = [subset.near(lag, axis) for axis, lag in enumerate(searched)]
+        lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
         residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
@@ -206,7 +206,7 @@ class _PartCurves:
             best = self._better(axis, best, self._searched(axis, first, (0.2, 0.4, 0.3)))
         return best
 
-    def near(self, lag: Part, axis: int) -> Part:
+    def refined(self, lag: Part, axis: int) -> Part:
         """Return the lag with the smallest RMS residual in the neighbourhood of a lag."""
         if not lag.tau_s:
             return lag

@@ -28,7 +28,7 @@ _SURE_SDS = 3.0
 # |f|.
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_MISS = 1e-5, 1e-8
 # Number of consecutive windows that count as one, since thermal residuals are correlated.
-_ALIKE = 6.0
+_CORRELATED_WINDOWS = 6.0
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     residual = windows.residual
     scatter = means_by(windows.position, residual**2) - means_by(windows.position, residual) ** 2
     count = np.unique(windows.position, return_counts=True)[1]
-    variance = 1.0 / known + scatter / np.maximum(count / _ALIKE, 1.0)
+    variance = 1.0 / known + scatter / np.maximum(count / _CORRELATED_WINDOWS, 1.0)
     sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_MISS)
     # The equations of the norms, and of the misalignment's prior, are linear in the small shifts.
     sizes = np.linalg.norm(force, axis=1)
