@@ -63,8 +63,8 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
         at_work = [term.during in ('always', regime) for term in response]
         for k, (name, axis) in enumerate(zip('xyz', part.axes(), strict=True)):
             terms = zip(response, sizes, at_work, strict=True)
-            most = sum(abs(term.scale[k]) * size for term, size, is_at_work in terms if is_at_work)
-            _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), most)
+            gain = sum(abs(term.scale[k]) * size for term, size, is_at_work in terms if is_at_work)
+            _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), gain)
         for name, at, axis in zip('xyz', calibration.axes, part.axes(), strict=True):
             reached = _extremes(axis.bias_function, ends)
             _check_bias(f'{regime}.{name}', at.bias + axis.delta, reached, most)
@@ -114,13 +114,13 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
         )
 
 
-def _check_scale(key: str, reached: tuple[float, float], most: float) -> None:
+def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
     """
-    Refuse a relative scale that exceeds its limits when the columns add up to `most` or -`most`.
+    Refuse a relative scale that exceeds its limits when the columns add up to `gain` or -`gain`.
     """
     for word, value, is_kept, limit in (
-        ('above', reached[0] - most, operator.gt, SMALLEST_RELATIVE_SCALE),
-        ('below', reached[1] + most, operator.lt, LARGEST_RELATIVE_SCALE),
+        ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
+        ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),
     ):
         if not is_kept(value, limit):
             raise ValueError(
