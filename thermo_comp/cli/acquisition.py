@@ -247,12 +247,12 @@ class Acquisition:
                 Position(up, rest.still_s, rest.n_rests, float(sd), rest.surveys, reason)
             )
         known = [position for position in positions if np.isfinite(position.up).all()]
-        up = np.array([position.up for position in known]).reshape(-1, 3)
+        ups = np.array([position.up for position in known]).reshape(-1, 3)
         sds = np.array([position.sd_g for position in known])
-        covariance = coverage.constants_covariance(up, sds, misalignment_sd)
-        next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, up)
+        covariance = coverage.constants_covariance(ups, sds, misalignment_sd)
+        next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, ups)
         now, is_still = self._now(cells)
-        farthest_up, farthest_deg = coverage.farthest(up)
+        farthest_up, farthest_deg = coverage.farthest(ups)
         n_good = sum(not position.reason for position in positions)
         thermometers = _together([rest.surveys for rest in rests])
         missing = self._n_wanted - n_good
