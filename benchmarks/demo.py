@@ -21,7 +21,7 @@ os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 from live_node import through_the_node
 
 from thermo_comp.api import fit
-from thermo_comp.cli.judge import tell_sections
+from thermo_comp.cli.judge import print_sections
 from thermo_comp.cli.output import Output
 from thermo_comp.judging.evaluation import evaluate
 from thermo_comp.recording.reader import open_recording
@@ -70,7 +70,7 @@ def demo(folder: Path, output: Path) -> bool:
     judged = [(name, models[name]) for name in reversed(MODELS)]
     result = evaluate([held_out], judged, gravity=STANDARD_GRAVITY)
     out.line()
-    tell_sections(out, result.judgements)
+    print_sections(out, result.judgements)
     out.line('one set: one cubic for both regimes; two sets: a cubic for each regime, as in the')
     out.line('paper; node: two sets and the thermal response that the fit selects')
     page, figures = output / 'report.html', output / 'figures'

@@ -53,7 +53,7 @@ LABORATORY = calibration()
 
 
 def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, Floats]:
-    """Build noiseless rests of use: rests, counts [K], warmth [K], true forces."""
+    """Build rests in use without noise: rests, counts / K, board temperature [K], true forces."""
     rng = np.random.default_rng(seed)
     force = G * np.array([attitude(kind, rng) for _ in range(N_PROBES)])
     warmth = rng.normal(0.0, 5.0, N_PROBES)
@@ -70,7 +70,7 @@ def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, F
 def errors_of(series: Series, calibrated: Calibration, force: Floats) -> Floats:
     """Return the errors of |f| and of the axes x, y, z, shape (n, 4)."""
     f = series.force @ np.array(calibrated.misalignment).T
-    return np.column_stack((series.miss, f - force))
+    return np.column_stack((series.residual, f - force))
 
 
 def root_mean(values: Floats) -> float:
@@ -94,7 +94,7 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     weights = old.n_windows / np.bincount(old.start, old.n_windows)[old.start]
     n_starts = int(old.start[-1]) + 1
     before, *later = (
-        np.sqrt(weights @ miss**2 / n_starts) for miss in (old.miss, updated.miss, of_best)
+        np.sqrt(weights @ x**2 / n_starts) for x in (old.residual, updated.residual, of_best)
     )
     error = root_mean(updated.claim) / np.sqrt(2.0 * n_starts)
     found = [bool(rms > before + error) for rms in later]
@@ -162,7 +162,7 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
             'after': errors_of(series, new, force),
             'best': of_best,
             'claimed': series.claim[:, None],
-            'missed': (series.miss + more)[:, None],
+            'missed': (series.residual + more)[:, None],
         },
         compared,
         took,

@@ -112,7 +112,7 @@ def judge_recordings(folder: Path) -> None:
                 n_written += updated.judged.is_better
                 best = updated.calibration if updated.judged.is_better else calibration
                 for rms, used in ((old, calibration), (new, best)):
-                    rms.append(float(np.sqrt(np.mean(series_of(parts[k], used).miss ** 2))))
+                    rms.append(float(np.sqrt(np.mean(series_of(parts[k], used).residual ** 2))))
             mg = [1e3 * np.sqrt(np.mean(np.square(rms))) / GRAVITY for rms in (old, new)]
             n_worse = sum(b > 1.001 * a for a, b in zip(old, new, strict=True))
             print(

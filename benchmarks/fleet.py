@@ -250,13 +250,13 @@ def kill(folder: Path, n_units: int, model: str) -> int:
     try:
         with connected(None, 2) as client:
 
-            def tell(n: int, total: int, _row: Row | None) -> None:
+            def report(n: int, total: int, _row: Row | None) -> None:
                 if n in (total // 4, total // 2):
                     killed.append(max(client.run(os.getpid).values()))
                     os.kill(killed[-1], signal.SIGKILL)
 
             began = time.perf_counter()
-            result = fit_fleet(str(fleet), fleet / '.out', options, client=client, tell=tell)
+            result = fit_fleet(str(fleet), fleet / '.out', options, client=client, progress=report)
             seconds = time.perf_counter() - began
     finally:
         shutil.rmtree(fleet)

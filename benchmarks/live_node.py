@@ -25,7 +25,7 @@ from thermo_comp.recording.writer import BagWriter
 from thermo_comp.ros.messages import message_class
 from thermo_comp.ros.node import CompensationNode
 from thermo_comp.ros.player import PlayReport, opened_player
-from thermo_comp.ros.waitloop import WaitLoop, own_node, wait_until
+from thermo_comp.ros.waitloop import WaitLoop, separate_node, wait_until
 from thermo_comp.topics import FLAGS, IMU_OUT, OUTPUTS, SAMPLES, thermometer
 from thermo_comp.unit.calibration_file import load_calibration
 
@@ -78,7 +78,7 @@ class Recorder:
 
     def __enter__(self) -> Recorder:
         with ExitStack() as stack:
-            loop = WaitLoop(stack.enter_context(own_node('recorder', self._ros_args)))
+            loop = WaitLoop(stack.enter_context(separate_node('recorder', self._ros_args)))
             self._heard = {
                 topic.name: loop.subscribe(message_class(topic.type), topic.name, EVERYTHING)
                 for topic in OUTPUTS

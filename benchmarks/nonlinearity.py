@@ -93,7 +93,7 @@ class Run:
 def run(
     unit: Unit, inward: Floats, rng: np.random.Generator, levels: tuple[float, ...] = LEVELS_G
 ) -> Run:
-    """Run a mounting through the soaks and levels."""
+    """Simulate a centrifuge run of one mounting: in each soak 1 g, then the levels of |f|."""
     knots, air = [0.0], [SOAKS_C[0]]
     for last, target in zip((SOAKS_C[0], *SOAKS_C), (*SOAKS_C, SOAKS_C[-1]), strict=False):
         if target != last:
@@ -161,7 +161,7 @@ def fitted(runs: list[Run], **options: float) -> Calibration:
     return fit(sources, wanted).calibration
 
 
-def left(calibration: Calibration, one: Run, level: float) -> float:
+def residual_ug(calibration: Calibration, one: Run, level: float) -> float:
     """Return the RMS vector error of 60 s means at one |f| [ug]."""
     compensator = Compensator(calibration, UNCHECKED)
     corrected = process_block(compensator, one.block)
@@ -207,8 +207,8 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     # The new mounting is nearly along an axis, where the terms are largest.
     direction = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
     new = run(unit, direction / np.linalg.norm(direction), rng, (5.0,))
-    result['after'] = np.array([left(calibration, new, 5.0)])
-    result['before'] = np.array([left(without_terms(calibration), new, 5.0)])
+    result['after'] = np.array([residual_ug(calibration, new, 5.0)])
+    result['before'] = np.array([residual_ug(without_terms(calibration), new, 5.0)])
     return result
 
 

@@ -9,8 +9,8 @@ log.
 The node runs in this process, source and sink of samples in two others; the rest log is on in even
 seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because a shared
 machine changes its pace. The latency runs from the source's publish call to the arrival in the
-sink's middleware. The wall time of one block of sums is the longest time for which the block can
-delay a sample.
+sink's middleware. A block of samples that is summed delays the next sample by at most the wall
+time of the sum, which is printed.
 """
 
 from __future__ import annotations
@@ -117,8 +117,8 @@ def _compared(with_log: Floats, without: Floats, unit: str) -> str:
     more, usual = with_log[:n] - without[:n], float(np.median(without))
     # Use the median: a second in which the host stops the machine has a large latency.
     sd = 1.2533 * 1.4826 * float(np.median(np.abs(more - np.median(more)))) / np.sqrt(n)
-    away = float(np.median(more))
-    return f'{usual:.3g} {unit} without, {away / usual:+.1%} +- {sd / usual:.1%} with the log'
+    change = float(np.median(more))
+    return f'{usual:.3g} {unit} without, {change / usual:+.1%} +- {sd / usual:.1%} with the log'
 
 
 def main() -> None:

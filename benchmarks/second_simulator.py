@@ -92,7 +92,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
     unit = SimpleNamespace(
         scale_factor=4e5 * (1.0 + 0.01 * draw.standard_normal(3)),
         constant=normal(1500.0),
-        skew=normal(1e-3),
+        misalignment=normal(1e-3),
         case_s=draw.uniform(100, 300),
         board_s=draw.uniform(350, 900),
         own_heat_k=draw.uniform(0.5, 2.0),
@@ -216,7 +216,7 @@ def runs_of(
     scale = sum(c * x ** (k + 1) for k, c in enumerate(unit.scale))
     scale = scale + (unit.scale_stress[0] + unit.scale_stress[1] * x) * behind
     scale = scale + unit.load[1] * change[:, :, None]
-    a, b, c = unit.skew
+    a, b, c = unit.misalignment
     aligned = np.linalg.inv(np.array([[1.0, 0.0, 0.0], [a, 1.0, 0.0], [b, c, 1.0]]))
     middle = np.arange(0.0, lasts_s, SAMPLE_S) + 0.5 * SAMPLE_S
     read = np.arange(0.0, lasts_s, READING_S) + 0.1

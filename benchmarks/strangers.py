@@ -176,9 +176,9 @@ def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
     return np.concatenate([error - error.mean(axis=0) for error in errors])
 
 
-def by_hand(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
+def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
     """Fit constants and a cubic per axis by scipy."""
-    bags = [minutes(bag) for bag in study.by_hand or study.bags]
+    bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
         # One pose does not determine the scale factors: take the norm of the samples over gravity.
@@ -297,7 +297,7 @@ def run(
         for test, result in scored(study, calibration, tests).items():
             scores[test][model] = result
     if has_baselines and not all(known.values()):
-        for model, correct in by_hand(study).items():
+        for model, correct in scipy_baselines(study).items():
             for test, bags in tests.items():
                 forces = [correct(bag) for bag in bags]
                 scores[test][model] = error_of(forces, bags, is_drift=study.is_drift)

@@ -76,7 +76,7 @@ class Study:
     is_drift : bool
         Whether the evaluated error is that of each axis less its mean over the bag, as for one
         pose.
-    by_hand : tuple of Bag
+    baseline_bags : tuple of Bag
         Bags at rest for the curves by scipy; if empty, these are the bags of the fit.
     bound : Bound or None
         Cramer-Rao bound of the bias, for studies that evaluate the bias instead of the force.
@@ -90,7 +90,7 @@ class Study:
     gravity: float = GRAVITY
     prior_of: str = ''
     is_drift: bool = False
-    by_hand: tuple[Bag, ...] = ()
+    baseline_bags: tuple[Bag, ...] = ()
     bound: Bound | None = None
 
 
@@ -111,7 +111,7 @@ def navigation(rng: np.random.Generator, **given: Any) -> Unit:
     drawn = {
         'bias': 1500.0 * rng.standard_normal(3),
         'gain': 0.01 * rng.standard_normal(3),
-        'skew': 1e-3 * rng.standard_normal(3),
+        'misalignment': 1e-3 * rng.standard_normal(3),
         'bias_curve': np.array([signed(rng, 5, 20), 0.08 * rng.standard_normal(3)]),
         'scale_curve': np.array([rng.uniform(30, 90, 3), 0.2 * rng.standard_normal(3)]),
         'case_s': rng.uniform(120, 300),
@@ -122,12 +122,12 @@ def navigation(rng: np.random.Generator, **given: Any) -> Unit:
     return Unit(**{**drawn, **given})
 
 
-def cheap(rng: np.random.Generator) -> Unit:
+def consumer_grade(rng: np.random.Generator) -> Unit:
     """Draw a MEMS unit with one thermometer, on the die."""
     return Unit(
         bias=2e4 * rng.standard_normal(3),
         gain=0.01 * rng.standard_normal(3),
-        skew=5e-3 * rng.standard_normal(3),
+        misalignment=5e-3 * rng.standard_normal(3),
         bias_curve=np.array([signed(rng, 50, 400), 2.0 * rng.standard_normal(3)]),
         scale_curve=np.array([signed(rng, 30, 120)]),
         case_s=rng.uniform(100, 200),
@@ -215,7 +215,7 @@ def mems(number: int) -> Iterator[Study]:
     for n in (9, 12, 18):
         for sd in (100, 300, 1000):
             rng = rng_of('mems', n, sd, number)
-            unit = cheap(rng)
+            unit = consumer_grade(rng)
             # At 10 Hz the noise is as large as a count, so that rounding leaves no bias.
             fit, held = (
                 positions(
@@ -377,11 +377,11 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     x = np.concatenate(temperatures)[:, None]
     position = np.repeat(np.arange(n), [len(celsius) for celsius in temperatures])
     p = np.concatenate((
-        1e-6 * unit.bias, unit.gain, unit.skew, 1e-6 * unit.bias_curve.ravel(),
+        1e-6 * unit.bias, unit.gain, unit.misalignment, 1e-6 * unit.bias_curve.ravel(),
         1e-6 * unit.scale_curve.ravel(), np.zeros(2 * n),
     ))  # fmt: skip
 
-    def seen(p: Any) -> Any:
+    def modelled(p: Any) -> Any:
         """Model of the samples in g, analytic in all unknowns."""
         a, b, c = p[6:9]
         u = up + np.einsum('pk,pki->pi', p[21:].reshape(n, 2), tangents)
@@ -396,7 +396,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     for k in range(len(p)):
         step = p.astype(complex)
         step[k] += 1e-30j
-        columns.append(seen(step).imag.ravel() / 1e-30)
+        columns.append(modelled(step).imag.ravel() / 1e-30)
     noise = 1e-6 * unit.density / np.sqrt(window_s)
     J = np.array(columns).T / noise
     size = np.linalg.norm(J, axis=0)

@@ -73,7 +73,8 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    The limits of a row; the defaults limit the error by that of the baselines, and the ratio.
+    The limits of a row; the defaults limit the error by that of the best baseline, and the ratio
+    of error to claim.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the recorded cases of the benchmark `strangers.py`: sample bags, without the case thermometer,
-and the recording of a real unit, which is distributed with another package and not with this one.
+Owns the recorded cases of the benchmark `strangers.py`: the sample bags, with and without the
+case thermometer, and a recording of a real unit, which another package distributes.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def cats(path: Path) -> Iterator[Study]:
     for parity, name in enumerate(('even to odd', 'odd to even')):
         tests = {'': tuple(still[1 - parity])}
         bags = tuple(bag for number, bag in blocks.items() if number % 2 == parity)
-        yield Study(name, bags, tests, options, by_hand=tuple(still[parity]))
+        yield Study(name, bags, tests, options, baseline_bags=tuple(still[parity]))
     for k, rest in enumerate(rests):
         others = tuple(rests[:k] + rests[k + 1 :])
         yield Study('rests left out', others, {'': (rest,)}, options)

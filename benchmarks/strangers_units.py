@@ -56,7 +56,7 @@ class Unit:
 
     Parameters
     ----------
-    bias, gain, skew : ndarray, shape (3,)
+    bias, gain, misalignment : ndarray, shape (3,)
         Bias [ug] and relative error of the scale at the reference; the lower triangle of M.
     bias_curve, scale_curve : ndarray, shape (order, 3)
         Powers 1, 2, ... of the part's temperature less the reference [ug/K^n], [ppm/K^n].
@@ -89,7 +89,7 @@ class Unit:
 
     bias: Floats
     gain: Floats
-    skew: Floats
+    misalignment: Floats
     bias_curve: Floats
     scale_curve: Floats
     kink: Floats = field(default_factory=_zeros)
@@ -131,7 +131,7 @@ class Unit:
 
     def sensed(self, force: Floats) -> Floats:
         """Project forces, shape (n, 3), on the sensitivity axes: the inverse of M."""
-        a, b, c = self.skew
+        a, b, c = self.misalignment
         M = np.array([[1.0, 0.0, 0.0], [a, 1.0, 0.0], [b, c, 1.0]])
         return np.asarray(force @ np.linalg.inv(M).T)
 

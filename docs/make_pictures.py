@@ -187,7 +187,11 @@ def draw_year(axes: Axes) -> None:
         old, new = (series_of(chosen, cal) for cal in (laboratory, calibrated))
         for one in np.unique(new.day):
             at = new.day == one
-            for name, values in (('old', old.miss), ('new', new.miss), ('claim', new.claim)):
+            for name, values in (
+                ('old', old.residual),
+                ('new', new.residual),
+                ('claim', new.claim),
+            ):
                 error[name].append(float(np.sqrt(np.mean(values[at] ** 2))) / units.UG)
         updated = update(new, calibrated, source_of(chosen, '', 7.0), ahead=7.0)
         if updated.judged.is_better:

@@ -153,7 +153,7 @@ def test_a_dead_sensor_has_no_direction():
     assert test.add(Block(stamp_ns, np.zeros((3000, 3)), '', None, {}, log_ns)) == []
     account = test.account()
     assert [position.reason for position in account.positions] == ['reads zero']
-    assert (account.n_good, account.hole_deg) == (0, 180.0)
+    assert (account.n_good, account.farthest_deg) == (0, 180.0)
 
 
 def test_unsigned_words_have_their_zero_in_mid_range(stream):

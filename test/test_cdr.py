@@ -17,7 +17,7 @@ from sensor_msgs.msg import Imu, Temperature
 from thermo_comp.ros.conversion import SampleConverter, read_temperature
 
 floats = st.floats(allow_nan=True, allow_infinity=True, width=64)
-# No NUL, which ends a string in CDR, and no lone surrogates, which have no UTF-8.
+# Frame names without NUL, which ends a string in CDR, and without characters outside UTF-8.
 frames = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
 
 

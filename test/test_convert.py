@@ -284,7 +284,7 @@ class TestColumnMap:
         ('changes', 'key', 'message'),
         [
             ({'further': [{'name': 'case', 'column': 'c'}]}, 'further[0].name',
-             'serve in a topic'),
+             'fit into a topic'),
             ({'further': [{'name': 'a', 'column': column} for column in 'bc']}, None,
              'two thermometers of one'),
             ({'stamp': {'column': 't'}}, 'stamp.unit', 'iso if `column` is given'),

@@ -308,7 +308,7 @@ def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermom
 
 @pytest.mark.parametrize(('last', 'unit'), [(3, None), (1200, None), (40, 'degC')])
 def test_whole_numbers_of_a_board_may_be_its_temperature(tmp_path, last, unit):
-    # The number of a board, a count of rows, whole degrees.
+    # Values of `board`: the number of a board, a count of rows, whole degrees.
     rows = [f'{k / 10},0,6,8,{3 + k * (last - 3) // 1199}' for k in range(1200)]
     (tmp_path / 'log.csv').write_text('\n'.join(['time,ax,ay,az,board', *rows]))
     board = guess_columns(tmp_path / 'log.csv').board

@@ -188,7 +188,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
             # A covariance from n draws has an sd of at most sqrt(2 / n) times both sds: 4 sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
-            # Along every direction, too: the correlations of the axes are not lost.
+            # The variances agree along all directions, so the axes have the right correlations.
             root = np.linalg.inv(np.linalg.cholesky(expected))
             assert np.abs(root @ claimed @ root.T - np.eye(3)).max() < 0.5
 

@@ -67,7 +67,7 @@ LAYOUTS = {
 }
 #: Drivers without a temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
-#: Drivers whose bags are fitted, in addition to `LACKS`: one driver for each kind of message.
+#: Drivers with a temperature whose bags are fitted: one driver for each kind of message.
 FITTED = {'xsens', 'mavros', 'px4', 'phidgets'}
 #: Six faces and the first face again, for REST_S each, while the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))

@@ -173,7 +173,7 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
 
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: with positions cut into rests, which agree, the claimed sd of the offset was 1/20.
+    # WHY: positions cut into rests, which agree, had 1/20 of the true sd of the offset.
     whole, cut = (
         fit([turned(rng, np.repeat(positions(9, 3), n, axis=0))], OPTIONS) for n in (1, 5)
     )
@@ -186,7 +186,7 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
 
 
 def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
-    # WHY: twelve recordings, three cut in two, claimed half the sd of the bias.
+    # WHY: a fit of twelve recordings, three cut in two, claimed half the true sd of the bias.
     def cut(source, at, pause_s):
         (whole,) = source.blocks()
         arrays = [
@@ -195,7 +195,7 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
         ]
         return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
 
-    # The cut is in the middle of the fifth position.
+    # The second bag begins in the middle of the fifth position.
     source = turned(rng, positions(9, 3))
     whole = fit([source], OPTIONS)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
@@ -208,7 +208,7 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
 
 
 def test_a_calibration_has_the_date_of_its_test(rng):
-    # WHY: old bags, fitted today, dated the calibration of today, and its ageing began today.
+    # WHY: a calibration fitted today to old bags had the date of today, and no ageing.
     source = turned(rng, positions(9, 3))
     provenance = fit([source], OPTIONS).calibration.provenance
     assert provenance.date == provenance.tested == '2023-11-14T22:16:28Z'
@@ -254,7 +254,7 @@ def test_three_positions_do_not_show_which_constants_have_aged(rng):
 
 
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng):
-    # WHY: recordings of six faces, 1 mg apart, were explained by misalignments of 20 mrad.
+    # WHY: misalignments of 20 mrad explained recordings of six faces whose biases differ by 1 mg.
     faces = np.vstack((np.eye(3), -np.eye(3)))
     bags = []
     for _ in range(3):
@@ -263,7 +263,7 @@ def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng):
         bags.append(turned(rng, ups + 1e-3 * rng.standard_normal(3)))
     calibration = fit(bags, OPTIONS).calibration
     a, b, c = (calibration.misalignment[i][j] for i, j in ((1, 0), (2, 0), (2, 1)))
-    # The prior sd is 2.5 mrad for the estimate, 10 mrad in the covariance.
+    # The prior sd of a misalignment is 2.5 mrad for the estimate, 10 mrad in the covariance.
     assert max(abs(a), abs(b), abs(c)) < 5e-3
     assert min(calibration.misalignment_sd) > 5e-3
 

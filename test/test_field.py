@@ -72,13 +72,15 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
-        miss = series_of(logged, with_parameters(unit, scale, moved, covariance)).miss
-        slope = (series.miss - miss) / step
+        residual = series_of(logged, with_parameters(unit, scale, moved, covariance)).residual
+        slope = (series.residual - residual) / step
         assert np.allclose(slope, series.by_parameter[:, k], atol=2e-4 * abs(slope).max() + 1e-9)
     for axis, block in enumerate(layout.scale):
         factor = np.where(np.arange(3) == axis, 1.0 + 1e-6, 1.0)
-        miss = series_of(logged, with_parameters(unit, scale * factor, values, covariance)).miss
-        slope = (series.miss - miss) / 1e-6
+        residual = series_of(
+            logged, with_parameters(unit, scale * factor, values, covariance)
+        ).residual
+        slope = (series.residual - residual) / 1e-6
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
@@ -146,8 +148,8 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_their_errors():
         new = series_of(
             [(start, replace(rest, mean=tuple(counts), state=thermal))], updated.calibration
         )
-        squares.append((float(after.miss[0]), float(new.miss[0])))
-        ratios.append(float(new.miss[0] / new.claim[0]))
+        squares.append((float(after.residual[0]), float(new.residual[0])))
+        ratios.append(float(new.residual[0] / new.claim[0]))
         if kind == 'level':
             assert abs(updated.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
     before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
@@ -284,7 +286,7 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'
     again = cli('evaluate', log, '-c', new)
-    assert '240 windows took part in its last update' in again.stdout
+    assert '240 windows took part in the last update' in again.stdout
     again = cli('update', new, log, '-o', tmp_path / 'newer.yaml', code=1)
     assert 'has been updated with all of these rests' in again.stderr
 

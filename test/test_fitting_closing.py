@@ -124,7 +124,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # The threshold has a false alarm rate of 1 % per series; none of these series exceeds it.
+    # Slow noise is found in 1 % of white series by chance; in none of the ten series here.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))

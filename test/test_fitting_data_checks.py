@@ -82,7 +82,7 @@ def test_a_complete_thermal_test_has_only_good_findings(good):
         # WHY: soaks at one temperature left 800 ug at others, with a claimed sd of 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},
          r'% of the windows are static, over [56]\.\d of \d\d\.\d K'),
-        ('swapped', lambda w: {'gradient': -w.gradient}, r'exchanged, or is that of the case'),
+        ('swapped', lambda w: {'gradient': -w.gradient}, r'exchanged, or is the case thermometer'),
     ],
 )  # fmt: skip
 def test_missing_data_of_a_test_are_reported(good, name, changed, message):
@@ -137,7 +137,7 @@ def test_six_faces_do_not_determine_the_misalignment(good):
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
     assert not determines_misalignment(np.vstack((faces, tilted)))
-    # Few and badly spread positions do not either.
+    # Five positions determine less; positions in a plane do not determine the misalignment.
     message = findings_of(windows, up[:5])['positions'].message
     assert '5 positions: bias and scale cannot be separated' in message
     flat = np.column_stack((np.cos(np.arange(12.0)), np.sin(np.arange(12.0)), np.zeros(12)))

@@ -49,7 +49,7 @@ SIZES = np.tile([GRAVITY, 30.0, 60.0, 95.0], 6)
 
 
 def table(rng, k2=0.0, kq=0.0, k3=0.0, *, share=0.01, radius_sd=0.0, radius_error=0.0):
-    """Draw windows of 24 positions on a centrifuge; the terms change by a share per kelvin."""
+    """Draw windows of 24 positions on a centrifuge; terms change by `share` per kelvin."""
     truth = Truth(on_bias=np.zeros((3, 6)), on_scale=np.zeros((3, 6)), offset_sd=MICRO)
     windows, up = table_of(truth, 24, rng, n_windows=10)
     t = windows.columns[:, 0]
@@ -111,10 +111,10 @@ def test_square_and_cube_are_estimated_within_their_claimed_sd(rng):
     assert [term.kind for term in terms] == ['square', 'cube']
     places = posterior.layout.nonlinear[:, [0, 2, 3, 5]]
     sd = np.sqrt(posterior.variance[places])
-    away = posterior.state.nonlinear[:, [0, 2, 3, 5]] - np.array([1e-5, -1e-6, 1e-7, -1e-8])
-    assert np.abs(away / sd).max() < 4.0
+    error = posterior.state.nonlinear[:, [0, 2, 3, 5]] - np.array([1e-5, -1e-6, 1e-7, -1e-8])
+    assert np.abs(error / sd).max() < 4.0
     # K2 and K3 are required to be right to 2 %.
-    assert np.abs(away[:, :2] / [1e-5, 1e-6]).max() < 0.02
+    assert np.abs(error[:, :2] / [1e-5, 1e-6]).max() < 0.02
     assert all(term.left_out_gain > 1.0 and term.log_evidence_change > 100.0 for term in terms)
 
 
@@ -123,9 +123,9 @@ def test_absent_terms_are_pruned_without_effect_on_the_other_parameters(rng):
     assert not terms
     assert not posterior.state.nonlinear.any()
     for name in ('kappa', 'bias'):
-        away = getattr(posterior.state, name) - getattr(truth, name)
+        error = getattr(posterior.state, name) - getattr(truth, name)
         assert (
-            np.abs(away / np.sqrt(posterior.variance[getattr(posterior.layout, name)])).max() < 4
+            np.abs(error / np.sqrt(posterior.variance[getattr(posterior.layout, name)])).max() < 4
         )
 
 

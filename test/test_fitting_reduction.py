@@ -316,7 +316,7 @@ def test_a_gravity_not_found_on_earth_is_refused(gravity):
         FitOptions(gravity=gravity)
 
 
-def course(quantum, noise, rng):
+def soak_ramp_soak(quantum, noise, rng):
     # Three hours at 1 Hz are a soak, a ramp of 1 K/min through a lag of 300 s, and a soak.
     time = np.arange(0.0, 10800.0)
     air = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
@@ -332,7 +332,7 @@ def course(quantum, noise, rng):
 
 @pytest.mark.parametrize(('quantum', 'noise'), [(0.0, 0.005), (0.0, 0.05), (0.0625, 0.005)])
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
-    learned = learn_thermometer([course(quantum, noise, rng)], ThermometerSettings())
+    learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
     # Noise below a tenth of the quantum is invisible; a tenth is assumed.
     assert learned.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)

@@ -340,7 +340,7 @@ def test_published_huygens_coefficients_come_back(rng):
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
-        # The fit's bias is in counts; divided by sf it is the published offset [g].
+        # The fit's bias in counts, over the counts per g, is the published offset [g].
         bias = K0 * polynomial.polyval(
             t[:40], np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         )

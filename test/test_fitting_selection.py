@@ -306,8 +306,8 @@ def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, up
     assert chosen_groups(chosen) == {'curve', 'board'}
 
 
-@pytest.mark.parametrize('away', [0.0, 30.0])
-def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, away):
+@pytest.mark.parametrize('offset', [0.0, 30.0])
+def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, offset):
     # Siblings may differ by less or more than their sd: the evidence selects the true prior.
     _, one, truth = calm
     state = one.posterior.state
@@ -318,14 +318,14 @@ def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, away):
     sd = np.full(layout.n_unit, 1e-5)
     places = layout.weights[0, :, 0]
     true = mean[places].copy()
-    mean[places] += away * sd[0]
+    mean[places] += offset * sd[0]
     priors = [InformativePrior(mean, np.diag(1.0 / (part * sd))) for part in (1.0, 100.0)]
     prior = replace(
         constants(truth), column_sd=candidates.typical, informative=priors[-1]
     )  # fmt: skip
     fixed = replace(candidates, fixed=np.ones((2, 6), dtype=bool))
     chosen = fit_all(regression, state, prior, fixed, priors)
-    assert chosen.posterior.prior.informative is priors[int(away > 0.0)]
+    assert chosen.posterior.prior.informative is priors[int(offset > 0.0)]
     curve = unit_of(chosen.posterior.state, layout)[places]
     # With the right prior the fitted curve agrees with the curve of the first fit.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()

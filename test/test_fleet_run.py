@@ -61,7 +61,7 @@ def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client,
     out = tmp_path / 'out'
     collected = []
 
-    def tell(_n, _total, row):
+    def report(_n, _total, row):
         if row is None:
             return
         # Two workers are fitting a unit each when the first result arrives.
@@ -69,7 +69,7 @@ def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client,
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
         collected.append(str(row['name']))
 
-    result = fit_fleet(str(fleet), out, OPTIONS, client=client, tell=tell)
+    result = fit_fleet(str(fleet), out, OPTIONS, client=client, progress=report)
     assert sorted(collected) == ['A/good', 'A/torn', 'B/exchanged']
     assert result.n_done == 3
     rows = {str(row['name']): row for row in result.rows}
@@ -154,7 +154,7 @@ def test_an_interrupted_fleet_run_continues(client, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_fleet(str(fleet), out, OPTIONS, client=client, tell=stop)
+        fit_fleet(str(fleet), out, OPTIONS, client=client, progress=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
     # The files of this unit were cut off as by a power failure.

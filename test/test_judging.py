@@ -360,7 +360,7 @@ class TestShifts:
         assert abs(judgement.shifts[2].bias) < 3.0 * judgement.shifts[2].bias_sd
         assert [text.split(' +')[0] for text in judgement.moved] == ['x bias', 'y scale']
         assert judgement.verdict == 'recalibrate'
-        assert '; moved: x bias +' in judgement.reason
+        assert '; shifted: x bias +' in judgement.reason
 
     def test_a_large_shift_is_written_without_an_exponent(self):
         # WHY: the verdict read `x bias +829 +- 1.3e+02 ug`.

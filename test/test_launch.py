@@ -114,11 +114,11 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
         rclpy.init(args=['--ros-args', *files], context=context)
         node = CompensationNode(context)
         used = {name: node.node.get_parameter(name).value for name in mine}
-        strangers = [name for name in overrides(node.node) if not node.node.has_parameter(name)]
+        unknown = [name for name in overrides(node.node) if not node.node.has_parameter(name)]
         node.close()
         context.try_shutdown()
         assert used == mine | arguments
-        assert all(name.startswith(NOT_GIVEN) for name in strangers)
+        assert all(name.startswith(NOT_GIVEN) for name in unknown)
 
 
 def test_executable_parameters_and_topics_of_a_launch_file_exist():

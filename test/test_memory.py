@@ -213,7 +213,7 @@ def test_the_prior_of_initial_lag_states_by_hand():
 
 
 def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
-    # The lags of a board in a long random walk scatter by P at the first reading.
+    # After a long random walk of the board the lags have the covariance `start_covariance`.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0

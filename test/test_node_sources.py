@@ -157,7 +157,7 @@ def test_two_publishers_that_send_are_never_mixed(offset, period_s):
     sources, used = Sources(), []
     for at_s, number, name in sorted(first + other):
         n_known = 2 if at_s > 2.0 else 1
-        if not sources.of_one(n_known, [number], [round(at_s * 1e9)]):
+        if not sources.first_of_single_source(n_known, [number], [round(at_s * 1e9)]):
             used.append((at_s, name))
     assert {name for _, name in used} == {'own'}
     # A second after one of two drivers fell silent, samples of the first driver are used again.
@@ -167,11 +167,11 @@ def test_two_publishers_that_send_are_never_mixed(offset, period_s):
 
 def test_without_sequence_numbers_no_publisher_is_taken_as_ended():
     sources = Sources()
-    assert sources.of_one(1, [None] * 3, [0, 1, 2]) == 0
+    assert sources.first_of_single_source(1, [None] * 3, [0, 1, 2]) == 0
     for k in range(5):
-        assert sources.of_one(2, [None] * 3, [k * SECOND_NS] * 3) == 3
-    assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 3
-    assert sources.of_one(1, [None] * 3, [9 * SECOND_NS] * 3) == 0
+        assert sources.first_of_single_source(2, [None] * 3, [k * SECOND_NS] * 3) == 3
+    assert sources.first_of_single_source(1, [None] * 3, [9 * SECOND_NS] * 3) == 3
+    assert sources.first_of_single_source(1, [None] * 3, [9 * SECOND_NS] * 3) == 0
 
 
 def test_readings_of_a_second_publisher_are_not_used(peer, unit):

@@ -166,6 +166,6 @@ def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
         moved = with_parameters(
             unit, scale, values + step * (np.arange(len(values)) == k), covariance
         )
-        slope = (series.miss - series_of(logged, moved).miss) / step
+        slope = (series.residual - series_of(logged, moved).residual) / step
         # The analytic derivatives neglect the slope of the nonlinear terms, 2 K2 times 1 g.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

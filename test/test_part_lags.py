@@ -16,7 +16,7 @@ from strangers_cases import (
     HALF,
     HELD,
     Study,
-    cheap,
+    consumer_grade,
     gradient,
     navigation,
     one_test,
@@ -193,7 +193,8 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
 
 
 @pytest.mark.parametrize(
-    ('grade', 'rate_hz', 'full_scale'), [(cheap, 10.0, 32767.0), (navigation, 0.5, 8388607.0)]
+    ('grade', 'rate_hz', 'full_scale'),
+    [(consumer_grade, 10.0, 32767.0), (navigation, 0.5, 8388607.0)],
 )
 def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     # The board drifts by 0.01 K within a soak; 26 K between the soaks move the norms by milli-g.
@@ -204,7 +205,7 @@ def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     study = Study('', bags, one_test(held), {'full_scale': full_scale})
     score = judged(strangers.fitted(study), study)
     means = [minutes(bag) for bag in held]
-    forces = [strangers.by_hand(study)['constants'](mean) for mean in means]
+    forces = [strangers.scipy_baselines(study)['constants'](mean) for mean in means]
     # A part of the error remains, because soaks do not show the lags of the held-out ramps.
     assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
@@ -215,7 +216,7 @@ def test_six_faces_in_three_soaks(given):
     # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
     # unit with drifts of 10 mg left 40 mg. With a stated repeatability the fit divided by zero.
     rng = rng_of('faces in soaks', 1)
-    unit = replace(cheap(rng), skew=np.zeros(3))
+    unit = replace(consumer_grade(rng), misalignment=np.zeros(3))
     faces = np.vstack((np.eye(3), -np.eye(3))).repeat(3, axis=0)
     bags = positions(unit, SOAKS, faces, rng, rate_hz=10.0)
     held = positions(unit, program(19.0, 90.0), spread(2, rng), rng, rate_hz=10.0)
@@ -227,7 +228,7 @@ def test_six_faces_in_three_soaks(given):
 def test_a_curve_between_two_soaks_is_claimed():
     # WHY: without the powers that the soaks do not determine the claimed sd was 1/8 of the error.
     rng = rng_of('two soaks')
-    unit = cheap(rng)
+    unit = consumer_grade(rng)
     bags = positions(unit, SOAKS[::2], spread(18, rng), rng, rate_hz=10.0)
     held = positions(unit, program(19.0, 90.0), spread(3, rng), rng, rate_hz=10.0)
     study = Study('', bags, one_test(held), {'full_scale': 32767.0})

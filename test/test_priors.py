@@ -94,22 +94,22 @@ def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 
-    def left(away, k):
+    def share_left(units, k):
         """Return the variance of parameter k given all others / its variance."""
-        scatter = _scatter((away - away.mean(axis=0)) / np.sqrt(len(away) - 1.0), layout)
+        scatter = _scatter((units - units.mean(axis=0)) / np.sqrt(len(units) - 1.0), layout)
         return 1.0 / (np.linalg.inv(scatter)[k, k] * scatter[k, k])
 
     independent = rng.standard_normal((12, n))
     bias, M = layout.bias[1].response - 1, layout.misalignment
-    assert left(independent, M) == pytest.approx(1.0)
+    assert share_left(independent, M) == pytest.approx(1.0)
     # The dynamic level of a bias is correlated with its static level alone.
     level = layout.bias[0].dynamic
     pair = np.corrcoef(independent[:, [layout.bias[0].static, level]].T)[0, 1]
-    assert left(independent, level) == pytest.approx(1.0 - pair**2)
-    assert left(independent, bias) > 0.5
+    assert share_left(independent, level) == pytest.approx(1.0 - pair**2)
+    assert share_left(independent, bias) > 0.5
     # Curves that have one cause determine each other.
     common = rng.standard_normal((12, 1)) + 0.01 * independent
-    assert left(common, bias) < 0.1
+    assert share_left(common, bias) < 0.1
 
 
 def test_a_fit_starts_with_the_widest_prior(monkeypatch):

@@ -236,7 +236,7 @@ configs = st.builds(
 def largest(axis, regime, of):
     """Bound the change of an axis' bias, and the relative change of its scale."""
     edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
-    # Curves continue along their tangents for up to a quarter of both ranges together.
+    # Curves continue along their tangents for up to a quarter of the union of both ranges.
     t = max(abs(edge - of.reference_temperature_c) for edge in edges)
     t += 0.25 * (max(edges) - min(edges))
     curves = regime.axes()[axis]

@@ -70,8 +70,8 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     result = fit(sources, replace(OPTIONS, input=kind))
     calibration = result.calibration
     assert len(result.positions) == 6
-    # The prior sd of the misalignment of a MEMS is 1 %. Faces that are a degree off change it by
-    # less than 1 % of this sd.
+    # The prior sd of the misalignment of a MEMS is 1 %. Faces that are a degree off change the
+    # misalignment by less than 1 % of its prior sd.
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-4)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
     # Bias and scale by hand: half the sum and half the difference of opposite faces.

@@ -94,7 +94,8 @@ def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
             and options['index_types'] == IndexType.ALL
             and options['repeat']
         ):
-            # Order of rosbags for the same file; its versions order equal log times differently.
+            # Order of rosbags for the same file; versions of rosbags order equal log times
+            # differently.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]

@@ -159,7 +159,8 @@ def test_soaks_have_no_false_switches(sensor):
 def test_the_rate_of_false_alarms_is_that_of_the_setting():
     # The signal is noise without ripple, and 20 alarms an hour are permitted. Rice's formula
     # counts crossings, which come in groups and coincide between the filters, so it is an upper
-    # bound of separate alarms: 2000 in 100 h. The lower limit checks that the detector is active.
+    # bound of separate alarms: 2000 in 100 h. The lower limit of the alarms shows that the
+    # detector is active.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)

@@ -31,7 +31,7 @@ ATTITUDES = ATTITUDES / np.linalg.norm(ATTITUDES, axis=1)[:, None]
 def unit(**given):
     """Make a unit without errors, noise and rounding."""
     perfect = {
-        'bias': np.zeros(3), 'gain': np.zeros(3), 'skew': np.zeros(3), 'bias_curve': ZEROS,
+        'bias': np.zeros(3), 'gain': np.zeros(3), 'misalignment': np.zeros(3), 'bias_curve': ZEROS,
         'scale_curve': ZEROS, 'counts': 0.0, 'density': 0.0, 'reading_sd': 0.0,
         'reading_step': 1e-9, 'heat_k': 0.0,
     }  # fmt: skip
@@ -78,10 +78,10 @@ def test_noise_bias_scale_and_misalignment_follow_their_definition():
     # corrected = M (measured - bias) / scale must give the force, except for white noise.
     given = unit(
         bias=np.array([100.0, -200.0, 300.0]), gain=np.array([0.01, -0.02, 0.03]),
-        skew=np.array([1e-3, 2e-3, -3e-3]), density=5.0,
+        misalignment=np.array([1e-3, 2e-3, -3e-3]), density=5.0,
     )  # fmt: skip
     bag = record(given, units.program(20, 120), ATTITUDES[3], rng_of('noise'))
-    a, b, c = given.skew
+    a, b, c = given.misalignment
     M = np.array([[1.0, 0.0, 0.0], [a, 1.0, 0.0], [b, c, 1.0]])
     corrected = (bag.samples - UG * given.bias) / (1.0 + given.gain) @ M.T
     error = corrected - bag.force
@@ -196,13 +196,13 @@ def curved_unit():
     rng = rng_of('curved')
     return unit(
         bias=1500.0 * rng.standard_normal(3), gain=0.01 * rng.standard_normal(3),
-        skew=1e-3 * rng.standard_normal(3),
+        misalignment=1e-3 * rng.standard_normal(3),
         bias_curve=rng.standard_normal((3, 3)) * [[20.0], [1.0], [0.05]],
         scale_curve=50.0 * rng.standard_normal((1, 3)),
     )  # fmt: skip
 
 
-def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
+def test_a_cubic_by_scipy_finds_a_cubic_and_constants_do_not():
     given = curved_unit()
     fit, held = (
         of_attitudes(given, np.linspace(5, 35, 7)),
@@ -217,7 +217,7 @@ def test_a_cubic_by_hand_finds_a_cubic_and_constants_do_not():
     assert constants.vector > 50.0
 
 
-def test_constants_by_hand_bound_the_scale_of_few_attitudes():
+def test_constants_by_scipy_bound_the_scale_of_few_attitudes():
     # Without a bound on the scale, a fit to one noisy attitude makes all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
@@ -241,7 +241,7 @@ def test_a_bias_at_the_reference_is_held_against_its_bound():
     assert score.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
 
 
-def test_a_cubic_by_hand_finds_a_pose_s_drift():
+def test_a_cubic_by_scipy_finds_a_pose_s_drift():
     given = replace(curved_unit(), scale_curve=ZEROS)
     minutes_ = [
         of_attitudes(given, board) for board in (np.linspace(5, 35, 31), np.array([9.0, 22]))

@@ -48,7 +48,7 @@ def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
         if second < 2000:
             compensator.push('case', stamp, 19.0 + 2e-3 * (second % 5))
         corrected.append(compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2))
-    # 0.1 K of 1 K: 3 counts of 300 per m/s^2.
+    # The gradient of 1 K is known to 0.1 K, 3 counts, at 300 counts per m/s^2.
     assert corrected[-1][0] == pytest.approx(corrected[1999][0], abs=0.01)
 
 

@@ -248,14 +248,14 @@ def fit(
         sources, kind = fit_sources(paths)
         if paths:
             options.setdefault('input', 'counts' if kind == 'counts' else 'm/s^2')
-        for one in items:
-            if isinstance(one, Columns):
+        for item in items:
+            if isinstance(item, Columns):
                 nothing: Temperature = ([], [])
-                readings = {'board': nothing, 'case': nothing, **one.temperatures}
-                block = _block(one.time_s, one.counts, readings, one.start_ns)
-                text = parse_sections(one.specific_force) if one.specific_force else ()
-                known = KnownForce(one.name, text) if text else None
-                source = FitSource(one.name, partial(list, [block]), None, one.serial, known)
+                readings = {'board': nothing, 'case': nothing, **item.temperatures}
+                block = _block(item.time_s, item.counts, readings, item.start_ns)
+                text = parse_sections(item.specific_force) if item.specific_force else ()
+                known = KnownForce(item.name, text) if text else None
+                source = FitSource(item.name, partial(list, [block]), None, item.serial, known)
                 sources.append(source)
         return run(sources, FitOptions(gravity=gravity, **options)).calibration
 

@@ -58,10 +58,10 @@ class Kind:
 CALIBRATION = Kind('calibration', rb'(?m)^(format_version|unit)\s*:')
 PAGE = Kind('HTML page', rb'(?i)\A\s*<!doctype html', suffixes=('.html', '.htm'))
 PICTURE = Kind('PNG picture', rb'\A\x89PNG\r\n')
-PARAMETERS = Kind('parameter file of ours', rb'\A# Thermal calibration of unit ')
+PARAMETERS = Kind('parameter file of thermo_comp', rb'\A# Thermal calibration of unit ')
 RECORD = Kind('JSON record', rb'\A\{')
 PARQUET = Kind('Parquet file', rb'\APAR1')
-CSV = Kind('CSV table of ours', rb'\A(stamp_ns|name|section|bag),', suffixes=('.csv',))
+CSV = Kind('CSV table of thermo_comp', rb'\A(stamp_ns|name|section|bag),', suffixes=('.csv',))
 MCAP = Kind('MCAP file', rb'\A\x89MCAP')
 BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z', is_folder=True)
 

@@ -94,8 +94,8 @@ def _load(text: str | bytes, node_limit: int) -> Any:
         if isinstance(event, yaml.SequenceStartEvent):
             return [value(part, depth + 1) for part in inner]
         collected: dict[str, Any] = {}
-        for one in inner:
-            key, line = value(one, depth + 1), one.start_mark.line + 1
+        for key_event in inner:
+            key, line = value(key_event, depth + 1), key_event.start_mark.line + 1
             if type(key) is not str:
                 raise _invalid(line, f'a key must be a text, got {key!r:.40}')
             if key in collected:

@@ -5,7 +5,7 @@ Owns the table of the physical bounds of every quantity in a calibration.
 
 The bounds are far wider than any instrument needs and far narrower than the range of a float, so
 that a calibration within them gives finite results. Bounds that depend on the unit's full scale
-and temperature range (bias, curves, weights and their deviations) are in `unit.reach`.
+and temperature range (bias, curves, weights and their deviations) are in `unit.limits`.
 """
 
 import math

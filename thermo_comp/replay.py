@@ -88,7 +88,8 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
     """Return the roles of the topics that a recording must have to be corrected."""
-    return ('accel', 'board') if any(one.needs_temperature for one in calibrations) else ('accel',)
+    needs_board = any(calibration.needs_temperature for calibration in calibrations)
+    return ('accel', 'board') if needs_board else ('accel',)
 
 
 def replay(

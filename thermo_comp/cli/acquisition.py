@@ -65,7 +65,7 @@ class Account:
     The last of `positions` is unfinished. `worst_sd_g` is the sd of the force in the worst
     attitude, `constants_sd` the sd of bias [g], relative scale and M [rad], as in `coverage`.
     `next_up` is the recommended next direction, `next_deg` away from `now`, the direction of the
-    newest reading (NaN before any); `hole` is the direction farthest from all positions.
+    newest reading (NaN before any); `farthest_up` is the direction farthest from all positions.
     `findings` are texts about missing data.
     """
 
@@ -76,8 +76,8 @@ class Account:
     constants_sd: Floats
     next_up: Floats
     next_deg: float
-    hole: Floats
-    hole_deg: float
+    farthest_up: Floats
+    farthest_deg: float
     thermometers: Surveys
     now: Floats
     is_still: bool
@@ -247,12 +247,12 @@ class Acquisition:
                 Position(up, rest.still_s, rest.n_rests, float(sd), rest.surveys, reason)
             )
         known = [position for position in positions if np.isfinite(position.up).all()]
-        seen = np.array([position.up for position in known]).reshape(-1, 3)
+        ups = np.array([position.up for position in known]).reshape(-1, 3)
         sds = np.array([position.sd_g for position in known])
-        covariance = coverage.constants_covariance(seen, sds, misalignment_sd)
-        next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, seen)
+        covariance = coverage.constants_covariance(ups, sds, misalignment_sd)
+        next_up = coverage.next_direction(covariance, known[-1].sd_g if known else _FLOOR_SD, ups)
         now, is_still = self._now(cells)
-        hole, hole_deg = coverage.farthest(seen)
+        farthest_up, farthest_deg = coverage.farthest(ups)
         n_good = sum(not position.reason for position in positions)
         thermometers = _together([rest.surveys for rest in rests])
         missing = self._n_wanted - n_good
@@ -265,8 +265,8 @@ class Acquisition:
             np.sqrt(np.diag(covariance)),
             next_up,
             float(np.degrees(np.arccos(np.clip(now @ next_up, -1.0, 1.0)))),
-            hole,
-            hole_deg,
+            farthest_up,
+            farthest_deg,
             thermometers,
             now,
             is_still,

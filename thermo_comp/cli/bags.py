@@ -91,7 +91,7 @@ def _calibration(out: Output, path: Path) -> None:
     out.line(f'{path}: unit {unit.serial}, {unit.input} up to {unit.full_scale:g}')
     out.line(
         f'  fitted {provenance.created or "at an unknown time"} by thermo_comp '
-        f'{provenance.tool_version or "?"} from {len(provenance.sources)} bags, '
+        f'{provenance.tool_version or "?"} from {counted(len(provenance.sources), "bag")}, '
         f'model {provenance.model or "?"}'
     )
     out.line(
@@ -125,12 +125,12 @@ def _calibration(out: Output, path: Path) -> None:
                 for n in provenance.residuals
             ],
         )
-    tell_nonlinearity(out, calibration)
+    print_nonlinearity(out, calibration)
     out.points(provenance.notes)
     out.end(path=path, calibration=calibration)
 
 
-def tell_nonlinearity(out: Output, calibration: 'Calibration') -> None:
+def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
     """Print the nonlinear terms, if rests of a fit were not all at 1 g."""
     from ..unit.prediction import nonlinear_coefficients
 
@@ -142,12 +142,12 @@ def tell_nonlinearity(out: Output, calibration: 'Calibration') -> None:
         cells = [f'{value:.4g}' + f' +- {sd:.2g}' * isfinite(sd) for value, sd in axes]
         rows.append((coefficient.name, coefficient.unit, *cells))
     terms = calibration.nonlinearity.terms
-    losses = ', '.join(f'{one.kind} {one.log_evidence_change:.1f}' for one in terms) or 'no term'
+    loss = ', '.join(f'{term.kind} {term.log_evidence_change:.1f}' for term in terms) or 'no term'
     low, high = calibration.nonlinearity.force_range_m_s2
     out.table(
         ('coefficient', 'unit', 'x', 'y', 'z'),
         rows,
-        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {losses}',
+        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {loss}',
     )
 
 

@@ -28,7 +28,7 @@ _FINDINGS = {
     'out_of_range': 'rows left out, stamp before 1970 or after 2038',
     'clipped': 'rows clipped, kept',
     'impossible': 'temperatures left out, below -90 or above 200 degC',
-    'continued': 'rows at which a 32-bit time began again at 0, continued',
+    'continued': 'rows at which a 32-bit time overflowed to 0, times continued',
     'backwards': 'rows whose time goes back, kept',
     'repeated': 'rows whose time stands still, kept',
 }
@@ -85,7 +85,7 @@ def convert(
     with out.progress('converting') as done:
         with flags_named():
             read = read_log(log, **given)
-        tell_guess(out, read, {})
+        print_guess(out, read, {})
         report = write_log(read, output, force, done)
     _print_conversion(out, report, output)
     written, further = report.log, dict(report.messages)
@@ -146,7 +146,7 @@ def flags_named() -> Iterator[None]:
             raise ValueError(flag) from mistake
 
 
-def tell_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
+def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     """
     Print a guessed column map, or name the log of `shown` whose printed map is the same; print the
     columns of a table that are not used, unless they are those of a log of `shown`.
@@ -183,8 +183,8 @@ def export(
     to: Tool = option('Tool whose file to write.', ...),
     output: Path = option('File to write.', ..., '--output', '-o'),
     number: int | None = option(
-        'Number of the set: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot (1), imu0.. of '
-        'Kalibr (0).',
+        'Number of the set of parameters: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot '
+        '(1), imu0.. of Kalibr (0).',
         min=0,
     ),
     device_id: int = option("PX4's id of the sensor (TC_An_ID), used to match it.", 0),
@@ -232,7 +232,7 @@ def import_(
     ),
     output: Path = options.NEW_CALIBRATION,
     serial: str = option('Serial of the unit.', ..., callback=options.check_serial),
-    number: int | None = option('Number of the set, if several (TC_A0, INS_TCAL1, imu0).'),
+    number: int | None = option('Number of the set of parameters (TC_A0, INS_TCAL1, imu0).'),
     gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
     rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
     full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),

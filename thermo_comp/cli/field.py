@@ -70,7 +70,7 @@ def update(
         save_calibration(result.calibration, output, overwrite=force)
         out.line(f'{output}: written')
     else:
-        out.line(f'nothing gained: {output} is not written, keep {calibration}')
+        out.line(f'the update gains nothing: {output} is not written, keep {calibration}')
     out.end(
         0 if is_better else NOTHING_GAINED,
         output=output if is_better else None,

@@ -13,8 +13,8 @@ import typer
 from ..files import CALIBRATION, PAGE, check_output
 from ..text import counted
 from . import shared_options as options
-from .bags import tell_nonlinearity
-from .convert import flags_named, tell_guess
+from .bags import print_nonlinearity
+from .convert import flags_named, print_guess
 from .output import Cell, Output, micro_g, millidegrees, picked
 from .shared_options import argument, option
 
@@ -41,7 +41,7 @@ def fit(
         "Curve of bias and scale over temperature; default: the model's.", metavar='CURVE'
     ),
     dynamic_curve: Curve | None = option('Curve of the dynamic set alone.', metavar='CURVE'),
-    groups: str | None = option('Groups allowed in the fit.', metavar='A,B'),
+    groups: str | None = option('Groups of columns allowed in the fit.', metavar='A,B'),
     force_groups: str = option('Groups kept regardless of the evidence.', '', metavar='A,B'),
     prior: Path | None = option(
         'Prior: a calibration of the type, or an old calibration of the unit.', metavar='YAML'
@@ -100,13 +100,13 @@ def fit(
 
     shown: dict[str, str] = {}
 
-    def tell(log: 'ForeignLog') -> None:
-        tell_guess(out, log, shown)
+    def print_log(log: 'ForeignLog') -> None:
+        print_guess(out, log, shown)
         out.sources([(log.path, log.chosen, None)])
 
     with flags_named():
         # The temporary bags exist until the command ends.
-        bags = context.with_resource(as_bags(bags, tell, columns=columns, rate_hz=rate_hz))
+        bags = context.with_resource(as_bags(bags, print_log, columns=columns, rate_hz=rate_hz))
     sources, kind = fit_sources(bags, topics, known_force)
     info = None
     if certificate_info is not None:
@@ -198,14 +198,14 @@ def _print_fit(
     if taus and shares:
         source = 'the board'
         if any(shares):
-            away = ', '.join(f'{share:.2f}' for share in shares)
-            source = f'a temperature between board and case (case share {away})'
+            case_shares = ', '.join(f'{share:.2f}' for share in shares)
+            source = f'a temperature between board and case (case share {case_shares})'
         out.line(
             f'each axis is a curve of the temperature of its part, which lags {source} by '
             f'{", ".join(f"{tau:.0f}" for tau in taus)} s (x, y, z)'
         )
     _print_groups(out, calibration, has_prior=result.fit.posterior.prior.informative is not None)
-    tell_nonlinearity(out, calibration)
+    print_nonlinearity(out, calibration)
     _print_residuals(out, result, n_positions)
     if gyroscope is not None:
         _print_rates(out, result, gyroscope)

@@ -65,7 +65,7 @@ def fleet_fit(
     state = 'no test has begun'
     with out.progress('fitting') as show:
 
-        def tell(n: int, total: int, _row: object) -> None:
+        def progress(n: int, total: int, _row: object) -> None:
             nonlocal state
             state = f'{n} of {counted(total, "test")} done'
             show(n / total)
@@ -79,7 +79,7 @@ def fleet_fit(
                 scheduler=scheduler,
                 n_workers=workers,
                 earlier=before,
-                tell=tell,
+                progress=progress,
             )
         except KeyboardInterrupt:
             out.note(f'interrupted: {state}, kept in {output}; the same command continues')
@@ -111,20 +111,20 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     for row in result.rows:
         # The reservations of a calibrated test also name the bags left out.
         text = (row['problem'], row['reservations'] or row['left_out'])
-        out.points(f'{row["name"]}: {one}' for one in text if one)
+        out.points(f'{row["name"]}: {problem}' for problem in text if problem)
     out.points(
         f'{name}: tables, but no bag: thermo_comp convert makes bags' for name in result.skipped
     )
     out.points(
-        f'{one.name}: {one.label} {one.value:.4g} {one.unit}, median {one.middle:.4g}: '
-        f'{one.z:+.1f} sd'
-        for one in summary.outliers
+        f'{outlier.name}: {outlier.label} {outlier.value:.4g} {outlier.unit}, '
+        f'median {outlier.middle:.4g}: {outlier.z:+.1f} sd'
+        for outlier in summary.outliers
     )
     out.points(
-        f'{one.serial}: {one.worst.constant} changed by {one.worst.change:+.4g} {one.worst.unit} '
-        f'(sd {one.worst.sd:.2g}) from {one.earlier} to {one.later}'
-        for one in summary.drifts
-        if one.is_significant
+        f'{retest.serial}: {retest.worst.constant} changed by {retest.worst.change:+.4g} '
+        f'{retest.worst.unit} (sd {retest.worst.sd:.2g}) from {retest.earlier} to {retest.later}'
+        for retest in summary.drifts
+        if retest.is_significant
     )
     if result.prior is not None:
         out.line(f'{result.prior}: prior of the type, from the valid units')

@@ -24,7 +24,7 @@ def evaluate(
         'Bags of one unit, any positions, or its rest logs.', metavar='BAG...'
     ),
     calibration: list[Path] = option(
-        'Calibration; the first is judged, more are compared.', ..., '--calibration', '-c'
+        'Calibration; further ones are compared with the first.', ..., '--calibration', '-c'
     ),
     judging: dict[str, Any] = options.judging,
     known_force: Any = options.force,
@@ -40,7 +40,7 @@ def evaluate(
 
     The verdict compares the RMS residual with your --tolerance or, without
     one, with the uncertainty that the calibration claims for the same
-    windows; six positions or more show which axis has moved. Exit code 0
+    windows; six positions or more show which axis has shifted. Exit code 0
     only if the calibration is shown to be valid. Rest logs of the node
     instead of bags show the drift over the days, and when it exceeds the
     claimed uncertainty.
@@ -67,7 +67,8 @@ def evaluate(
         kind = TABLES.get(csv.suffix, CSV)
         check_output(csv, kind, overwrite=force, others=[*bags, *calibration])
     is_named = len({path.stem for path in calibration}) == len(calibration)
-    models = [(one.stem if is_named else str(one), load_calibration(one)) for one in calibration]
+    names = [path.stem if is_named else str(path) for path in calibration]
+    models = list(zip(names, map(load_calibration, calibration), strict=True))
     with out.progress('evaluating') as done:
         result = run(bags, models, **judging, topics=topics, force=known_force, progress=done)
     out.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
@@ -76,10 +77,10 @@ def evaluate(
         with table_writer(csv, {}, overwrite=force) as write:
             write(columns_of(judged.windows, list(map(shown_name, bags))))
     drifts = drifts_of(history_of([model for _, model in models]))
-    tell_sections(out, result.judgements)
+    print_sections(out, result.judgements)
     _print_axes(out, judged)
     _print_levels(out, judged)
-    rates = {name: one.rate for name, one in result.judgements.items() if one.rate is not None}
+    rates = {k: judged.rate for k, judged in result.judgements.items() if judged.rate is not None}
     if rows := _sections(rates, millidegrees):
         out.table(
             ('section', 'model', 'windows', 'RMS', 'max', 'claimed', 'ratio'),
@@ -147,7 +148,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
         )
 
 
-def tell_sections(out: Output, judgements: Mapping[str, Any]) -> None:
+def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     """Print the residuals of |f| of each calibration."""
     (window_s,) = {judgement.windows.window_s for judgement in judgements.values()}
     out.table(

@@ -32,7 +32,7 @@ _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 def record(
     context: typer.Context,
     output: Path = option(
-        'Folder of the bags; existing bags are continued.', ..., '--output', '-o'
+        'Folder of the bags; existing bags belong to the test.', ..., '--output', '-o'
     ),
     bag: Path | None = argument(
         'Bag that another recorder writes, instead of topics.', None, metavar='[BAG]'
@@ -92,7 +92,7 @@ def record(
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
     if bag is None and live.n_lost:
-        out.note(f'{live.n_lost} messages were lost on the way')
+        out.note(f'{live.n_lost} messages from the drivers were lost')
     _end(out, test.account(), output, [*known, *bags.written], offset, over.is_set())
 
 
@@ -265,13 +265,13 @@ def _lines(account: 'Account') -> list[str]:
     from ..fitting.coverage import direction_text
 
     lines = [_accuracy(account)]
-    if account.hole_deg > 0.0:
-        where = direction_text(account.hole)
-        lines.append(f'no position within {account.hole_deg:.0f} deg of {where}')
-    for name, one in account.thermometers.items():
+    if account.farthest_deg > 0.0:
+        where = direction_text(account.farthest_up)
+        lines.append(f'no position within {account.farthest_deg:.0f} deg of {where}')
+    for name, survey in account.thermometers.items():
         lines.append(
-            f'{name} {one.lowest:.1f} .. {one.highest:.1f} degC, ramps '
-            f'{one.steepest_cooling_k_min:+.2f} .. {one.steepest_heating_k_min:+.2f} K/min'
+            f'{name} {survey.lowest:.1f} .. {survey.highest:.1f} degC, ramps '
+            f'{survey.steepest_cooling_k_min:+.2f} .. {survey.steepest_heating_k_min:+.2f} K/min'
         )
     if not account.is_complete:
         lines.append(_next(account))

@@ -108,10 +108,10 @@ SERIAL = option(
     "Serial of the unit, instead of the bag's; '' accepts any calibration.", callback=check_serial
 )
 OFFSET = option(
-    'Reading of raw samples without a force, e.g. 32768; default: detected.', metavar='WORD'
+    'Reading of raw samples at zero force, e.g. 32768; default: detected.', metavar='WORD'
 )
 INPUT = option(
-    'Input to read from the bag: counts, imu, or auto (the input that it has).',
+    'Input to read from the bag: counts, imu, or auto (whichever it holds).',
     'auto',
     '--input',
     metavar='KIND',

@@ -3,9 +3,10 @@
 """
 Owns the logs of autopilots, behind the extras ``px4`` and ``ardupilot``: one IMU, one barometer.
 
-An IMU's thermometer lags the surroundings: its readings become the board temperature. Those of the
-barometer follow the surroundings: they become the case temperature, and the board's if the IMU has
-no thermometer. A simulator's log is refused: without noise the fit cannot weight its samples.
+An IMU's thermometer lags the surroundings: its readings become the board temperature. The readings
+of the barometer's thermometer follow the surroundings: they become the case temperature, and the
+board's if the IMU has no thermometer. A simulator's log is refused: without noise the fit cannot
+weight its samples.
 
 PX4's ULog (``.ulg``): ``sensor_accel`` holds the driver's samples before PX4's corrections, with
 the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher rate. If

@@ -47,7 +47,7 @@ _FASTEST_K_S = 0.5
 # boards or sensors whose rows alternate change more often.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
-#: Last and first part of a counter's range; a step from the last to the first is a new start.
+#: Last and first part of a counter's range; a step from the last to the first is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
 _GIVE_MAP = f'give {_A_MAP}'
@@ -59,7 +59,7 @@ class Accel:
     The accelerometer's three columns, which become `output`: ``counts`` or ``imu`` (m/s^2).
 
     `clip`: lowest and highest reading, at which the sensor is saturated, in the table's unit;
-    `offset`: reading without a force, which is subtracted, such as 32768 in offset binary.
+    `offset`: reading at zero force, which is subtracted, such as 32768 in offset binary.
     """
 
     columns: Triple
@@ -111,7 +111,7 @@ class Further(Thermometer):
         super().__post_init__()
         if not is_thermometer(self.name):
             raise ValueError(
-                f'`name` must serve in a topic, as temperature/magnet, got {self.name!r}'
+                f'`name` must fit into a topic, as temperature/magnet, got {self.name!r}'
             )
 
 

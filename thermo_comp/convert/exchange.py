@@ -145,7 +145,7 @@ def _thermal(
 
 
 def _ppm(part: float) -> str:
-    """Format a part in ppm, with two digits or as a whole number."""
+    """Format a ratio in ppm, with two digits or as a whole number."""
     value = 1e6 * part
     return f'{value:.2g} ppm' if value < 99.5 else f'{value:.0f} ppm'
 

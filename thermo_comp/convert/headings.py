@@ -90,9 +90,9 @@ def read_headings(
     `is_plausible`: whether the values of a column, in a unit, can be those of a thermometer
     """
     names = {_plain(heading): heading for heading in reversed(headings)}
-    times = [one for name, one in names.items() if _TIME.search(name) and not _is_warm(one)]
+    times = [text for name, text in names.items() if _TIME.search(name) and not _is_warm(text)]
     # A heading like `T_magnet_C` is that of the times only if no other heading is.
-    times.sort(key=lambda one: _LETTER.search(_plain(one)) is None)
+    times.sort(key=lambda text: _LETTER.search(_plain(text)) is None)
     found = dict(_triads(names))
     triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
     accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
@@ -111,7 +111,7 @@ def read_headings(
         _stated(triads[accel][0], _ACCELS),
         triads[gyro] if gyro is not None else None,
         _stated(triads[gyro][0], _RATES) if gyro is not None else '',
-        _thermometers([one for one in headings if one not in taken], names, is_plausible),
+        _thermometers([text for text in headings if text not in taken], names, is_plausible),
     )
 
 

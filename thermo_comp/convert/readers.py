@@ -64,9 +64,9 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
 
 @contextmanager
 def as_bags(
-    paths: Sequence[Path], tell: Callable[[ForeignLog], None] = lambda _: None, **given: Any
+    paths: Sequence[Path], on_log: Callable[[ForeignLog], None] = lambda _: None, **given: Any
 ) -> Iterator[list[Path]]:
-    """Convert tables and logs to temporary bags; `tell` is called with each log."""
+    """Convert tables and logs to temporary bags; `on_log` is called with each log."""
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
     if any(given.values()) and not others:
         flags = ' and '.join(f'`{name}`' for name in given)
@@ -76,6 +76,6 @@ def as_bags(
         for number, path in enumerate(others):
             bags[path] = Path(folder) / str(number) / f'{path.name}.mcap'
             log = read_log(path, **given)
-            tell(log)
+            on_log(log)
             write_log(log, bags[path])
         yield [bags.get(path, path) for path in paths]

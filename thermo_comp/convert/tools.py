@@ -190,7 +190,7 @@ def _choose(numbers: set[int], number: int | None, is_in_use: Callable[[int], bo
     if number is None:
         live = [n for n in sorted(numbers) if is_in_use(n)] or sorted(numbers)
         if len(live) > 1:
-            raise CalibrationError(f'several sets of parameters {live}: choose one')
+            raise CalibrationError(f'several sets of parameters {live}: choose one by its number')
         return live[0]
     if number not in numbers:
         raise CalibrationError(f'no set of parameters {number}, there is {sorted(numbers)}')
@@ -333,7 +333,7 @@ class Tool:
     write: Callable[[Content, int | None, int], str]
     read: Callable[[str, int | None], Content | None]  # None for a text of another kind
     is_thermal: bool = False
-    reference_c: float | None = None  # the fixed reference of an autopilot
+    reference_c: float | None = None  # the fixed reference temperature of an autopilot
 
 
 TOOLS = {

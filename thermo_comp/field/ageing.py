@@ -78,8 +78,8 @@ class Change:
 @dataclass(frozen=True)
 class Rows:
     """
-    Equations of the rests, in order of time, at most `_ROWS` of a start: orthogonal sums with all
-    information of its rests about the six levels.
+    Equations of the rests, in order of time, at most `_ROWS` for each start of the node:
+    orthogonal sums with all information of its rests about the six levels.
 
     noise, scatter: variance of the noise, and factor of the rests' scatter variance in a row
     rank: number of the row within its start
@@ -116,7 +116,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
         # rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
-        summed = (series.miss, series.by_parameter, series.by_level, series.lack)
+        summed = (series.residual, series.by_parameter, series.by_level, series.lack)
         parts.append(
             (
                 *(np.full(n, series.time[at].mean()), np.full(n, start)),
@@ -179,13 +179,13 @@ class Model:
             factor = cho_factor(self.covariance(Ageing(*sd)), lower=True)
             inverse = cho_solve(factor, np.eye(len(self.rows.y)))
             alpha = inverse @ self.rows.y
-            away = (logs - middle) / _LOG_SD
-            value = np.log(np.diag(factor[0])).sum() + 0.5 * (self.rows.y @ alpha + away @ away)
+            shift = (logs - middle) / _LOG_SD
+            value = np.log(np.diag(factor[0])).sum() + 0.5 * (self.rows.y @ alpha + shift @ shift)
             slope = [
                 v**2 * float((inverse * part).sum() - alpha @ part @ alpha)
                 for v, part in zip(sd, self.parts, strict=True)
             ]
-            return float(value), np.array(slope) + away / _LOG_SD
+            return float(value), np.array(slope) + shift / _LOG_SD
 
         # The evidence has almost no gradient where variances are small, so the search has two
         # initial points: all scatter is due to the starts, or all scatter to the random walks.

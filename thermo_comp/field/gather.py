@@ -21,8 +21,7 @@ from .rest import Rest
 
 SECONDS = 10  # length of a window of a rest [s]
 _SECOND_NS = 1_000_000_000
-#: Number of a window in its rest, and n: from the window with this number on, every n-th window is
-#: kept.
+#: Pairs (k, n): from the window number k of a rest on, every n-th window is kept.
 _SPACING = ((360, 30), (60, 6), (0, 1))
 
 
@@ -77,10 +76,10 @@ class RestFinder:
                 if self._second is not None:
                     rests += self._close(self._second, number)
                 self._second = _Second(number, part[0], total=np.zeros(part.shape[1]))
-            second, away = self._second, part - self._second.origin
+            second, centred = self._second, part - self._second.origin
             second.n += len(part)
-            second.total += away.sum(axis=0)
-            second.squares += (away[:, :3] ** 2).sum(axis=0)
+            second.total += centred.sum(axis=0)
+            second.squares += (centred[:, :3] ** 2).sum(axis=0)
         return rests
 
     def _close(self, second: _Second, following: int) -> list[Rest]:

@@ -57,19 +57,19 @@ class Rest:
     rate: tuple[float, ...] = ()
 
 
-def encode(one: Start | Rest) -> bytes:
+def encode(record: Start | Rest) -> bytes:
     """Write a start or a rest as a line."""
-    if isinstance(one, Start):
+    if isinstance(record, Start):
         # Earlier releases cannot read angular rates and the newer fields of lags and plays: such
         # fields are written only if they differ from their defaults.
-        sensors, lags, plays, rates = vars(one.memory).values()
+        sensors, lags, plays, rates = vars(record.memory).values()
         memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
-        data: Any = {**vars(one), 'memory': [*memory, rates] if rates else memory}
+        data: Any = {**vars(record), 'memory': [*memory, rates] if rates else memory}
     else:
         # Nine digits resolve 0.001 counts of a 24-bit converter.
         data = [
             [float(f'{value:.9g}') for value in part] if isinstance(part, tuple) else part
-            for part in astuple(one)
+            for part in astuple(record)
         ]
     text = json.dumps(data, separators=(',', ':'), ensure_ascii=True).encode()
     return b'%08x %s\n' % (zlib.crc32(text), text)

@@ -46,10 +46,10 @@ class Series:
     """
     Rests in order of time, (n,) and (n, ...); accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the start; `direction`: v; `force`: x; `miss`:
+    `time`: days since 1970; `start`: number of the start; `direction`: v; `force`: x; `residual`:
     ``|f| - g``; `by_parameter`: H, (n, n_parameters); `by_level`: derivatives by the bias of each
     axis and by its scale times g, (n, 6); `noise`: variance of one rest by samples and
-    thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of `miss`.
+    thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of `residual`.
     """
 
     time: Floats
@@ -58,7 +58,7 @@ class Series:
     state: Floats
     direction: Floats
     force: Floats
-    miss: Floats
+    residual: Floats
     by_parameter: Floats
     by_level: Floats
     noise: Floats
@@ -141,7 +141,7 @@ def read_rests(
     first_ns = begin * _DAY_NS + 1e9 * is_update
     later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
     if is_update and not is_for_update:
-        notes.append(f'{counted(len(rests) - len(later), "window")} took part in its last update')
+        notes.append(f'{counted(len(rests) - len(later), "window")} took part in the last update')
     elif is_update and not later:
         raise RecordingError('the calibration has been updated with all of these rests', paths[0])
     elif later and len(later) < len(rests):
@@ -153,7 +153,7 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Describe rests for the provenance of an update: the name holds their end and `ahead`."""
+    """Describe the rests of an update; its name has the time of the last rest, and `ahead`."""
     end = np.datetime64(rests[-1][1].stamp_ns, 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
@@ -218,7 +218,7 @@ def series_of(
     white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
     noise = (v**2 * white).sum(axis=1) / sizes
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
-    bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
+    bare, full = (SlowUncertainty(part, correction) for part in (without, calibration))
     slow, claim = (_along(correction, states, shares, model, u, x) for model in (bare, full))
     of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
     slow, claim = slow - of_one_sample, claim - of_one_sample
@@ -232,7 +232,7 @@ def series_of(
         state=states,
         direction=v,
         force=x,
-        miss=size - local,
+        residual=size - local,
         by_parameter=_by_parameter(calibration, correction, states, u, v, x, scale),
         by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
         noise=noise + np.maximum(slow, 0.0),

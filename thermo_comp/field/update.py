@@ -155,7 +155,7 @@ def update(
 
 def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
     """Add the residuals of left-out rests, and a note, to the origin of a calibration."""
-    largest, day = float(np.abs(series.miss).max()), np.datetime64(int(series.time[-1]), 'D')
+    largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time[-1]), 'D')
     residuals = ResidualSummary(
         f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
     )
@@ -239,9 +239,9 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
         at = labels == label
         earlier = int(np.searchsorted(rows.start, series.start[at].min()))
         shift = np.where(determined, solution.before(earlier), 0.0)
-        left = series.miss[at] - series.by_parameter[at] @ shift
+        left = series.residual[at] - series.by_parameter[at] @ shift
         share = series.n_windows[at] / series.n_windows[at].sum()
-        squares.append((float(share @ series.miss[at] ** 2), float(share @ left**2)))
+        squares.append((float(share @ series.residual[at] ** 2), float(share @ left**2)))
     before, after = np.array(squares).T
     gain = before - after
     gain_sd = float(gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else np.inf

@@ -137,8 +137,8 @@ def _rows(
     for name in ordered:
         at = labels == name
         weight = series.n_windows[at] / series.n_windows[at].sum()
-        temperature, mean = (float(weight @ one[at]) for one in (series.temperature, series.miss))
-        rms, claim = (float(np.sqrt(weight @ one[at] ** 2)) for one in (series.miss, series.claim))
+        temperature, mean = (float(weight @ x[at]) for x in (series.temperature, series.residual))
+        rms, claim = (float(np.sqrt(weight @ x[at] ** 2)) for x in (series.residual, series.claim))
         limit = tolerance or LIMIT * claim
         rows.append(Row(name, int(at.sum()), temperature, mean, rms, claim, limit))
     return tuple(rows)

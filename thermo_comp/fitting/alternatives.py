@@ -130,8 +130,8 @@ def _may_have_sets(selected: Selected) -> bool:
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
     """Name the case thermometer, then the other thermometers, but the board's, of every bag."""
-    seen = (
+    recorded = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags
     )
-    return 'case', *sorted(set.intersection(*seen) - {'board', 'case'})
+    return 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})

@@ -47,8 +47,8 @@ _GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
 #: above, and falling to 0 below a hundredth of the scale, which few mountings reach.
 _LOG_DENSITY = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_GRID**2 / STUDENT_NU)
 _LOG_DENSITY += np.log(np.minimum(_GRID / 0.01, 1.0))
-#: The same about the sd of a prior calibration: a Student's density of the logarithm, whose scale
-#: is a factor of 1.5, to which twelve positions determine an sd.
+#: Grid and log prior density about the sd of a prior calibration: a Student's density of the
+#: logarithm; its scale is a factor of 1.5, to which twelve positions determine an sd.
 _KNOWN_GRID = 10.0 ** np.arange(-1.5, 1.51, 0.125)
 _KNOWN_LOG_DENSITY = (
     -0.5 * (STUDENT_NU + 1.0) * np.log1p(np.log(_KNOWN_GRID) ** 2 / np.log(1.5) ** 2 / STUDENT_NU)
@@ -84,10 +84,10 @@ def claim_of(
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
     `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
-    `informative`: priors from a calibration that differ in the ageing since then
+    `informative`: priors from one calibration, with different ageings since that calibration
     """
     # The rests of one mounting have one offset, but the regression has one for each rest. The mean
-    # of k offsets with k times the variance has the variance of one.
+    # of k offsets with k times the variance has the variance of a single offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -110,8 +110,8 @@ def claim_of(
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
     covariance[layout.bias, layout.bias] += shared
     if candidates is not None:
-        wider = _with_unseen(regression, posterior, candidates)
-        with_unseen = regression.solve(posterior.state, wider, n_steps=0)
+        widened = _with_unseen(regression, posterior, candidates)
+        with_unseen = regression.solve(posterior.state, widened, n_steps=0)
         # The covariance with unseen columns is computed at the mode's mounting sd. Add the excess
         # of the mixture's covariance over that of the mode.
         at = _places(posterior.layout, with_unseen.layout)
@@ -126,12 +126,12 @@ def claim_of(
     return Claim(layout, covariance, offset_sd)
 
 
-def _places(layout: Layout, wider: Layout) -> Ints:
+def _places(layout: Layout, widened: Layout) -> Ints:
     """Return the places of the unit's unknowns in a layout with more columns, (n_unit,)."""
     places = np.empty(layout.n_unit, dtype=np.int64)
     for name in ('kappa', 'bias', 'weights', 'nonlinear', 'shared'):
         at = getattr(layout, name)
-        places[at[at >= 0]] = getattr(wider, name)[at >= 0]
+        places[at[at >= 0]] = getattr(widened, name)[at >= 0]
     return places
 
 
@@ -152,10 +152,10 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
-    seen = np.diag(inactive.S).reshape(-1, 3)
-    seen = seen.sum(axis=1) / np.maximum((seen > 0.0).sum(axis=1), 1)
+    information = np.diag(inactive.S).reshape(-1, 3)
+    information = information.sum(axis=1) / np.maximum((information > 0.0).sum(axis=1), 1)
     sd = np.zeros_like(typical)
-    sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(seen, 1e-300))
+    sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
@@ -199,9 +199,8 @@ def _over_mountings(
         ]
 
     fits = solved(tried)
-    # A large mounting sd leaves the attitudes free to absorb errors of the model. Therefore the
-    # drifts may increase the log evidence of an sd, over that of the mode, by at most
-    # `TRIAL_GAIN`.
+    # A large mounting sd leaves the attitudes free to absorb errors of the model, so the drifts
+    # may increase the log evidence of an sd, over that of the mode, by at most `TRIAL_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -294,7 +293,7 @@ def _norm_evidence(
     weight = np.add.reduceat(regression.weight, first)
     residual = regression.weight[:, None] * regression.residual(state, layout)
     residual = np.add.reduceat(residual, first) / weight[:, None]
-    # Errors of the norms without offsets.
+    # Covariance of the norms, without the mounting offsets.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
     rows = np.column_stack((point.norm_by_axes, along, errors, np.ones(len(along))))
@@ -311,7 +310,7 @@ def _norm_evidence(
             along[:, weights] @ by_drifts[weights],
         ))  # fmt: skip
     else:
-        errors += along @ point.away[: layout.n_unit]
+        errors += along @ point.deviation[: layout.n_unit]
         of_prior = solve_triangular(prior.informative.root, along.T, trans='T').T
     noise = float(np.mean(prior.sigma**2)) * (1.0 / weight + prior.noise.ratio)
     known = of_prior @ of_prior.T

@@ -49,9 +49,9 @@ def constants_covariance(
     up: Floats, sd: Floats, misalignment_sd: float = MISALIGNMENT_SD
 ) -> Floats:
     """Return the covariance of a triad's constants by positions `up` (n, 3) of noise `sd` [g]."""
-    seen = norm_columns(up) / sd[:, None]
+    rows = norm_columns(up) / sd[:, None]
     prior_sd = np.append(PRIOR_SD[:6], [misalignment_sd] * 3)
-    return np.asarray(np.linalg.inv(np.diag(prior_sd**-2) + seen.T @ seen))
+    return np.asarray(np.linalg.inv(np.diag(prior_sd**-2) + rows.T @ rows))
 
 
 def worst_sd(covariance: Floats) -> float:
@@ -60,13 +60,13 @@ def worst_sd(covariance: Floats) -> float:
     return math.sqrt(np.max(np.linalg.eigvalsh(columns @ covariance @ columns.transpose(0, 2, 1))))
 
 
-def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
+def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     """
     Find the direction in which a position of noise `sd` [g] most lowers the mean variance.
 
     Faces of a cube, which are the easiest to hold, are preferred if their gain is at least half of
     the largest, then edges, then corners. Directions closer than 20 degrees to a direction in
-    `seen`, shape (n, 3), are not proposed.
+    `positions`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -74,7 +74,7 @@ def next_direction(covariance: Floats, sd: float, seen: Floats) -> Floats:
     moved = columns_of_norm @ covariance
     gain = np.einsum('ij,jk,ik->i', moved, weight, moved)
     gain /= np.einsum('ij,ij->i', moved, columns_of_norm) + sd * sd
-    gain[np.max(_SPHERE @ seen.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
+    gain[np.max(_SPHERE @ positions.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
     good = gain >= max(0.5 * gain.max(), 1e-300)
     # Slices of `_SPHERE`: faces, edges and corners of a cube, and all other directions.
     tiers = slice(0, 6), slice(6, 18), slice(18, 26), slice(26, None)

@@ -106,7 +106,7 @@ def judge_windows(
                 'swapped',
                 'refusal',
                 f'the board temperature leads the case (correlation {correlation:.2f} of gradient '
-                'and rate): are the two sensors exchanged, or is that of the case loose?',
+                'and rate): are the two sensors exchanged, or is the case thermometer loose?',
             )
 
 
@@ -180,10 +180,10 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
                 f'unknown; five temperatures determine a cubic',
             )
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
-        seen, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
+        recorded, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
         yield advice(
             'directions',
-            f'only {seen} was recorded; errors in a ramp change sign with its direction, so '
+            f'only {recorded} was recorded; errors in a ramp change sign with its direction, so '
             f'record {missing}, too',
         )
     calm = windows.weight <= 0.5
@@ -282,8 +282,8 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     state, K = fit.posterior.state, fit.posterior.state.kappa * fit.regression.nominal_scale
     span = float(np.ptp(fit.windows.temperature))
     scale = float(np.abs(K / (1.0 if options.input == 'm/s^2' else K.mean()) - 1.0).max())
-    worst, skewed = float(np.abs(state.bias).max()), float(np.abs(state.misalignment).max())
-    largest = max(scale, worst / options.gravity, skewed)
+    worst, angle = float(np.abs(state.bias).max()), float(np.abs(state.misalignment).max())
+    largest = max(scale, worst / options.gravity, angle)
     is_none = largest < 1e-4 and raw < 2e-5 * options.gravity
     if is_none and span > 20.0 and determines_misalignment(state.up):
         yield Finding(
@@ -291,7 +291,7 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
             'refusal',
             f'there is nothing to correct: over {span:.0f} K |f| moves by {raw / MICRO_G:.1f} ug '
             f'RMS, scales differ by {1e6 * scale:.1f} ppm, biases reach {worst / MICRO_G:.1f} ug '
-            f'and misalignments {1e6 * skewed:.1f} urad: the samples have been compensated '
+            f'and misalignments {1e6 * angle:.1f} urad: the samples have been compensated '
             'already, and the calibration must be made from raw samples',
         )
 

@@ -43,7 +43,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
-                # Only some of the matrices need more jitter.
+                # Only the matrices without a factor get more jitter.
                 return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise
@@ -202,12 +202,12 @@ class Reduced:
         return _square(of_positions, of_bags), cross
 
 
-def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -> Reduced:
+def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floats) -> Reduced:
     """
     Eliminate the unknowns of positions and bags.
 
     normal: the normal equations in units of the noise
-    precision, away: inverse prior variances, and values less prior means, shape (n,)
+    precision, deviation: inverse prior variances, and values less prior means, shape (n,)
     """
     n_positions, n_own = layout.own.shape
     r, n_local = layout.start.shape[1], layout.n_local
@@ -221,13 +221,14 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, away: Floats) -
     )
     index = np.arange(n_own)
     block[:, index, index] += precision[layout.own]
-    cross[..., -1] -= (precision * away)[layout.own]
+    cross[..., -1] -= (precision * deviation)[layout.own]
     # Attitudes about which the data have no information keep their value.
     block[:, index, index] += np.einsum('pii->pi', block) <= 0.0
     positions = Blocks.of(block, cross)
     diagonal = np.einsum('pii->pi', starts[..., :r])
     starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
-    shares, prior = (starts, diagonal), np.stack((precision, precision * away))[:, layout.start]
+    shares = (starts, diagonal)
+    prior = np.stack((precision, precision * deviation))[:, layout.start]
     bags = _of_bags(_membership(layout), shares, prior)
     matrix = _of_unit(normal.unit, layout)
     matrix -= _square(positions.turned[..., r:], bags.turned)

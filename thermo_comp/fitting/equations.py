@@ -55,16 +55,16 @@ class Effects(NamedTuple):
     The effect of a state of the unknowns at the reference temperature.
 
     force: specific force along each axis in each position, shape (n_positions, 3)
-    across: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
-    read: reading without the bias, shape (n_positions, 3)
+    by_rotation: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
+    without_bias: reading without the bias, shape (n_positions, 3)
     nonlinear: sums of the nonlinear terms at the reference temperature and per kelvin, shape (2,
         n_positions, 3)
     slopes: derivatives of `nonlinear` by the force, of the same shape
     """
 
     force: Floats
-    across: Floats
-    read: Floats
+    by_rotation: Floats
+    without_bias: Floats
     nonlinear: Floats
     slopes: Floats
 
@@ -137,17 +137,17 @@ class Equations(Series):
         force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
         turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
         sizes = np.reshape(self._norm(state), (-1, 1, 1))
-        across = sizes * (state.kappa[:, None] * turned)
+        by_rotation = sizes * (state.kappa[:, None] * turned)
         if self.forces is None:
             nonlinear = np.zeros((2, 2, *force.shape))
         else:
             terms = np.stack(self.forces.terms(force))
             nonlinear = np.einsum('vpik,ijk->vjpi', terms, state.nonlinear.reshape(3, 2, -1))
-        return Effects(force, across, state.kappa * (force + nonlinear[0, 0]), *nonlinear)
+        return Effects(force, by_rotation, state.kappa * (force + nonlinear[0, 0]), *nonlinear)
 
     def tangent(self, state: State, layout: Layout, base: Base) -> Tangent:
         """Linearise the measurement equations about a state."""
-        force, across, read, _, _ = self.effects(state)
+        force, by_rotation, without_bias, _, _ = self.effects(state)
         along = (state.kappa * force)[..., None]
         n_starts, n_stretches = layout.start.shape[1], layout.stretch.shape[1]
         scaled, by_kappa, by_force = (base.size + k for k in range(3))
@@ -157,14 +157,14 @@ class Equations(Series):
         if self.forces is not None:
             by_radius = self.forces.by_radius(state.radius)[:, None, None] * along
         unknowns: list[tuple[Ints | list[int], Floats | float]] = [
-            ([by_force] * 2, across),
+            ([by_force] * 2, by_rotation),
             ([by_force] * n_stretches, along),
             ([0], 1.0),
-            (np.repeat(base.tilts, 2), np.tile(across, len(base.tilts))),
+            (np.repeat(base.tilts, 2), np.tile(by_rotation, len(base.tilts))),
             (starts, 1.0),
             ([by_kappa, 0], 1.0),
             (in_bias, 1.0),
-            (in_scale, read[..., None]),
+            (in_scale, without_bias[..., None]),
             self._by_coefficients(state, layout, base, scaled),
             ([by_force] * layout.radius.size, by_radius),
             ([by_force] * 3, self._by_misalignment(state)),
@@ -177,14 +177,14 @@ class Equations(Series):
             first += len(at)
         combined = self._combined(state, base, n_starts)
         n_bias, n_scale = 1 + len(in_bias), len(in_scale)
-        return Tangent(combined, place, factor, layout.n_local, n_bias, n_scale, read)
+        return Tangent(combined, place, factor, layout.n_local, n_bias, n_scale, without_bias)
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
         Return the combinations of a tangent: 1 + S s, the derivatives by kappa, by the force along
         the axis and by the initial lag states, and the residual.
         """
-        force, _, read, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
+        force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size, 4 + n_starts))
         result[:, :, 0, :3] = 1.0
@@ -194,7 +194,7 @@ class Equations(Series):
         result[:, :, base.t, 1] = bend_by_t[..., None]
         result[:, :, base.t, 2] = slope_by_t[..., None]
         if n_starts:
-            weight = (on_bias + read[..., None] * on_scale)[..., base.moved, None]
+            weight = (on_bias + without_bias[..., None] * on_scale)[..., base.moved, None]
             result[:, :, base.at_start, 3:-1] = weight * self.start_root[base.lag]
         result[..., -1] = self.misfit(state, base)
         return result
@@ -227,13 +227,13 @@ class Equations(Series):
 
     def misfit(self, state: State, base: Base) -> Floats:
         """Return the residual as combinations of the base series, (n_positions, 3, n_base)."""
-        force, across, read, (_, bend_by_t), _ = self.effects(state)
+        force, by_rotation, without_bias, (_, bend_by_t), _ = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size))
-        result[:, :, 0] = self.level - (read + state.bias + state.offset)
-        result[:, :, 1 : 1 + len(base.columns)] = -(on_bias + read[..., None] * on_scale)
+        result[:, :, 0] = self.level - (without_bias + state.bias + state.offset)
+        result[:, :, 1 : 1 + len(base.columns)] = -(on_bias + without_bias[..., None] * on_scale)
         result[:, :, base.t] = -(state.kappa * bend_by_t)[..., None]
-        result[:, :, base.tilts] = -np.einsum('pkt,pit->pik', state.tilt, across)
+        result[:, :, base.tilts] = -np.einsum('pkt,pit->pik', state.tilt, by_rotation)
         result[:, [0, 1, 2], base.measured] = 1.0
         return result
 
@@ -284,7 +284,7 @@ class Equations(Series):
         result[layout.up] = 0.0 if self.gravity else 1.0
         return result
 
-    def away(self, state: State, prior: Prior, layout: Layout) -> Floats:
+    def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
         """Return the unknowns less the mean of the prior, 0 for all but the unit's, (n,)."""
         result = as_vector(state, layout)
         if prior.informative is not None:

@@ -3,8 +3,8 @@
 """
 Owns the sequence of a fit, from sources to a calibration with its residuals and findings.
 
-Angles and norms of raw codes with an offset, as in offset binary, are meaningless. Therefore the
-code at zero force is subtracted before the fit and added to the bias afterwards.
+Angles and norms of raw codes with an offset, as in offset binary, are meaningless, so the code at
+zero force is subtracted before the fit and added to the bias afterwards.
 """
 
 from __future__ import annotations

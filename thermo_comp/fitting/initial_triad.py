@@ -85,7 +85,7 @@ def _refine(
     """
     Fit the triad from initial values; return also the RMS error of the norms [m/s^2].
 
-    The norms of few positions hardly determine some constants. Therefore the built-in prior of the
+    The norms of few positions hardly determine some constants, so the built-in prior of the
     constants is added, with the weight of norms that are known to 0.1 %.
     """
     one_g = float(np.median(gravity))

@@ -154,7 +154,7 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Sd for the estimate [rad]: the cross-axis sensitivity of good consumer MEMS.
     of_faces, sd = 2.5e-3, prior.misalignment_scale
-    # Faces that are set by hand, a few degrees off, are below 0.1; the edges of a cube have 0.3.
+    # The RMS of `by_element` is below 0.1 for faces set by hand, a few degrees off; 0.3 for edges.
     if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= of_faces:
         return prior
     return replace(prior, misalignment_sd=of_faces, unseen_misalignment_sd=sd)
@@ -179,8 +179,9 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
-    Their effect is nearly collinear with the curve, and its final value would be extrapolated. No
-    model uses slow columns; those linear in temperature enter the covariance, see `claim`.
+    The effect of a slow column is nearly collinear with the curve, and its final value would be
+    extrapolated. No model uses slow columns; those linear in temperature enter the covariance, see
+    `claim`.
     """
     model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])

@@ -77,16 +77,16 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
         if after.start_ns - before.end_ns <= longest_ns and up @ other > np.cos(np.radians(10.0))
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
-    near = _near(bag, gaps, [margin_s] * len(gaps))
+    beside = _beside_gaps(bag, gaps, [margin_s] * len(gaps))
     # If the noise is correlated, the level beside a gap is the mean over a time above `margin_s`.
-    margins = [max(_margin(part, quiet_sd), margin_s) for part in near]
+    margins = [max(_margin(part, quiet_sd), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
-        near = _near(bag, gaps, margins)
-    jumps = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(near, gaps, strict=True))
+        beside = _beside_gaps(bag, gaps, margins)
+    jumps = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(beside, gaps, strict=True))
     return tuple(jump for jump in jumps if jump is not None)
 
 
-def _near(
+def _beside_gaps(
     bag: ReducedBag, gaps: Sequence[tuple[float, float]], margins: Sequence[float]
 ) -> list[Floats]:
     """Collect the samples beside each gap: time, reading, angular rate or NaN, shape (n, 7)."""
@@ -101,9 +101,9 @@ def _near(
     return [np.concatenate(part) for part in parts]
 
 
-def _margin(near: Floats, quiet_sd: Floats) -> float:
+def _margin(samples: Floats, quiet_sd: Floats) -> float:
     """Return the duration of readings beside a gap: 60 time constants of the noise, 10..100 s."""
-    time, accel = near[:, 0], near[:, 1:4]
+    time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
     _, r = _place_and_colour(time, accel, quiet_sd)
@@ -112,10 +112,10 @@ def _margin(near: Floats, quiet_sd: Floats) -> float:
 
 
 def _examine(
-    near: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
+    samples: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
 ) -> Jump | None:
     """Test the readings beside a gap for a jump; None without a jump."""
-    time, accel, gyro = near[:, 0], near[:, 1:4], near[:, 4:]
+    time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
         return None

@@ -88,7 +88,8 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The scatter of a single fold is unknown: the smallest difference that counts.
+            # The standard error of a single fold is unknown: take the smallest difference that
+            # counts.
             return of_sums, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))

@@ -95,7 +95,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
             continue
         sizes = 3000, len(data.time)
         subset, full = (_PartCurves(windows, start, shape, n) for n in sizes)
-        lags = [subset.near(lag, axis) for axis, lag in enumerate(searched)]
+        lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
         residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
@@ -141,7 +141,7 @@ class _PartCurves:
         # Between the time constants tau of the columns the lag m is interpolated: m / tau is a
         # smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
         ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
-        knots = _even(np.append(0.0, self._taus))
+        knots = _interpolation_place(np.append(0.0, self._taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
         # The lag L_tau(g) of the gradient g is interpolated over tau; its limit at tau = 0 is g.
         of_case = [
@@ -206,7 +206,7 @@ class _PartCurves:
             best = self._better(axis, best, self._searched(axis, first, (0.2, 0.4, 0.3)))
         return best
 
-    def near(self, lag: Part, axis: int) -> Part:
+    def refined(self, lag: Part, axis: int) -> Part:
         """Return the lag with the smallest RMS residual in the neighbourhood of a lag."""
         if not lag.tau_s:
             return lag
@@ -298,7 +298,7 @@ class _PartCurves:
         if lag.tau_s:
             tau, second, of_case = lag
             for tau_s, share in zip((tau, second), Lag('board', tau, second).shares, strict=True):
-                at = _even(np.asarray(tau_s))
+                at = _interpolation_place(np.asarray(tau_s))
                 x -= share * tau_s * self._ratio(at)
                 if of_case:
                     x += of_case * share * self._gradient(at)
@@ -340,7 +340,7 @@ def _in_order(tau_s: float, second_tau_s: float, sensor_share: float) -> Part:
     return Part(longer, min(shorter, 0.89 * longer), sensor_share)
 
 
-def _even(tau_s: Floats) -> Floats:
+def _interpolation_place(tau_s: Floats) -> Floats:
     """Map time constants [s] to the interval 0 to 1, for the interpolation; 200 s become 0.5."""
     return np.asarray(tau_s / (tau_s + 200.0))
 

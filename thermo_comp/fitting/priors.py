@@ -154,8 +154,8 @@ def informative_priors(
         # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
         # QR factor of the covariance's factor, instead of a product, keeps the precision of nearly
         # equal parameters.
-        wider = correlation + (1e-6 + share) * np.eye(len(sd))
-        whitened = solve_triangular(np.linalg.cholesky(wider), scaled, lower=True)
+        widened = correlation + (1e-6 + share) * np.eye(len(sd))
+        whitened = solve_triangular(np.linalg.cholesky(widened), scaled, lower=True)
         root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))
         root = root * np.sign(np.diag(root))[:, None]
         result.append(InformativePrior(mean, root))
@@ -195,7 +195,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     for calibration in calibrations:
         for column in prior_columns(calibration):
             for common, _ in _on_common_lags(column):
-                keys.setdefault(_alike(common), []).append(common)
+                keys.setdefault(_without_range(common), []).append(common)
     columns = [
         replace(
             key,
@@ -204,20 +204,20 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
         )
         for key, columns in keys.items()
     ]
-    like = _like(calibrations, columns)
+    template = _template(calibrations, columns)
     K = np.array([constants_of(calibration).scale for calibration in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
-    units = [_relative_to(calibration, like, mean_K) for calibration in calibrations]
+    units = [_relative_to(calibration, template, mean_K) for calibration in calibrations]
     vectors = np.array([vector for vector, _ in units])
     mean = vectors.mean(axis=0)
-    away = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
-    scatter = (1.0 + 1.0 / len(vectors)) * _scatter(away, parameter_layout(like))
+    deviations = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
+    scatter = (1.0 + 1.0 / len(vectors)) * _scatter(deviations, parameter_layout(template))
     # Parameters that none of the units determined keep the uncertainty of their own prior.
     scatter += np.mean([covariance for _, covariance in units], axis=0)
-    return with_parameters(like, mean_K, mean, scatter)
+    return with_parameters(template, mean_K, mean, scatter)
 
 
-def _scatter(away: Floats, layout: ParameterLayout) -> Floats:
+def _scatter(deviations: Floats, layout: ParameterLayout) -> Floats:
     """
     Return the covariance of units from their distances to the mean / sqrt(n - 1), (n, p).
 
@@ -225,14 +225,14 @@ def _scatter(away: Floats, layout: ParameterLayout) -> Floats:
     scatter of a few units they have correlations by chance, by which one position would determine
     all of them. The correlations of the curves are multiplied by 1 - share [1]_.
     """
-    kind = np.zeros(away.shape[1], np.int64)
+    kind = np.zeros(deviations.shape[1], np.int64)
     levels = [[block.static, block.dynamic] for block in (*layout.bias, *layout.scale)]
     for number, places in enumerate((*levels, *range(layout.misalignment, len(kind))), 1):
         kind[places] = number
-    scatter: Floats = away.T @ away * (kind[:, np.newaxis] == kind)
+    scatter: Floats = deviations.T @ deviations * (kind[:, np.newaxis] == kind)
     curves = np.flatnonzero((kind == 0) & (np.diag(scatter) > 0.0))
     sd = np.sqrt(np.diag(scatter))
-    relative, n = away[:, curves] / sd[curves], len(away)
+    relative, n = deviations[:, curves] / sd[curves], len(deviations)
     correlation = relative.T @ relative
     variance = n / (n - 1.0) * ((relative**2).T @ relative**2 - correlation**2 / n)
     others = ~np.eye(len(curves), dtype=bool)
@@ -242,7 +242,7 @@ def _scatter(away: Floats, layout: ParameterLayout) -> Floats:
     return scatter
 
 
-def _alike(column: Column) -> Column:
+def _without_range(column: Column) -> Column:
     """Return a column without the fields that differ between units of a type: range and rest."""
     return replace(column, range=(0.0, 1.0), rest_k=0.0)
 
@@ -300,7 +300,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 
 
 def _relative_to(
-    calibration: Calibration, like: Calibration, mean_K: Floats
+    calibration: Calibration, template: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
     """Return a unit's parameters and covariance in the layout of `like`, relative to `mean_K`."""
     if calibration.posterior is None:
@@ -308,15 +308,15 @@ def _relative_to(
             f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '
             'of a population'
         )
-    common_columns = [_alike(column) for column in prior_columns(like)]
+    common_columns = [_without_range(column) for column in prior_columns(template)]
     unit_columns = prior_columns(calibration)
     terms = np.zeros((len(common_columns), len(unit_columns)))
     for k, column in enumerate(unit_columns):
         for common, share in _on_common_lags(column):
-            terms[common_columns.index(_alike(common)), k] += share
+            terms[common_columns.index(_without_range(common)), k] += share
     scale = constants_of(calibration).scale
     values, factor = parameters_of(calibration), np.ones(calibration.posterior.n_parameters)
-    layout, into = parameter_layout(calibration), parameter_layout(like)
+    layout, into = parameter_layout(calibration), parameter_layout(template)
     for axis, (bias, relative) in enumerate(zip(layout.bias, layout.scale, strict=True)):
         factor[bias.rows] = mean_K[axis] / scale[axis]
         values[[relative.static, relative.dynamic]] = np.log(scale[axis] / mean_K[axis])
@@ -342,7 +342,7 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
     ]
 
 
-def _like(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
+def _template(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
     """Return a calibration with the union of the ranges and the given columns, all weights 0."""
     first = calibrations[0]
     slow = [[axis.residual_sd_m_s2 for axis in each.static.axes()] for each in calibrations]

@@ -94,9 +94,9 @@ class Point:
         return self.regression.precision(self.prior, self.layout)
 
     @cached_property
-    def away(self) -> Floats:
+    def deviation(self) -> Floats:
         """The unknowns of the state less the mean of the prior, shape (n,)."""
-        return self.regression.away(self.state, self.prior, self.layout)
+        return self.regression.deviation(self.state, self.prior, self.layout)
 
     @cached_property
     def square(self) -> Floats:
@@ -113,11 +113,11 @@ class Point:
     @cached_property
     def prior_misfit(self) -> float:
         """-2 times the log density of the state, without the constants of the prior."""
-        size = float(self.precision @ self.away**2)
+        size = float(self.precision @ self.deviation**2)
         if self.prior.informative is not None:
             # With an informative prior the diagonal `precision` is 0 for the unit's unknowns.
             root = self.prior.informative.root
-            size += float(np.sum((root @ self.away[: self.layout.n_unit]) ** 2))
+            size += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
         if self._has_common_start:
             size += float(np.sum(self.state.start.sum(axis=0) ** 2)) / self._common_variance
         return size
@@ -163,7 +163,7 @@ class Point:
 
     def _reduced(self, normal: Normal) -> Reduced:
         in_sigmas = normal.scaled(self.prior.sigma**-2.0)
-        reduced = eliminate(in_sigmas, self.layout, self.precision, self.away)
+        reduced = eliminate(in_sigmas, self.layout, self.precision, self.deviation)
         if self._has_common_start:
             total = self.state.start.sum(axis=0)
             reduced = reduced.with_prior_of_sum(total, self._common_variance)
@@ -188,19 +188,19 @@ class Point:
         their normal equations, see `Reduced.matrix`.
         """
         n = self.layout.n_unit
-        information, gradient, away = matrix[:n, :n], matrix[:n, n], self.away[:n]
+        information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
         if self.prior.informative is None:
             precision = self.precision[:n]
             hessian: Floats = information.copy()
             hessian[np.diag_indices(n)] += precision
             factor = factored(hessian)
-            return solved(factor, gradient - precision * away), factor
+            return solved(factor, gradient - precision * deviation), factor
         # In units of the prior's standard deviations the normal equations are well conditioned.
         root = self.prior.informative.root
         turned = solve_triangular(root, information, trans='T')
         turned = solve_triangular(root, turned.T, trans='T')
         factor = factored((turned + turned.T) / 2.0 + np.eye(n))
-        right = solve_triangular(root, gradient, trans='T') - root @ away
+        right = solve_triangular(root, gradient, trans='T') - root @ deviation
         return solve_triangular(root, solved(factor, right)), root.T @ factor
 
     @cached_property

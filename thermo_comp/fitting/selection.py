@@ -219,7 +219,7 @@ class Growth:
         return np.where(np.isin(self._names, groups), new, chosen.typical)
 
 
-def better_beginning(fits: Sequence[Trial]) -> Trial:
+def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose the fit that is better on left-out data: begun with a small or with a large prior sd of
     mounting offsets. If neither is better, the large sd must be likelier by `TRIAL_GAIN`. Mounting
@@ -256,12 +256,12 @@ def select(
     if prior.offset_scale > 0.0:
         priors.append(replace(prior, offset_sd=float(prior.sigma.mean())))
     fits = [growth.fit(growth.forced, state, initial, candidates.typical) for initial in priors]
-    constants = first = better_beginning(fits)
+    constants = first = better_start(fits)
     trials = [constants]
     if CURVE in growth.free:
         # The curve is added without a test: it may improve the score only with other groups.
         if regression.windows.has_drifts:
-            curve = better_beginning([growth.extended(fit, (CURVE,)) for fit in fits])
+            curve = better_start([growth.extended(fit, (CURVE,)) for fit in fits])
             downweigh(regression, curve.posterior)
             first = growth.extended(curve)
         else:
@@ -270,7 +270,7 @@ def select(
     parts = None
     if PART in growth.free:
         # Curves over the temperatures of parts take the place of the curve over that of the board.
-        parts = better_beginning([growth.extended(fit, (PART,)) for fit in fits])
+        parts = better_start([growth.extended(fit, (PART,)) for fit in fits])
     chosen, tried = _grown(growth, first, parts, progress)
     trials += tried
     if chosen is not constants and not is_better(constants.score, chosen.score):
@@ -301,8 +301,8 @@ def _grown(
     is_without_bends = BEND in growth.free and BEND not in chosen.groups
     if is_without_bends and not chosen.is_complete:
         # A change of slope of a part is visible only in a model with the lag of this part, not in
-        # a model whose products and squares approximate the lag. A model of bends is continued if
-        # its drift is less than three times that of the chosen model.
+        # a model whose products and squares approximate the lag. Further groups are added to a
+        # model with bends if its drift is less than three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
             last, tried = growth.added(with_bends[0], progress)

@@ -27,7 +27,7 @@ _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 
 @dataclass(frozen=True)
-class Course:
+class RateHistory:
     """One thermometer's rate over one bag, on a grid of ten seconds, and its noise [K/s]."""
 
     rate: Floats
@@ -55,13 +55,13 @@ def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
     base = DetectorSettings()
     board = learn_thermometer([bag.board for bag in bags], base.board)
     case = learn_thermometer([bag.case for bag in bags], base.case)
-    courses = _courses([bag.case for bag in bags], case.noise_sd_c, case.quantum_c)
-    smallest = min(base.smallest_ramp_k_min, _slowest_ramp(courses, base.smallest_ramp_k_min))
+    histories = _rate_histories([bag.case for bag in bags], case.noise_sd_c, case.quantum_c)
+    smallest = min(base.smallest_ramp_k_min, _slowest_ramp(histories, base.smallest_ramp_k_min))
     return replace(
         base,
         smallest_ramp_k_min=smallest,
         relaxed_rate_k_min=min(base.relaxed_rate_k_min, 0.4 * smallest / OBVIOUS_SHARE),
-        ripple_c=_ripple(courses, case.lag_s, base.ripple_c),
+        ripple_c=_ripple(histories, case.lag_s, base.ripple_c),
         board=board,
         case=case,
     )
@@ -77,18 +77,18 @@ def learn_thermometer(
     quantum = quantum_of(np.concatenate(long))
     # The noise is at least 0.1 mK, because with less the recursion would follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
-    courses = _courses(recorded, noise, quantum)
-    with_ramps = [course for course in courses if course.fastest > course.least_ramp]
+    histories = _rate_histories(recorded, noise, quantum)
+    with_ramps = [history for history in histories if history.fastest > history.least_ramp]
     if not with_ramps:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
-    fastest = max(course.fastest for course in with_ramps)
+    fastest = max(history.fastest for history in with_ramps)
     # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. The
     # second derivative is estimated from the difference of two rates one minute apart.
     lags = []
-    for course in with_ramps:
-        bend = np.abs(course.rate[_BINS_PER_SIDE:] - course.rate[:-_BINS_PER_SIDE])
-        if (steepest := float(np.quantile(bend, 0.995)) / (_BIN_S * _BINS_PER_SIDE)) > 0.0:
-            lags.append(course.fastest / steepest)
+    for history in with_ramps:
+        change = np.abs(history.rate[_BINS_PER_SIDE:] - history.rate[:-_BINS_PER_SIDE])
+        if (steepest := float(np.quantile(change, 0.995)) / (_BIN_S * _BINS_PER_SIDE)) > 0.0:
+            lags.append(history.fastest / steepest)
     lag = float(np.clip(np.median(lags), 30.0, 3600.0)) if lags else base.lag_s
     return replace(
         base,
@@ -125,7 +125,9 @@ def _noise_of(values: Sequence[Floats], quantum: float) -> float:
     return float(np.sqrt(variance))
 
 
-def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list[Course]:
+def _rate_histories(
+    recorded: Sequence[Readings], noise: float, quantum: float
+) -> list[RateHistory]:
     """Return the rate in each bag with at least 30 readings and 6 minutes."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
@@ -144,30 +146,30 @@ def _courses(recorded: Sequence[Readings], noise: float, quantum: float) -> list
         per_side = max(1.0, side * (len(time) - 1) / time[-1])
         # Rounding errors are fully correlated while the temperature stays within a quantum.
         spread = np.sqrt(2.0 * (noise**2 / per_side + quantum**2 / 12.0))
-        result.append(Course(rate, float(spread) / side))
+        result.append(RateHistory(rate, float(spread) / side))
     return result
 
 
-def _slowest_ramp(courses: Sequence[Course], usual: float) -> float:
+def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
     """Return 0.7 times the slowest ramp longer than 10 min, at least `RAMP_K_MIN` [K/min]."""
     slowest = usual / 0.7
-    for course in courses:
-        is_ramp = np.abs(course.rate) > max(course.least_ramp, 0.1 / 60.0)
+    for history in histories:
+        is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
         edges = np.flatnonzero(np.diff(is_ramp, prepend=False, append=False))
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             if (stop - start) * _BIN_S > 600.0:
-                middle = float(np.quantile(np.abs(course.rate[start:stop]), 0.9)) * 60.0
+                middle = float(np.quantile(np.abs(history.rate[start:stop]), 0.9)) * 60.0
                 slowest = min(slowest, middle)
     return max(0.7 * slowest, RAMP_K_MIN)
 
 
-def _ripple(courses: Sequence[Course], lag_s: float, usual: float) -> float:
+def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> float:
     """Return the amplitude of the ambient ripple in soaks [K], from rates and lag."""
-    rates = [course.rate[course.is_resting] for course in courses]
+    rates = [history.rate[history.is_resting] for history in histories]
     resting = np.concatenate(rates) if rates else np.zeros(0)
     if len(resting) < 60:
         return usual
-    noise = float(np.median([course.rate_sd for course in courses]))
+    noise = float(np.median([history.rate_sd for history in histories]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
     # A ripple below the noise of the rates is not detected; the assumed ripple is at most the

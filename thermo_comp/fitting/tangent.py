@@ -48,10 +48,10 @@ class Tangent:
     The last "unknown" is the residual, measured minus predicted.
 
     combined: the combinations, shape (n_positions, 3, n_base, n_combined)
-    place: series of each unknown, shape (k + 1,)
+    place: index of the series of each unknown, shape (k + 1,)
     factor: factor of the series of each unknown, shape (n_positions, 3, k + 1)
     n_local: number of unknowns of position and bag
-    n_bias: number of unknowns with factor 1 after kappa: bias and its weights
+    n_bias: number of unknowns after kappa with factor 1: the bias and its weights
     n_scale: number of weights of the scale, which follow those of the bias
     scale: factor of the weights of the scale, shape (n_positions, 3)
     """

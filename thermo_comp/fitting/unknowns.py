@@ -307,7 +307,8 @@ class Layout:
     def columns(self) -> Ints:
         """
         The unknowns of each axis in the order of `Tangent`, as columns of the equations of a
-        position: its own unknowns, the initial lag states, the unit's, the residual; shape (3, k).
+        position: unknowns of the position, initial lag states, unknowns of the unit, residual;
+        shape (3, k).
         """
         n_own, r = self.own.shape[1], self.start.shape[1]
         starts = np.tile(n_own + np.arange(r), (3, 1))

@@ -75,13 +75,13 @@ def fit_fleet(
     n_workers: int | None = None,
     client: Any = None,
     earlier: Sequence[Row] = (),
-    tell: Callable[[int, int, Row | None], None] = lambda *_: None,
+    progress: Callable[[int, int, Row | None], None] = lambda *_: None,
 ) -> FleetResult:
     """
     Fit all units without results; ThermoCompError or OutputError if no unit can be fitted.
 
-    `tell` is called with the numbers of finished and of all tests, and None before the first fit,
-    or the row of the last fit.
+    `progress` gets the numbers of finished and of all tests, and None before the first fit, or the
+    row of the last fit.
     """
     _require_packages()
     storage = Storage(url)
@@ -92,16 +92,16 @@ def fit_fleet(
 
         def fitted(some: Sequence[FoundUnit], how: FleetOptions) -> dict[str, Row]:
             nonlocal client
-            rows = {one.name: row for one in some if (row := results.look_up(one, how))}
+            rows = {unit.name: row for unit in some if (row := results.look_up(unit, how))}
             missing = [unit for unit in some if unit.name not in rows]
             if missing and client is None:
                 most = min(n_workers or os.cpu_count() or 1, len(some))
                 client = stack.enter_context(connected(scheduler, most))
-            tell(len(rows), len(some), None)
+            progress(len(rows), len(some), None)
             for unit, outcome in run(client, storage.address, missing, how) if missing else ():
                 rows[unit.name] = results.store(unit, how, outcome)
                 done.add(unit.name)
-                tell(len(rows), len(some), rows[unit.name])
+                progress(len(rows), len(some), rows[unit.name])
             return rows
 
         rows = fitted(units, options)

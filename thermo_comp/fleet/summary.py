@@ -30,7 +30,7 @@ _LEAST = 1e-12
 #: The columns in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
 #: The columns whose changes between two tests are drift.
-_CONSTANTS = tuple(one for one in QUANTITIES if one.sd and '_slope_' not in one.name)
+_CONSTANTS = tuple(column for column in QUANTITIES if column.sd and '_slope_' not in column.name)
 
 
 class Spread(NamedTuple):
@@ -108,11 +108,15 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
     )
     serials = {str(row['name']): str(row['serial']) for row in fitted}
     outliers = [
-        Outlier(name, serials[name], label, value, one.middle, z, one.quantity.unit, one.limit)
-        for one in spreads
-        for label in [one.quantity.label]
-        for name, value, z in zip(one.names, one.values.tolist(), one.z.tolist(), strict=True)
-        if abs(z) > one.limit
+        Outlier(
+            name, serials[name], column.label, value, spread.middle, z, column.unit, spread.limit
+        )
+        for spread in spreads
+        for column in [spread.quantity]
+        for name, value, z in zip(
+            spread.names, spread.values.tolist(), spread.z.tolist(), strict=True
+        )
+        if abs(z) > spread.limit
     ]
     wide = Verdict.WIDE.value
     # Drop the amount from the verdict, so that equal verdicts count together.
@@ -136,13 +140,13 @@ def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
     if not is_counted.any():
         return None
     middle = float(np.median(values[is_counted]))
-    away = _away(quantity, values, middle)
-    sd = _robust_sd(away[is_counted])
+    deviations = _deviations(quantity, values, middle)
+    sd = _robust_sd(deviations[is_counted])
     claimed = np.hypot(sd, own_sd)
-    z = np.divide(away, claimed, out=np.zeros_like(away), where=claimed > 0.0)
+    z = np.divide(deviations, claimed, out=np.zeros_like(deviations), where=claimed > 0.0)
     names = tuple(str(row['name']) for row in known)
     if quantity.by == 'ppm':
-        values, middle = away, 0.0
+        values, middle = deviations, 0.0
     elif quantity.by == 'logarithm':
         sd *= middle
     return Spread(quantity, names, values, is_counted, middle, sd, z)
@@ -155,12 +159,12 @@ def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)
-    # The spread of eight units or, in a small fleet, of most of them, is the first that is used.
+    # The first spread is that of eight units or, in a small fleet, of more than half of the units.
     first = min(_UNITS_NEEDED, n // 2 + 1)
     n_counted = 0
     for k in range(first, n + 1):
         best = values[order[:k]]
-        spread = _robust_sd(_away(quantity, best, float(np.median(best))))
+        spread = _robust_sd(_deviations(quantity, best, float(np.median(best))))
         if own_sd[order[k - 1]] > _LARGEST_SD * spread:
             break
         n_counted = k
@@ -169,7 +173,7 @@ def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
     return is_counted
 
 
-def _away(quantity: Column, values: Floats, middle: float) -> Floats:
+def _deviations(quantity: Column, values: Floats, middle: float) -> Floats:
     """Return the distances of values from the median: by value, in ppm, or by logarithm."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
@@ -178,8 +182,8 @@ def _away(quantity: Column, values: Floats, middle: float) -> Floats:
     return values - middle
 
 
-def _robust_sd(away: Floats) -> float:
-    return 1.4826 * float(np.median(np.abs(away)))
+def _robust_sd(deviations: Floats) -> float:
+    return 1.4826 * float(np.median(np.abs(deviations)))
 
 
 def outlier_limit(n_units: int, n_comparisons: int) -> float:

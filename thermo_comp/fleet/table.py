@@ -71,13 +71,13 @@ _TABLE = (
     ('is_whole', 'whole', '1 if the bags determine every parameter: then the prior may use them'),
     ('prior', 'text', 'SHA-256 of the prior.yaml used in the fit'),
     ('start', 'text', 'UTC of the first sample'),
-    ('hours', 'number', 'length of the bags together'),
+    ('hours', 'number', 'total length of the bags'),
     ('gravity_m_s2', 'number', 'local gravity used'),
     ('reference_temperature_c', 'number', 'T_ref'),
     ('lowest_c', 'number', 'lower end of the calibrated range'),
     ('highest_c', 'number', 'upper end of the calibrated range'),
-    ('cooling_k_min', 'number', 'fastest fall of the board in the range'),
-    ('heating_k_min', 'number', 'fastest rise of the board in the range'),
+    ('cooling_k_min', 'number', 'fastest fall of the board temperature calibrated'),
+    ('heating_k_min', 'number', 'fastest rise of the board temperature calibrated'),
     ('scale_{0}', 'number', '{1}: scale factor at T_ref, input units per m/s^2'),
     ('scale_sd_{0}_ppm', 'number', '{1}: standard deviation of the scale factor'),
     ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the static scale at T_ref'),
@@ -89,7 +89,11 @@ _TABLE = (
     ('m_{0}_urad', 'number', '`{1}`'),
     ('m_sd_{0}_urad', 'number', 'standard deviation of `{1}`'),
     ('noise_{0}_ug_sqrt_hz', 'number', '{1}: white noise'),
-    ('board_lag_s', 'number', 'lag of the board behind the case in ramps; negative: it leads'),
+    (
+        'board_lag_s',
+        'number',
+        'lag of the board behind the case in ramps; negative: the board leads',
+    ),
     ('window_s', 'number', 'length of the windows at rest'),
     ('raw_ug', 'number', '|f| - g at rest, RMS, constants at T_ref only'),
     ('static_ug', 'number', '|f| - g at rest, RMS, static regime'),
@@ -253,7 +257,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
     types = {'text': pa.string(), 'whole': pa.int64(), 'number': pa.float64()}
     schema = pa.schema(
-        [pa.field(one.name, types[one.kind], metadata={'meaning': one.meaning}) for one in COLUMNS]
+        [pa.field(c.name, types[c.kind], metadata={'meaning': c.meaning}) for c in COLUMNS]
     )
     buffer = pa.BufferOutputStream()
     parquet.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer)

@@ -28,7 +28,7 @@ _SURE_SDS = 3.0
 # |f|.
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_MISS = 1e-5, 1e-8
 # Number of consecutive windows that count as one, since thermal residuals are correlated.
-_ALIKE = 6.0
+_CORRELATED_WINDOWS = 6.0
 
 
 @dataclass(frozen=True)
@@ -164,13 +164,13 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
     sections, windows, tolerance = judgement.sections, judgement.windows, judgement.tolerance
     full, outside, left_out = sections['all'], sections['outside'], judgement.left_out_rms
     if not full.n:
-        seen = _ranges(windows.board, windows.rate * 60.0)
+        judged = _ranges(windows.board, windows.rate * 60.0)
         sets = calibration.static, calibration.dynamic
         known = _ranges(
-            np.ravel([one.temperature_range_c for one in sets]),
-            np.ravel([one.rate_range_k_min for one in sets]),
+            np.ravel([each_set.temperature_range_c for each_set in sets]),
+            np.ravel([each_set.rate_range_k_min for each_set in sets]),
         )
-        text = f'all {_windows(outside.n, windows)} lie there, at {seen}; calibrated at {known}'
+        text = f'all {_windows(outside.n, windows)} lie there, at {judged}; calibrated at {known}'
         return Verdict.OUTSIDE, f'{text}; {_numbers(outside)}'
     worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
@@ -201,7 +201,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
     if kind is Verdict.SWAPPED:
         parts.insert(0, SWAPPED)
     if judgement.moved:
-        parts.append('moved: ' + ', '.join(judgement.moved))
+        parts.append('shifted: ' + ', '.join(judgement.moved))
     if outside.n:
         parts.append(
             f'{_windows(outside.n, windows)} outside the calibrated ranges not judged: '
@@ -239,20 +239,20 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     residual = windows.residual
     scatter = means_by(windows.position, residual**2) - means_by(windows.position, residual) ** 2
     count = np.unique(windows.position, return_counts=True)[1]
-    variance = 1.0 / known + scatter / np.maximum(count / _ALIKE, 1.0)
+    variance = 1.0 / known + scatter / np.maximum(count / _CORRELATED_WINDOWS, 1.0)
     sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_MISS)
     # The equations of the norms, and of the misalignment's prior, are linear in the small shifts.
     sizes = np.linalg.norm(force, axis=1)
-    seen = norm_columns(force / sizes[:, None]) / sd[:, None]
-    seen = np.vstack(
-        (seen, np.eye(9)[6:] / np.maximum(misalignment_sd, _SMALLEST_MISALIGNMENT_SD)[:, None])
+    rows = norm_columns(force / sizes[:, None]) / sd[:, None]
+    rows = np.vstack(
+        (rows, np.eye(9)[6:] / np.maximum(misalignment_sd, _SMALLEST_MISALIGNMENT_SD)[:, None])
     )
-    misses = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
-    shift = np.linalg.lstsq(seen, misses, rcond=None)[0]
+    residuals = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
+    shift = np.linalg.lstsq(rows, residuals, rcond=None)[0]
     # Residuals in excess of the claimed errors increase the sd of the shifts.
-    freedom, left = len(sd) - 6, float(np.sum((misses - seen @ shift) ** 2))
+    freedom, left = len(sd) - 6, float(np.sum((residuals - rows @ shift) ** 2))
     excess = max(1.0, left / freedom) if freedom > 0 else 1.0
-    spread = np.sqrt(np.diag(np.linalg.pinv(seen.T @ seen)) * excess)
+    spread = np.sqrt(np.diag(np.linalg.pinv(rows.T @ rows)) * excess)
     bias, scale = (np.stack((shift[k], spread[k]), axis=1) for k in (slice(3), slice(3, 6)))
     return tuple(AxisShift(*row) for row in np.hstack((bias * gravity, scale)).tolist())
 

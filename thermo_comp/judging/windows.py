@@ -213,22 +213,23 @@ def _table(
                 path=bag.source.name,
             )
         sums: list[_Table] = [np.zeros(0, kind)]
-        for one in bag.intervals:
-            n = one.n_whole // per * per
+        for rest in bag.intervals:
+            n = rest.n_whole // per * per
             rows = np.zeros(n, kind)
             rows['bag'], rows['position'] = number, n_positions
-            begin_s = one.begin_s + bag.window_s * np.arange(n)
+            begin_s = rest.begin_s + bag.window_s * np.arange(n)
             rows['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
-            rows['count'], rows['time'], rows['mean'] = one.count[:n], one.time[:n], one.mean[:n]
+            rows['count'], rows['time'] = rest.count[:n], rest.time[:n]
+            rows['mean'] = rest.mean[:n]
             rows['gyro'] = np.nan
             rows['size'] = gravity
             if (known := bag.source.force) is not None:
                 first_ns = bag.start_ns - round(bag.since_s * 1e9)
-                size = known.of(one.start_ns, one.end_ns, first_ns)
+                size = known.of(rest.start_ns, rest.end_ns, first_ns)
                 rows['size'] = size.norm(gravity)
                 rows['size_sd'] = np.hypot(size.sd, known.radius_part(size, gravity))
-            if n_gyro and one.angular_rate is not None:
-                rows['gyro'][:, :3] = one.angular_rate[:n]
+            if n_gyro and rest.angular_rate is not None:
+                rows['gyro'][:, :3] = rest.angular_rate[:n]
             sums.append(rows)
             n_positions += 1
         whole = np.concatenate(sums)

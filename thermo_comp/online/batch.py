@@ -216,7 +216,7 @@ def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
 
 def _line(correction: Correction, segments: Segments, slow: Floats) -> Floats:
     """Evaluate `Correction.line` for segments, with the slow part of their variance."""
-    start, end = (np.array([one[at] for one, _ in segments]).T for at in (4, 5))
+    start, end = (np.array([segment[at] for segment, _ in segments]).T for at in (4, 5))
     excess = np.array([segment.noise_excess for segment, _ in segments])
     return correction.line(start, end, slow, excess)
 
@@ -233,7 +233,7 @@ def _corrected(
     angular rates and their variances, (6, n).
     """
     each = [segment for segment, _ in segments]
-    start_ns = np.array([one.start_ns for one in each], dtype=np.int64)
+    start_ns = np.array([segment.start_ns for segment in each], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
     order = range(6) if correction is None else _COLUMNS
     is_nonlinear = correction is not None and correction.of_force is not None

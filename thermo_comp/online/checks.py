@@ -209,8 +209,8 @@ class GravityCheck:
         )
         is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
         variance = max(variance_along(force, covariance), noise / 3.0)
-        miss = math.hypot(*force) - self.gravity
-        is_off = abs(miss) > self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
+        residual = math.hypot(*force) - self.gravity
+        is_off = abs(residual) > self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
         self._is_resting = is_near and not self._off
         if not is_off or not (is_near if self._off else was_resting):
             self._off = []
@@ -221,9 +221,10 @@ class GravityCheck:
         if stamp_ns - self._off_ns >= STEP_NS:
             self._is_against, self._n_alike, self.is_refuted = True, REFUTING_WINDOWS, True
             mean = [math.fsum(values) / len(self._off) for values in zip(*self._off, strict=True)]
-            miss, n = math.hypot(*mean) - self.gravity, self.result.n_windows if self.result else 0
+            residual = math.hypot(*mean) - self.gravity
+            n = self.result.n_windows if self.result else 0
             self._weight, self._last_mean, self._forces = 0.0, mean, []
-            self.result = GravityResidual(miss, math.sqrt(variance), n, True)
+            self.result = GravityResidual(residual, math.sqrt(variance), n, True)
             self._off = []
 
     def _close(self, covariance: Sequence[float], noise_variance: float) -> None:
@@ -260,12 +261,12 @@ class GravityCheck:
         sd = math.sqrt(sd**2 + gain * (variance - sd**2))
         self.result = GravityResidual(residual, sd, n + 1, is_still)
 
-    def _judge(self, miss: float, sd: float) -> bool:
+    def _judge(self, residual: float, sd: float) -> bool:
         """
         Count consecutive windows with equal verdicts; return whether the verdict has changed.
         """
         was_against = self._is_against
-        is_against = miss > self._tolerance + REFUTING_SIGMAS * sd
+        is_against = residual > self._tolerance + REFUTING_SIGMAS * sd
         self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1
         self._is_against = is_against
         if self._n_alike >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):

@@ -320,7 +320,8 @@ class Compensator:
         if stamp_ns is None or (board_ns is None and not thermal.is_unmeasured):
             return CompensatorStatus(stamp_ns, faults, ahead_s)
         board_age_s, case_age_s = (
-            math.inf if one is None else (stamp_ns - one) * 1e-9 for one in (board_ns, case_ns)
+            math.inf if used_ns is None else (stamp_ns - used_ns) * 1e-9
+            for used_ns in (board_ns, case_ns)
         )
         # The board temperature is stale at half the time-out at the latest: a warning precedes the
         # error.

@@ -245,7 +245,7 @@ class ThermalSide:
         return self._slow_rows
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
-        """Return the state of the slow part of a segment's variance, held for `SLOW_NS`."""
+        """Return the thermal state that determines the slow part of the variance for `SLOW_NS`."""
         # The first readings after a start do not show the rate yet, on which the unknown initial
         # lag states depend: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS

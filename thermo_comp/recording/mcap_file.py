@@ -147,8 +147,8 @@ class McapFile(BagFile):
         except Exception:  # noqa: BLE001 - damaged bytes surface as nearly any exception type
             return
         counts, n_messages = text.channel_message_counts, text.message_count
-        channels: dict[int, Channel] = {one.id: one for one in records_of.get(Channel, [])}
-        chunks = sorted(records_of.get(ChunkIndex, []), key=lambda one: one.chunk_start_offset)
+        channels: dict[int, Channel] = {c.id: c for c in records_of.get(Channel, [])}
+        chunks = sorted(records_of.get(ChunkIndex, []), key=lambda index: index.chunk_start_offset)
         spans = [Span(*_SPAN_FIELDS(chunk)) for chunk in chunks]
         if (
             sum(counts.values()) != n_messages

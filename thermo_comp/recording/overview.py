@@ -142,7 +142,7 @@ def survey_recording(
     still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
     cause = causes.cause(reduced, STILL_SD) if n > 1 else ''
     surveys = ((name, survey_thermometer(parts)) for name, parts in readings.items())
-    thermometers = {name: one for name, one in surveys if one is not None}
+    thermometers = {name: survey for name, survey in surveys if survey is not None}
     findings = [
         (info.truncated, f'cut off: {info.truncated}'),
         (reader.apart, 'a fit needs one clock for all'),

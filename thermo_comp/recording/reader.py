@@ -88,7 +88,7 @@ class RecordingReader(ExitStack):
         #: Time from the bag's first sample to the part of the bag that is read [s]; set when
         #: the first sample is read.
         self.since_s = 0.0
-        self.apart = ''  # warning, if any so far, about a thermometer on another clock
+        self.apart = ''  # warning about a thermometer on another clock, if found so far
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
         for role, path in selected.fields.items():
@@ -193,7 +193,7 @@ class RecordingReader(ExitStack):
         if not self._files:
             raise RecordingError('the recording is closed', self.info.path)
         for file in self._files:
-            channels = {number: one for number, one in file.topics.items() if one.name in names}
+            channels = {k: topic for k, topic in file.topics.items() if topic.name in names}
             for topic in channels.values():
                 if topic.encoding not in encodings:
                     reason = f'its messages are encoded as {shown(topic.encoding)!r}, expected cdr'

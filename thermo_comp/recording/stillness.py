@@ -170,7 +170,7 @@ class CellAccumulator:
         spread = np.maximum(square - count[:, None] * mean**2, 0.0)
         variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
         rate, rate_variance = (
-            one[:, 3:] if one.shape[1] > 3 else np.zeros((len(one), 3)) for one in (mean, variance)
+            x[:, 3:] if x.shape[1] > 3 else np.zeros((len(x), 3)) for x in (mean, variance)
         )
         cell_s = self._cell_ns * 1e-9
         return Cells(
@@ -196,8 +196,8 @@ class CellAccumulator:
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
             # Samples that are stamped on their arrival come in bursts at a constant interval, of 5
-            # s at most, as of a buffer that is polled; the pauses of a tumble by hand differ. Two
-            # bursts are in a cell.
+            # s at most, as of a buffer that is polled; the pauses of a tumble by hand differ. A
+            # cell contains two bursts.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -299,20 +299,20 @@ def still_runs(
         return [[] for _ in ratios]
     drift = _drift(cells, plausible)
     level = np.quantile(cells.variance[plausible], 0.1, axis=0)
-    wider = spread_of_variances(cells, plausible, level)
+    colour = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise: toggling between two adjacent
     # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
     # variance is below its mean; for cells of 32 samples a factor of 1.3 covers the difference.
-    noise = np.maximum(1.3 * level * wider, 0.25 * cells.quantum**2)
+    noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
     by_drift = within**2 / 6.0 if len(within) else 0.0
     result = []
     for ratio in ratios:
         quiet = plausible & (cells.variance <= ratio * noise + by_drift).all(axis=1)
-        roughest = roughest_at_rest(cells, quiet, wider > 1.0, ratio)
+        roughest = roughest_at_rest(cells, quiet, colour > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
-        # Noise of the roughness `roughest` changes between cells by at most `_STEP_SDS` sd.
+        # Successive samples of noise as rough as `roughest` differ by `_STEP_SDS` sd at most.
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
         # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.

@@ -205,7 +205,7 @@ def select_topics(
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    among = ["driver's", 'only']  # chosen by the usual name, or as the only topic of its type
+    among = ["driver's", 'only']  # the topic with the usual name, and the only one of its type
     chosen = [
         choice_note(
             name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]
@@ -220,9 +220,9 @@ def select_topics(
     named = {**topics.further, 'board': topics.board, 'case': topics.case}
     fields = {role: split_field(named.get(role, ''))[1] for role in name_of if role != 'accel'}
     fields = {
-        role: one or PLAIN.get(present[name_of[role]][0], '') for role, one in fields.items()
+        role: field or PLAIN.get(present[name_of[role]][0], '') for role, field in fields.items()
     }
-    fields = {role: one for role, one in fields.items() if one}
+    fields = {role: field for role, field in fields.items() if field}
     _check_twins(name_of, fields)
     text = '; '.join(filter(None, chosen)) or None
     return Selected(name_of, fields, cast(Any, keys.get('accel')), text)
@@ -265,7 +265,7 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # several Imu topics could be meant: none is chosen
+            return  # of several possible Imu topics none is chosen
 
 
 def _corrected(present: Present, metadata: Mapping[str, str]) -> str:

@@ -257,7 +257,7 @@ def conformity(evidence: Evidence) -> tuple[str, str]:
 
 
 def _slope(calibration: Calibration) -> float:
-    """RMS over the static range and the axes of the bias per kelvin [m/s^2/K]."""
+    """RMS of the slope of the bias, over the static range and the axes [m/s^2/K]."""
     temperature = np.linspace(*calibration.static.temperature_range_c, _N_SLOPE)
     bias, _ = bias_and_scale(calibration, ramp_states(calibration, temperature))
     return _rms(np.diff(bias, axis=0) / np.diff(temperature)[:, None])

@@ -161,7 +161,7 @@ class Evidence:
         places, first, n = np.unique(label, return_index=True, return_counts=True)
         up = means_by(label, next(reversed(self.forces.values())))
         up /= np.linalg.norm(up, axis=1, keepdims=True)
-        rms = {name: np.sqrt(means_by(label, one**2)) for name, one in self.residuals.items()}
+        rms = {name: np.sqrt(means_by(label, x**2)) for name, x in self.residuals.items()}
         rms[LEFT_OUT] = np.array([self.left_out.get(place, np.nan) for place in places.tolist()])
         return tuple(
             Position(
@@ -169,7 +169,7 @@ class Evidence:
                 bag=int(windows.bag[first[k]]),
                 duration_s=windows.window_s * int(n[k]),
                 up=tuple(up[k].tolist()),
-                residual_rms={r: float(one[k]) for r, one in rms.items() if np.isfinite(one[k])},
+                residual_rms={r: float(x[k]) for r, x in rms.items() if np.isfinite(x[k])},
             )
             for k in range(len(places))
         )
@@ -252,7 +252,7 @@ def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
         judged,
         steps=result.residuals,
         gravity_sd=gravity_sd,
-        left_out={k: left_out[one] for k, one in enumerate(rests) if left_out.get(one, 0.0) > 0.0},
+        left_out={k: left_out[at] for k, at in enumerate(rests) if left_out.get(at, 0.0) > 0.0},
         findings=tuple(dict.fromkeys((*judged.findings, *against))),
         checks=tuple(note.message for note in result.findings if not _is_reservation(note)),
     )

@@ -206,8 +206,8 @@ def draw_every_position(evidence: Evidence) -> Figure:
     unit, name = style.time_unit(max(position.duration_s for position in shown))
     figure = style.new_figure(0.8 + 0.24 * len(shown))
     axes = figure.subplots()
-    for row, one in enumerate(shown):
-        rows = windows.position == numbers[one.number - 1]
+    for row, position in enumerate(shown):
+        rows = windows.position == numbers[position.number - 1]
         time = (windows.time[rows] - windows.time[rows][0]) / unit
         value = row - 0.5 * residual[rows] / limit
         dynamic = windows.is_dynamic[rows]

@@ -31,7 +31,7 @@ _POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8
 
 
 def draw_functions(evidence: Evidence) -> Figure:
-    """Draw bias and scale over temperature, less a line, with bands and measurements."""
+    """Draw bias and scale over temperature, less a straight line, with bands and measurements."""
     calibration = given(evidence.calibration)
     figure = style.new_figure(4.4)
     panels = figure.subplots(2, 3, sharex=True)
@@ -52,14 +52,14 @@ def draw_functions(evidence: Evidence) -> Figure:
 
 
 def draw_rates(evidence: Evidence) -> Figure:
-    """Draw the bias of the angular rate over temperature, less a line, with bands."""
+    """Draw the bias of the angular rate over temperature, less a straight line, with bands."""
     triad = rate_triad(given(evidence.calibration))
     figure = style.new_figure(2.5)
     panels = figure.subplots(1, 3, sharex=True)
     panels[0].set_ylabel('bias less the line, mdeg/s')
     # In the triad of a gyroscope m/s^2 stands for rad/s.
     factor = MICRO_G / MILLIDEGREE
-    drawn = [one._replace(value=factor * one.value, sd=factor * one.sd) for one in curves(triad)]
+    drawn = [c._replace(value=factor * c.value, sd=factor * c.sd) for c in curves(triad)]
     for i, axes in enumerate(panels):
         axes.set_xlabel(_BOARD)
         _draw_less_line(axes, triad, drawn, i, 'mdeg/s')
@@ -70,7 +70,7 @@ def draw_rates(evidence: Evidence) -> Figure:
 def _draw_less_line(
     axes: Axes, calibration: Calibration, drawn: list[Curve], k: int, unit: str
 ) -> None:
-    """Draw column `k` of the curves, with bands, less the line of the soak."""
+    """Draw column `k` of the curves, with bands, less the straight line through the soak."""
     reference, slope = calibration.reference_temperature_c, slopes(drawn[0])[k]
     widest = 0.0
     for curve in drawn:
@@ -133,7 +133,7 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
 def draw_distances(
     labels: Sequence[str], distances: Sequence[Floats], limits: Sequence[float]
 ) -> Figure:
-    """Draw each unit's distance from the middle, by quantity; beyond its limit as a diamond."""
+    """Draw each unit's distance from the fleet's median, by quantity; an outlier is a diamond."""
     figure = style.new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
     known = [limit for limit in limits if np.isfinite(limit)]

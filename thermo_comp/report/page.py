@@ -95,7 +95,7 @@ def render_report(
         info=info,
         evidence=evidence,
         bags=[(bag, *span_of(bag), remarks_of(bag)) for bag in evidence.bags],
-        seen=_seen(evidence),
+        judged_bags=_judged_bags(evidence),
         tested=info.dates.test or _test_dates(evidence),
         results=results(evidence, info, contributions),
         budget=contributions,
@@ -144,7 +144,7 @@ def remarks_of(bag: ReducedBag) -> list[str]:
     ]
 
 
-def _seen(evidence: Evidence) -> list[str]:
+def _judged_bags(evidence: Evidence) -> list[str]:
     """Describe the bags of the verdict; add a sentence if their regime was never known."""
     collected = []
     if evidence.judgement is not None:

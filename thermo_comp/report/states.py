@@ -86,7 +86,7 @@ def slopes(soak: Curve) -> Floats:
 def table_temperatures(lowest: float, highest: float) -> Floats:
     """Choose the temperatures of a table: both ends of a range, and round numbers between them."""
     span = highest - lowest
-    step = next((one for one in _STEPS_K if span <= one * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
+    step = next((k for k in _STEPS_K if span <= k * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
     within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)
     # Skip round temperatures within a quarter of a step from an end: such a row would repeat the
     # row of the end.

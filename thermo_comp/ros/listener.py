@@ -18,10 +18,10 @@ from ..recording.topics import Topics, is_thermometer, split_field
 from ..recording.wire import Feed, decode_blocks
 from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .messages import LiveField, live_field, message_class
-from .waitloop import RawSubscription, WaitLoop, own_node
+from .waitloop import RawSubscription, WaitLoop, separate_node
 
 #: Interval of the search for publishers, and of the blocks [s].
-LOOK_S, BLOCK_S = 0.5, 1.0
+SEARCH_S, BLOCK_S = 0.5, 1.0
 
 NODE_NAME = 'thermo_comp_record'
 _AS_OFFERED = QoSProfile(
@@ -44,10 +44,10 @@ class LiveTopics:
 
     def __enter__(self) -> LiveTopics:
         with ExitStack() as stack:
-            self._node = stack.enter_context(own_node(NODE_NAME, self._ros_args))
+            self._node = stack.enter_context(separate_node(NODE_NAME, self._ros_args))
             self._loop = WaitLoop(self._node)
-            self._look()
-            self._loop.call_every(LOOK_S, self._look)
+            self._find_topics()
+            self._loop.call_every(SEARCH_S, self._find_topics)
             stack.callback(self._take)
             thread = threading.Thread(target=self._loop.run, args=[self._take], name=NODE_NAME)
             thread.start()
@@ -82,7 +82,7 @@ class LiveTopics:
             # The receiving thread may have appended more messages meanwhile.
             del self._came[: len(waiting)]
             if waiting:
-                feeds = [Feed(k, *one) for k, one in enumerate(self._feeds.items())]
+                feeds = [Feed(k, *source) for k, source in enumerate(self._feeds.items())]
                 numbers = {feed.role: feed.channel for feed in feeds}
                 messages = Messages.of(
                     [
@@ -102,19 +102,19 @@ class LiveTopics:
         field = self._fields.get(role)
         return messages if field is None else list(map(field.as_temperature, messages))
 
-    def _look(self) -> None:
+    def _find_topics(self) -> None:
         """Subscribe to the published topics; list topics without a publisher in `problems`."""
         problems: list[str] = []
         resolved = self._node.resolve_topic_name
         chosen = self._feeds.get('accel')
-        inputs = {
+        topics = {
             getattr(self._topics, key): usual.type
             for key, usual in SAMPLES.items()
             if self._topics.input in (key, 'auto')
             and (chosen is None or chosen.type == usual.type)
         }
-        if not any(self._hear('accel', name, kind, problems) for name, kind in inputs.items()):
-            problems.append(f'no publisher on {" or ".join(map(resolved, inputs))}')
+        if not any(self._subscribe('accel', *topic, problems) for topic in topics.items()):
+            problems.append(f'no publisher on {" or ".join(map(resolved, topics))}')
         front = resolved(thermometer('name')).removesuffix('name')
         further = {
             name.removeprefix(front): name
@@ -125,10 +125,10 @@ class LiveTopics:
         }
         both = {'board': self._topics.board, 'case': self._topics.case}
         for name, topic in {**both, **further, **self._topics.further}.items():
-            self._hear(name, topic, TEMPERATURE, problems)
+            self._subscribe(name, topic, TEMPERATURE, problems)
         self.problems = tuple(problems)
 
-    def _hear(self, role: Role, topic: str, kind: str, problems: list[str]) -> bool:
+    def _subscribe(self, role: Role, topic: str, kind: str, problems: list[str]) -> bool:
         """Subscribe to a topic if it has a publisher; return whether it is subscribed."""
         name = self._node.resolve_topic_name(split_field(topic)[0])
         if role in self._heard:
@@ -144,12 +144,12 @@ class LiveTopics:
             return False
         if field is not None:
             self._fields[role], self._feeds[role] = field, Topic(name, TEMPERATURE, 'cdr')
-            self._heard[role] = self._loop.subscribe(field.kind, name, _AS_OFFERED, is_hot=False)
+            self._heard[role] = self._loop.subscribe(field.kind, name, _AS_OFFERED, wakes=False)
         elif any(offer.topic_type != kind for offer in offers):
             problems.append(f'{name} has the type {offers[0].topic_type}, expected {kind}')
         elif offers:
             self._feeds[role] = Topic(name, kind, 'cdr')
             self._heard[role] = self._loop.subscribe(
-                message_class(kind), topic, _AS_OFFERED, is_hot=role == 'accel'
+                message_class(kind), topic, _AS_OFFERED, wakes=role == 'accel'
             )
         return role in self._heard

@@ -110,7 +110,7 @@ class CompensationNode:
         self.node.destroy_node()
 
     def _report(self) -> None:
-        self._relay.look()
+        self._relay.follow_types()
         self._relay.gather()
         self._reporter.report()
 

@@ -36,7 +36,7 @@ from ..recording.reader import RecordingReader, open_recording
 from ..recording.topics import Topics
 from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .messages import message_class
-from .waitloop import own_node, wait_until
+from .waitloop import separate_node, wait_until
 
 NODE_NAME = 'thermo_comp_player'
 
@@ -89,7 +89,7 @@ def opened_player(
         raise ValueError(f'`rate` must be zero or positive, got {rate}')
     with (
         open_recording(path, topics, require=('accel',)) as reader,
-        own_node(NODE_NAME, ros_args) as node,
+        separate_node(NODE_NAME, ros_args) as node,
     ):
         yield Player(node, reader, rate)
 

@@ -67,7 +67,7 @@ class Relay:
         self._fields: dict[str, LiveField] = {}
         for name in compensator.thermal.inputs:
             topic = split_field(self._topic(name))[0]
-            self._hear(name, topic, LiveField(topic, TEMPERATURE, 'temperature'))
+            self._subscribe(name, topic, LiveField(topic, TEMPERATURE, 'temperature'))
         self._problems: set[str] = set()
         output = self._names.get('output', IMU_OUT.name)
         self._check_topics(loop.node.resolve_topic_name(output))
@@ -100,7 +100,7 @@ class Relay:
             reason = f'is both input and output: remap {IMU_OUT.name} to another name'
             raise ThermoCompError(reason, key=output)
 
-    def look(self) -> None:
+    def follow_types(self) -> None:
         """Subscribe again to thermometers whose messages have another type."""
         for name, heard in list(self.thermometers.items()):
             if self._fields[name].kind is not Temperature or heard.count_publishers():
@@ -117,11 +117,11 @@ class Relay:
                 self._loop.unsubscribe(self.thermometers.pop(name))
                 # The middleware allows one type per topic: the loop must release the old
                 # subscription first.
-                self._loop.call_soon(partial(self._hear, name, topic, field))
+                self._loop.call_soon(partial(self._subscribe, name, topic, field))
 
-    def _hear(self, name: str, topic: str, field: LiveField) -> None:
+    def _subscribe(self, name: str, topic: str, field: LiveField) -> None:
         self._fields[name] = field
-        heard = self._loop.subscribe(field.kind, topic, qos_of(BOARD), is_hot=False)
+        heard = self._loop.subscribe(field.kind, topic, qos_of(BOARD), wakes=False)
         self.thermometers[name] = heard
 
     @property
@@ -164,9 +164,9 @@ class Relay:
 
     def on_data(self) -> None:
         """Process everything that has arrived."""
-        messages, received_ns, n_others = self.samples.drain_of_one()
+        messages, received_ns, n_others = self.samples.drain_single_source()
         for name, subscription in self.thermometers.items():
-            readings, read_ns, n_more = subscription.drain_of_one()
+            readings, read_ns, n_more = subscription.drain_single_source()
             n_others += n_more
             if readings:
                 self._take_readings(name, readings, read_ns)

@@ -71,7 +71,7 @@ class Sources:
         #: False only when a single publisher is proven.
         self.is_contested = False
 
-    def of_one(
+    def first_of_single_source(
         self, n_known: int, numbers: Sequence[int | None], received_ns: Sequence[int]
     ) -> int:
         """Return the index of the first message that is surely from the only active publisher."""
@@ -105,9 +105,9 @@ class Sources:
 class RawSubscription:
     """A subscription of `WaitLoop.subscribe`, to be read in the loop's thread."""
 
-    def __init__(self, subscription: Subscription, is_hot: bool) -> None:
+    def __init__(self, subscription: Subscription, wakes: bool) -> None:
         self.subscription = subscription
-        self.is_hot = is_hot
+        self.wakes = wakes
         self.sources = Sources()
         self._take = partial(subscription.handle.take_message, subscription.msg_type, True)
         #: Number of publishers that the middleware has discovered; cheap enough for each wake-up.
@@ -119,12 +119,12 @@ class RawSubscription:
         #: Mean interval between the messages of the last drain [ns].
         self.interval_ns = 0
 
-    def drain_of_one(self) -> tuple[list[bytes], list[int], int]:
+    def drain_single_source(self) -> tuple[list[bytes], list[int], int]:
         """Take the waiting messages that are surely from one publisher, and count the others."""
         messages, received_ns, numbers = self.drain()
         if not messages:
             return messages, received_ns, 0
-        first = self.sources.of_one(self.count_publishers(), numbers, received_ns)
+        first = self.sources.first_of_single_source(self.count_publishers(), numbers, received_ns)
         return messages[first:], received_ns[first:], first
 
     def drain(self) -> tuple[list[bytes], list[int], list[int | None]]:
@@ -153,8 +153,8 @@ class RawSubscription:
 class WaitLoop:
     """Runs a node without an executor; raw subscriptions are left to the caller."""
 
-    # Messages of a best-effort subscription gather for `rest_s` [s] after each wake-up if there
-    # are four messages or more within three pauses, so that no message waits alone.
+    # Messages of a best-effort subscription gather for `rest_s` [s] after each wake-up if four
+    # messages or more come in three times `rest_s`, so that no message waits alone.
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
         self.node = node
         self._rest_ns = int(rest_s * 1e9)
@@ -171,13 +171,13 @@ class WaitLoop:
         node.context.on_shutdown(self.stop)
 
     def subscribe(
-        self, message_type: Any, topic: str, qos: QoSProfile, *, is_hot: bool = True
+        self, message_type: Any, topic: str, qos: QoSProfile, *, wakes: bool = True
     ) -> RawSubscription:
-        """Subscribe in serialized form; the first hot subscription wakes the loop at once."""
+        """Subscribe in serialized form; the first that `wakes` ends a wait at once."""
         # rclpy needs a callback for each subscription, but without an executor never calls it.
         create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)
         subscription = _opened(create, message_type, topic, qos)
-        self._raw.append(RawSubscription(subscription, is_hot))
+        self._raw.append(RawSubscription(subscription, wakes))
         self._is_stale = True
         return self._raw[-1]
 
@@ -222,12 +222,12 @@ class WaitLoop:
         """Wait and serve until the entities change or the loop stops."""
         node, self._is_stale = self.node, False
         raw = [subscription.subscription for subscription in self._raw]
-        others = {one: partial(_take_message, one) for one in node.subscriptions if one not in raw}
+        others = {sub: partial(_take_message, sub) for sub in node.subscriptions if sub not in raw}
         others |= {service: partial(self._take_request, service) for service in node.services}
-        hot = next((subscription for subscription in self._raw if subscription.is_hot), None)
+        waking = next((subscription for subscription in self._raw if subscription.wakes), None)
         rest_ns = 0
         # With reliable samples a wake-up costs less than a short sleep: make no pause.
-        if hot and hot.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
+        if waking and waking.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             rest_ns = self._rest_ns
         crowd_ns = rest_ns * 3 // 4
         now_ns, look_ns = time.monotonic_ns, 0
@@ -237,7 +237,7 @@ class WaitLoop:
             for entity in (*entities, node.context):
                 in_use.enter_context(entity.handle)
             everything = _WaitSet(node.context, entities)
-            alone = _WaitSet(node.context, [hot.subscription] if hot else [])
+            alone = _WaitSet(node.context, [waking.subscription] if waking else [])
             while not (self._is_stopping or self._is_stale):
                 if self._soon:
                     self._guarded(self._soon.popleft())
@@ -256,16 +256,16 @@ class WaitLoop:
                     is_flowing = bool(alone.wait(min(self._call_ns - now, OTHERS_PERIOD_NS)))
                 else:
                     everything.wait(min(self._call_ns - now, _LONGEST_WAIT_NS))
-                    is_flowing, look_ns = hot is not None, 0
+                    is_flowing, look_ns = waking is not None, 0
                 woken_ns = now_ns()
                 on_data()
                 if woken_ns >= look_ns:
-                    ready = [others[one] for one in everything.wait(0) if one in others]
+                    ready = [others[entity] for entity in everything.wait(0) if entity in others]
                     served = [self._guarded(serve) for serve in ready]
                     # After a request the next request may wait already.
                     look_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
                 # An interval of 0 means that the middleware gives no arrival times.
-                if hot and 0 < hot.interval_ns < crowd_ns:
+                if waking and 0 < waking.interval_ns < crowd_ns:
                     left_ns = woken_ns + rest_ns - now_ns()
                     if left_ns > 0:
                         time.sleep(left_ns * 1e-9)
@@ -342,7 +342,7 @@ def _take_message(subscription: Subscription) -> bool:
 
 
 @contextmanager
-def own_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
+def separate_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
     """Open a node in a separate context."""
     context = rclpy.context.Context()
     rclpy.init(args=['--ros-args', *ros_args], context=context)

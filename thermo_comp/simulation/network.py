@@ -105,8 +105,8 @@ class ThermalNetwork:
         flow = np.zeros(len(at))
         for link in self.links:
             i, j = index[link.a], index[link.b]
-            away = at[i] - at[j]
-            extra = link.conductance * (abs(away) ** (link.exponent - 1.0) - 1.0) * away
+            drop = at[i] - at[j]
+            extra = link.conductance * (abs(drop) ** (link.exponent - 1.0) - 1.0) * drop
             flow[[i, j]] += -extra, extra
         flow[: len(self.nodes)] /= list(self.capacity.values())
         return flow[:-1]
@@ -134,10 +134,10 @@ class ThermalNetwork:
         """
         i = self.nodes.index(node)
 
-        def miss(air: Floats) -> float:
+        def error(air: Floats) -> float:
             return float(self.equilibrium(air[0])[i] - temperature)
 
-        return float(root(miss, 0.0, tol=1e-13).x[0])
+        return float(root(error, 0.0, tol=1e-13).x[0])
 
 
 class ThermalResponse:

@@ -3,7 +3,8 @@
 """
 Owns the definitions of lags and play operators, and the covariance of their initial states.
 
-A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The state stored is ``m = u - L``.
+A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The stored state is ``m = u - L``, the input
+less its lag.
 
 A part may exchange heat with another part that lags the board: the lag then has two stages in
 series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of

@@ -215,7 +215,7 @@ class ThermalMemory:
         behind, extra = self._single_lags(stamp_ns, board, gradients)
         if still:
             # An error of the board temperature is one of each gradient, too.
-            causes = [still[:1], *((still[0], one) for one in still[1:])]
+            causes = [still[:1], *((still[0], cause) for cause in still[1:])]
             grown = [
                 sum((sd * math.expm1(-still_s / tau)) ** 2 for sd, still_s in of_bank)
                 for bank, of_bank in zip(self.banks.values(), causes, strict=True)

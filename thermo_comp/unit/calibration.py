@@ -29,11 +29,11 @@ from ..text import LONGEST_SERIAL, valid_serial
 from ..thermal.settings import DetectorSettings, ThermometerSettings
 from .columns import Column
 from .functions import Polynomial, TemperatureFunction, check_reference
+from .limits import check_limits
 from .nonlinearity import Nonlinearity
 from .posterior import ParameterLayout, Posterior, lay_out
 from .provenance import GroupEvidence, Provenance
 from .rate_bias import LARGEST_RATE, NIL, Gyroscope, RateCurve, RateSet, RateTerm
-from .reach import check_reach
 from .schema import Vector, check_ranges
 
 if TYPE_CHECKING:
@@ -250,7 +250,7 @@ class Calibration:
         self._check_sensors()
         if self.rest_gradient_range_k is not None:
             check_ranges(self, rest_gradient_range_k=QUANTITIES['temperature span'])
-        check_reach(self, parameter_layout(self))
+        check_limits(self, parameter_layout(self))
         if self.gyroscope is not None:
             self._check_gyroscope()
 

@@ -11,10 +11,10 @@ misalignment M. To first order the error of the corrected force is ::
     e_y = yx (u0 + x u1) + u2 + y u3 + x u6
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
-so that each element of its covariance is a polynomial of second degree in x, y, z. Its
-coefficients are sums over the covariance of u, whose numbers are called rows here: first a, b, c
-of each axis, with the axis' error variance ``a + b x + c x^2``, then one row for each pair in
-`BETWEEN`.
+so that each element of its covariance is a polynomial of second degree in x, y, z. The
+coefficients of the polynomials are sums over the elements of the covariance of u, which are called
+rows here: first a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then one
+row for each pair in `BETWEEN`.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ class CovarianceMap:
 
     def __init__(self, misalignment: Sequence[float]) -> None:
         yx, zx, zy = misalignment
-        # Derivative of the force by u: (axis of the force, 1 or x or y or z, u).
+        # Derivative of the force by the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
         J = np.zeros((3, 4, 9))
         J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0
         J[2] += zx * J[0] + zy * J[1]

@@ -157,7 +157,7 @@ class Curves:
 
     @cached_property
     def _families(self) -> list[int]:
-        """Index of the first bias or scale with the same families of functions, for each."""
+        """For each bias or scale, the index of the first with the same families of functions."""
         bases = [
             tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
             for functions in zip(*self._functions.rows, strict=True)

@@ -185,7 +185,7 @@ class BeyondForce(NamedTuple):
         self, x: Real, y: Real, z: Real,
         xx: Real, xy: Real, xz: Real, yy: Real, yz: Real, zz: Real,
     ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:  # fmt: skip
-        """Add the variance to the covariance xx, xy, xz, yy, yz, zz of a corrected sample."""
+        """Add the unknown term's variance to the covariance xx, xy, xz, yy, yz, zz of a sample."""
         xx, yy, zz = xx + self._variance(x), yy + self._variance(y), zz + self._variance(z)
         return x, y, z, xx, xy, xz, yy, yz, zz
 

@@ -36,7 +36,7 @@ _GRID = 513
 _AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
 
 
-def check_reach(calibration: Calibration, layout: ParameterLayout) -> None:
+def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
     """Raise ValueError, with the key's name, if a part of a calibration exceeds its limits."""
     reference, sets = calibration.reference_temperature_c, calibration.regime_sets()
     most = FULL_SCALES * calibration.unit.full_scale
@@ -63,8 +63,8 @@ def check_reach(calibration: Calibration, layout: ParameterLayout) -> None:
         at_work = [term.during in ('always', regime) for term in response]
         for k, (name, axis) in enumerate(zip('xyz', part.axes(), strict=True)):
             terms = zip(response, sizes, at_work, strict=True)
-            lost = sum(abs(term.scale[k]) * size for term, size, is_at_work in terms if is_at_work)
-            _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), lost)
+            gain = sum(abs(term.scale[k]) * size for term, size, is_at_work in terms if is_at_work)
+            _check_scale(f'{regime}.{name}', _extremes(axis.scale_function, ends), gain)
         for name, at, axis in zip('xyz', calibration.axes, part.axes(), strict=True):
             reached = _extremes(axis.bias_function, ends)
             _check_bias(f'{regime}.{name}', at.bias + axis.delta, reached, most)
@@ -114,13 +114,13 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
         )
 
 
-def _check_scale(key: str, reached: tuple[float, float], lost: float) -> None:
+def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
     """
-    Refuse a relative scale that exceeds its limits when the columns add up to `lost` or -`lost`.
+    Refuse a relative scale that exceeds its limits when the columns add up to `gain` or -`gain`.
     """
     for word, value, is_kept, limit in (
-        ('above', reached[0] - lost, operator.gt, SMALLEST_RELATIVE_SCALE),
-        ('below', reached[1] + lost, operator.lt, LARGEST_RELATIVE_SCALE),
+        ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
+        ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),
     ):
         if not is_kept(value, limit):
             raise ValueError(
