@@ -190,6 +190,23 @@ def test_a_jump_is_distinguished_from_ageing(rng):
     assert along == pytest.approx(60.0 * MICRO_G, rel=0.4)
 
 
+def test_the_present_sd_of_the_old_calibration_contains_its_ageing(rng):
+    # The bias walks by 60 ug per root day for 30 days: the sd of a bias grows to 329 ug.
+    unit = known()
+    walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
+    logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
+    x, y, z = update(series_of(logged, unit), unit).moved
+    # The sd of the biases is 10 ug, and that of the readings of z is that of bias plus scale.
+    residual = unit.static.x.residual_sd_m_s2
+    assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
+    assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
+    # One attitude does not separate bias from scale, so up to half the variance goes to the scale.
+    for axis in (x, y):
+        assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
+    # The rests show the error of z, up to its turn-on of 20 ug.
+    assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
+
+
 def test_a_changed_curve_is_detected_and_corrected():
     # The z bias changes by 5 ug/K, and the log has temperatures of 15 to 25 degC.
     unit = known(
@@ -352,6 +369,9 @@ def test_an_update_without_gain_writes_no_file(tmp_path, unit_file, cli):
     data = parsed(finished.stdout)
     assert data['output'] is None
     assert data['is_better'] is False
+    assert all(axis['present_sd'] >= axis['claimed_sd'] > 0.0 for axis in data['moved'][:2])
+    printed = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', code=3).stdout
+    assert 'sd of bias plus scale at rest, aged to the last rest: x ' in printed
     assert not (tmp_path / 'new.yaml').exists()
     text = cli('evaluate', log, '-c', unit_file).stdout
     assert 'recalibration interval' in text

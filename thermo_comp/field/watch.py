@@ -198,8 +198,9 @@ def _forecasts(
     limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
     bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
     # Delta method for the logarithm of the variance by which the error grows.
-    slope = 2.0 * np.array([bias, scale, 0.0, 0.0]) / (bias + scale)
-    rate_sd = float(np.sqrt(slope @ updated.model.log_covariance(ageing) @ slope))
+    slope = 2.0 * np.array([bias, scale]) / (bias + scale)
+    of_walks = updated.model.log_covariance(ageing)[:2, :2]
+    rate_sd = float(np.sqrt(slope @ of_walks @ slope))
     error = of_parameters @ solution.shift
     covariance = of_parameters @ solution.posterior @ of_parameters.T
     now, updated_now = (
