@@ -212,7 +212,7 @@ def main() -> None:
     parser.add_argument('--days', type=int, default=60)
     parser.add_argument('--recordings', type=Path, help='folder with the real recordings')
     arguments = parser.parse_args()
-    for kind in KINDS[: int(__import__('os').environ.get('NK', '2'))]:
+    for kind in KINDS[:2]:
         simulated(kind, arguments.units, arguments.days)
     log_size()
     if arguments.recordings is not None:

@@ -46,7 +46,7 @@ SLOPE, SCALE_SLOPE = 30 * UG, 1e-5
 PRIOR = np.repeat([10 * UG, 0.3 * UG, 10e-6, 0.3e-6, 5e-6], 3)
 #: Window: white noise 60 ug/sqrt(Hz) over 10 s.
 WINDOW_S, NOISE = 10.0, 60 * UG
-KINDS = ('level', 'carried')
+KINDS = ('level', 'carried', 'fixed', 'up and down', 'faces')
 
 
 @dataclass(frozen=True)
@@ -129,10 +129,13 @@ def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
 
 
 def attitude(kind: str, rng: np.random.Generator) -> Floats:
-    """Draw the direction of f: within 10 deg of the vertical, or any."""
+    """Draw the direction of f: within 10 deg of the vertical, any, up, up or down, a face."""
     if kind == 'carried':
         u = rng.standard_normal(3)
         return np.asarray(u / np.linalg.norm(u))
+    faces = np.vstack((np.eye(3), -np.eye(3)))
+    if n_faces := {'fixed': 1, 'up and down': 2, 'faces': 6}.get(kind):
+        return np.asarray(faces[[2, 5, 0, 1, 3, 4][rng.integers(n_faces)]])
     tilt, azimuth = np.radians(rng.uniform(0.0, 10.0)), rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
 
@@ -145,7 +148,7 @@ def temperature(day: float, rng: np.random.Generator) -> float:
 def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
     """Split a rest: a vehicle keeps its attitude, a drone changes it every 20 to 90 s."""
     while seconds >= WINDOW_S:
-        rest = seconds if kind == 'level' else min(seconds, rng.uniform(20.0, 90.0))
+        rest = seconds if kind in ('level', 'fixed') else min(seconds, rng.uniform(20.0, 90.0))
         yield rest
         seconds -= rest
 

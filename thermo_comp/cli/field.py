@@ -31,7 +31,7 @@ def update(
     The calibration is the prior, aged as far as the rests show; rests may
     be in any attitude. Old and new calibration are compared on days left out
     of the update. The new calibration is written only if its gain is above one standard error;
-    otherwise the exit code is 3.
+    otherwise the exit code is 3, and the present uncertainty of each axis is printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -71,6 +71,11 @@ def update(
         out.line(f'{output}: written')
     else:
         out.line(f'the update gains nothing: {output} is not written, keep {calibration}')
+        sds = [
+            f'{row.axis} {micro_g(row.present_sd)} ug ({micro_g(row.claimed_sd)} ug in the file)'
+            for row in result.moved
+        ]
+        out.line(f'sd of bias plus scale at rest, aged to the last rest: {", ".join(sds)}')
     out.end(
         0 if is_better else NOTHING_GAINED,
         output=output if is_better else None,

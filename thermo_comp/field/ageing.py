@@ -214,6 +214,16 @@ class Model:
         factor = cho_factor(self.covariance(ageing), lower=True)
         return np.asarray(cho_solve(factor, np.eye(len(self.rows.y))))
 
+    def log_covariance(self, ageing: Ageing) -> Floats:
+        """Return the covariance of the logarithms of the sds, by Fisher information and prior."""
+        inverse = self.inverse(ageing)
+        parts = [
+            2.0 * sd**2 * inverse @ part
+            for sd, part in zip(vars(ageing).values(), self.parts, strict=True)
+        ]
+        information = [[0.5 * float((a * b.T).sum()) for a in parts] for b in parts]
+        return np.asarray(np.linalg.inv(information + np.eye(len(parts)) / _LOG_SD**2))
+
 
 def usual(calibration: Calibration) -> Ageing:
     """Return the centre of the priors; its turn-on sd is the residual sd, or the noise in 1 Hz."""

@@ -40,6 +40,8 @@ class Moved:
     scale: relative change of the scale
     curve: change of the bias curve over the temperatures of the rests [m/s^2]
     reading: change by bias plus scale at the mean force of the rests [m/s^2]
+    claimed_sd: sd of the reading that the old calibration claims [m/s^2]
+    present_sd: sd of the reading with the old calibration at the last rest, by its ageing [m/s^2]
     """
 
     axis: str
@@ -52,6 +54,8 @@ class Moved:
     curve_sd: float
     reading: float
     reading_sd: float
+    claimed_sd: float
+    present_sd: float
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,7 @@ def update(
     ageing, model, used = learn(series, calibration, since)
     to_file, bend = _levels(calibration), _slopes(calibration)
     solution = solve(model, ageing, to_file, bend, ahead)
-    determined, moved = _moved(used, calibration, solution)
+    determined, moved = _moved(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
     # For parameters that are not updated, the shift that is not applied is an additional error.
@@ -197,7 +201,7 @@ def _slopes(calibration: Calibration) -> Floats:
 
 
 def _moved(
-    series: Series, calibration: Calibration, solution: Solution
+    series: Series, calibration: Calibration, model: Model, solution: Solution, ageing: Ageing
 ) -> tuple[Bools, tuple[Moved, ...]]:
     """Find the parameters that the rests determine, and list the changes of each axis."""
     layout, correction = parameter_layout(calibration), Correction(calibration)
@@ -220,10 +224,17 @@ def _moved(
         ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
         is_determined = bool(ratio <= 0.6**2)
         determined[bias.static : scale.end] = is_determined
+        # The old calibration keeps the shift as an error.
+        error = posterior[3, 3] + float(rows[3] @ solution.shift) ** 2
+        residual = calibration.static.axes()[axis].residual_sd_m_s2
+        scatter = float(np.hypot(ageing.turn_on, ageing.rest))
+        claimed = float(np.hypot(np.sqrt(rows[3] @ model.prior @ rows[3]), residual))
+        present = float(np.hypot(np.sqrt(error), max(residual, scatter)))
         change = rows @ solution.shift * is_determined
         sd = np.sqrt(np.maximum(np.diag(posterior if is_determined else prior), 0.0))
         of_scale = change[1] / gravity, sd[1] / gravity
-        values = (change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3])
+        values = [change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3]]
+        values += [claimed, present]
         shifts.append(Moved(name, is_determined, *map(float, values)))
     determined[layout.misalignment :] = all(shift.is_determined for shift in shifts)
     return determined, tuple(shifts)

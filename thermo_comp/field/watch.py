@@ -3,9 +3,11 @@
 """
 Owns the drift watch: ``|f| - g`` of a rest log against the claimed sd, and a forecast.
 
-A unit is within its claim while its error along gravity is at most `LIMIT` claimed sd. The
-forecast is the distribution of the time at which the error first exceeds either bound, for a
-random walk from the present estimate with the variance estimated from the log.
+A unit is within its claim while the RMS of its errors along gravity, over its attitudes and
+starts, is at most `LIMIT` claimed sd. The verdict follows from the rests of the last week and from
+the ageing model's error at the last rest. The forecast is the distribution of the time at which
+the RMS first exceeds the limit, for random walks of bias and scale from the present estimate with
+the variances estimated from the log.
 """
 
 from collections.abc import Sequence
@@ -13,16 +15,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..typing import Floats
+from ..text import counted
+from ..typing import Floats, Ints
 from ..unit.calibration import Calibration
 from .ageing import Ageing
 from .series import Series
-from .update import update
+from .update import Update, update
 
 #: Largest error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
-#: Probabilities of the forecast, and its horizon [days].
-_QUANTILES, _HORIZON = (0.1, 0.5, 0.9), 3650.0
+#: Days of a window that decides whether the unit is outside: the scatter of single starts is
+#: averaged, and the drift of half a window is small in comparison with that until the limit.
+_WINDOW_DAYS = 7
+#: Smallest number of starts whose attitudes the forecast uses, if the last window has fewer.
+_LEAST_STARTS = 10
+#: Probabilities of the forecast, its horizon [days], and number of simulated random walks.
+_QUANTILES, _HORIZON, _WALKS = (0.1, 0.5, 0.9), 3650.0, 2000
 #: Width of a class of temperature [K], and largest number of periods in the table.
 _CLASS_K, _PERIODS = 10.0, 30
 
@@ -51,7 +59,10 @@ class Watch:
     Comparison of the rests of a log with the claimed sd.
 
     days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
-    left: first day of the last period outside the claim; None for a unit within its claim
+    week: rows of the days with rests in the last week
+    recent: RMS over the last week divided by the limit, robust against one disturbed day
+    left: first day from which the unit stays outside its claim; None for a unit within its claim
+    back: first day after an earlier time outside the claim, for a unit within its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years
     interval: the quantiles of `forecast` for a unit that has just been updated
@@ -61,7 +72,10 @@ class Watch:
     periods: tuple[Row, ...]
     temperatures: tuple[Row, ...]
     last: str
+    week: tuple[Row, ...]
+    recent: float
     left: str | None
+    back: str | None
     forecast: tuple[float, ...]
     interval: tuple[float, ...]
     ageing: Ageing | None
@@ -72,13 +86,22 @@ class Watch:
         return 1 if self.left else 0
 
     def __str__(self) -> str:
+        n_out = sum(not row.is_within for row in self.week)
+        week = f'RMS {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} days'
+        week += f', {n_out} of {counted(len(self.week), "day")} outside'
+        if self.left and self.recent <= 1.0:
+            week += ', above the limit at the last rest by the ageing model'
         if self.left:
-            text = f'outside its claim since {self.left}: update or recalibrate it'
-        elif not self.forecast:
-            text = 'within its claim; a forecast needs 3 starts'
+            text = f'outside its claim since {self.left} ({week}): update or recalibrate it'
         else:
-            text = f'within its claim up to {self.last}, outside from about {self._date(1)}'
-            text += f' (10 to 90 %: {self._date(0)} .. {self._date(2)})'
+            text = f'again within its claim since {self.back}' if self.back else 'within its claim'
+            text += f' up to {self.last} ({week}); '
+            if self.forecast:
+                when = 'on any day' if self.forecast[1] < 1.0 else f'about {self._date(1)}'
+                text += f'will leave it {when}'
+                text += f' (10 to 90 %: {self._date(0)} .. {self._date(2)})'
+            else:
+                text += 'a forecast needs 3 starts'
         if self.interval:
             low, middle, high = (f'{min(days, _HORIZON):.0f}' for days in self.interval)
             text += f'; recalibration interval {middle} days ({low} .. {high})'
@@ -103,31 +126,87 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     lower = np.floor(series.temperature / _CLASS_K) * _CLASS_K
     classes = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in lower]
     warmer = [f'{edge:g} .. {edge + _CLASS_K:g} degC' for edge in np.unique(lower)]
-    is_out = [not row.is_within for row in days]
-    # The claim must be exceeded on two days in a row: on one day the unit may have been disturbed.
-    n_out = ([*is_out[::-1], False]).index(False)
-    left = days[-n_out].name if n_out >= min(2, len(days)) and n_out else None
+    numbers = np.unique(series.day)
+    first, recent = _smoothed(numbers, np.array([row.rms / row.limit for row in days]))
     last, ageing = days[-1].name, None
     forecast: tuple[float, ...] = ()
     interval: tuple[float, ...] = ()
     if series.start[-1] >= 2:
         updated = update(series, calibration)
-        ageing, used, solution = updated.ageing, updated.series, updated.solution
-        recent = used.at(used.start == used.start[-1])
-        of_parameters, of_levels = (
-            column.mean(axis=0) for column in (recent.by_parameter, recent.by_level)
-        )
-        error = float(of_parameters @ solution.shift)
-        variance = max(float(of_parameters @ solution.posterior @ of_parameters), 0.0)
-        walk = np.repeat([ageing.bias**2, ageing.scale**2], 3)
-        rate = float(of_levels**2 @ walk)
-        sd = float(np.sqrt(variance))
-        bound = tolerance or LIMIT * float(np.sqrt(np.mean(series.claim**2)))
-        interval = passage(0.0, sd, rate, bound)
-        forecast = passage(error, sd, rate, bound) if left is None else ()
+        ageing = updated.ageing
+        forecast, interval = _forecasts(updated, tolerance)
+    is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
+    # The RMS of a week follows a change late. Two days within the claim end an excess; the present
+    # error of the ageing model begins an excess if the last day agrees.
+    is_out[-1] &= is_row_out[-2:].any()
+    is_out[-1] |= is_row_out[-1] and bool(forecast) and forecast[1] == 0.0
+    left = back = None
+    if is_out[-1]:
+        is_early = ~is_out if recent[-1] > 1.0 else ~is_row_out
+        begin = min(int(np.append(-1, np.flatnonzero(is_early))[-1]) + 1, len(days) - 1)
+        window = days[first[begin] if recent[-1] > 1.0 else begin : begin + 1]
+        left = next((row.name for row in window if not row.is_within), window[-1].name)
+        forecast = ()
+    elif (recent > 1.0).any():
+        until = int(np.flatnonzero(recent > 1.0)[-1])
+        back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
     temperatures = _rows(series, np.array(classes), warmer, tolerance)
-    return Watch(days, periods, temperatures, last, left, forecast, interval, ageing)
+    return Watch(
+        *(days, periods, temperatures, last, days[first[-1] :], float(recent[-1])),
+        *(left, back, forecast, interval, ageing),
+    )
+
+
+def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
+    """
+    Return the first place of each day's window, and the window's RMS without its largest value.
+
+    A window has the days with rests of a week, and two days at least. Its largest value, which may
+    be that of a disturbed day, is replaced by the second largest.
+    """
+    n = np.arange(len(day))
+    first = np.minimum(
+        np.searchsorted(day, day - _WINDOW_DAYS, side='right'), np.maximum(n - 1, 0)
+    )
+    squares = [np.sort(ratio[i : k + 1] ** 2) for i, k in zip(first, n, strict=True)]
+    return first, np.sqrt(
+        [(values.sum() - np.diff(values[-2:]).sum()) / len(values) for values in squares]
+    )
+
+
+def _forecasts(
+    updated: Update, tolerance: float | None
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """
+    Forecast when the unit leaves its claim, with the present calibration and just after an update.
+
+    The attitudes of use are those of the rests in the last window, and of ten starts at least.
+    """
+    used, ageing, solution = updated.series, updated.ageing, updated.solution
+    is_recent = used.time > used.time[-1] - _WINDOW_DAYS
+    recent = used.at(is_recent | (used.start > used.start[-1] - _LEAST_STARTS))
+    share = recent.n_windows / recent.n_windows.sum()
+    # The norm of the errors `root @ (parameters, levels)` is the RMS over the rests.
+    joined = np.hstack((recent.by_parameter, recent.by_level)) * np.sqrt(share)[:, np.newaxis]
+    root = np.linalg.qr(joined, mode='r')
+    of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
+    walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
+    bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
+    # Each start adds its offset to the error: the limit of the levels is smaller by this scatter.
+    scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
+    limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
+    bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
+    # Delta method for the logarithm of the variance by which the error grows.
+    slope = 2.0 * np.array([bias, scale]) / (bias + scale)
+    of_walks = updated.model.log_covariance(ageing)[:2, :2]
+    rate_sd = float(np.sqrt(slope @ of_walks @ slope))
+    error = of_parameters @ solution.shift
+    covariance = of_parameters @ solution.posterior @ of_parameters.T
+    now, updated_now = (
+        passage(mean, covariance, walk, bound, rate_sd) for mean in (error, np.zeros_like(error))
+    )
+    return now, updated_now
 
 
 def _rows(
@@ -144,23 +223,42 @@ def _rows(
     return tuple(rows)
 
 
-def passage(error: float, sd: float, rate: float, bound: float) -> tuple[float, ...]:
+def passage(
+    mean: Floats, covariance: Floats, walk: Floats, bound: float, rate_sd: float = 0.0
+) -> tuple[float, ...]:
     """
-    Return quantiles of the time [days] after which a random walk first exceeds a bound.
+    Return quantiles of the time [days] at which the norm of a random walk first exceeds a bound.
 
-    The random walk begins at N(error, sd^2), and its variance grows by `rate` per day. A random
-    walk from x stays inside (-c, c) until t with the probability ``sum_k 4 / (k pi) sin(k pi (x +
-    c) / 2 c) exp(-(k pi)^2 rate t / 8 c^2)`` over odd k.
+    The random walk begins at N(mean, covariance), (k,) and (k, k), and grows by `walk` (k, m)
+    times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of its
+    variance. The time is 0 if the norm exceeds the bound at the beginning, else at least 0.01.
     """
-    # 60 terms of the sum suffice for times above a thousandth of the median.
-    k = np.arange(1, 120, 2) * np.pi
-    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
-    inside = np.abs(x := error + sd * nodes) < bound
-    waves = 4.0 / k * np.sin(np.outer((x + bound) / (2.0 * bound), k))
-    terms = (weights / weights.sum() * inside) @ waves
-    times = np.geomspace(1e-3, _HORIZON, 4000)
-    stays = np.exp(-np.outer(times, k**2 * rate / (8.0 * bound**2))) @ terms
+    rng = np.random.default_rng(1)
+    # Directions in which the error is below a thousandth of its size are left out.
+    size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
+    onto = vectors[:, size > 1e-6 * size[-1]].T
+    mean, walk, covariance = onto @ mean, onto @ walk, onto @ covariance @ onto.T
+    values, vectors = np.linalg.eigh(covariance)
+    initial = vectors * np.sqrt(np.maximum(values, 0.0))
+    error = mean + rng.standard_normal((_WALKS, len(mean))) @ initial.T
+    speed = np.exp(0.5 * rate_sd * rng.standard_normal((_WALKS, 1)))
+    times = np.concatenate(([0.0], np.geomspace(0.01, _HORIZON, 400)))
+    left = bound - np.sqrt((error**2).sum(axis=1))
+    inside = np.where(left > 0.0, 1.0, 0.0)
+    stays = [float(inside.mean())]
+    for step in np.diff(times):
+        moved = speed * np.sqrt(step) * rng.standard_normal((_WALKS, walk.shape[1]))
+        error = error + moved @ walk.T
+        size = np.sqrt((error**2).sum(axis=1))
+        # Between two points a Brownian bridge crosses the bound with the probability exp(-2 a b /
+        # variance): a and b are the distances from the bound, the variance is along the error.
+        along = ((error @ walk) ** 2).sum(axis=1) * speed[:, 0] ** 2 * step
+        product = np.maximum(left, 0.0) * np.maximum(bound - size, 0.0) * size**2
+        inside = inside * -np.expm1(-2.0 * product / np.maximum(along, 1e-300))
+        left = bound - size
+        stays.append(float(inside.mean()))
+    survival = np.array(stays)
     return tuple(
-        float(times[after[0]]) if len(after := np.flatnonzero(stays <= 1.0 - p)) else np.inf
+        float(times[np.argmax(survival <= 1.0 - p)]) if survival[-1] <= 1.0 - p else np.inf
         for p in _QUANTILES
     )

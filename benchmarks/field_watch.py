@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Measures verdict and forecasts of the drift watch against simulated units (`field_units.py`).
+
+    python benchmarks/field_watch.py [--units 20] [--days 30]
+
+Units of five kinds of attitudes age by random walks of known sd and write rests. The bound is a
+tolerance of 200 ug. For each unit 200 futures are drawn: its random walk goes on until the RMS of
+|f| - g over the attitudes of use, with the scatter of the starts, exceeds the bound. The figures
+are the share of futures within the printed 10 to 90 % interval, and the median time over the
+printed median. Then level and carried units, half of which do not age, are watched against their
+claim every five days; the figures are the share of the verdict "outside", by the true RMS.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import pairwise
+
+import numpy as np
+from field import probes, root_mean
+from field_units import DAY_ZERO, KINDS, UG, Floats, G, Process, calibration, live
+
+from thermo_comp.field.series import Series, series_of
+from thermo_comp.field.update import update
+from thermo_comp.field.watch import LIMIT, watch
+
+#: Classes of the true RMS divided by the limit.
+CLASSES = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 9.0)
+LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
+
+
+def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generator) -> Floats:
+    """Draw the days until the RMS of |f| - g exceeds a bound, for 200 futures, in steps of 8 h."""
+    size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
+    error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
+    # The norm of `root @ (1, levels)` is the RMS over the probes.
+    joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
+    root = np.linalg.qr(joined, mode='r')
+    for step in range(3 * 3650):
+        miss = root[:, 0] + levels @ root[:, 1:].T
+        is_out = (miss**2).sum(axis=1) + process.turn_on**2 > bound**2
+        error[is_out] = np.minimum(error[is_out], step / 3.0)
+        if np.isfinite(error).all():
+            break
+        levels += size * rng.standard_normal(levels.shape)
+    return error
+
+
+def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
+    """
+    Compare forecast and recalibration interval of units with their futures.
+
+    Each row has the share of futures in the 10 to 90 % interval, their median, and the quantiles.
+    """
+    rng, process = np.random.default_rng(3), Process()
+    found: dict[str, list[tuple[float, ...]]] = {'forecast': [], 'interval': []}
+    for seed in range(n_units):
+        history = live(kind, seed, days, process)
+        series = series_of(history.rests, LABORATORY)
+        result = watch(series, LABORATORY, TOLERANCE)
+        updated = update(series, LABORATORY, ahead=0.0).calibration
+        rests = probes(kind, history.states[-1], seed)[0]
+        before, after = (series_of(rests, one) for one in (LABORATORY, updated))
+        for name, probe, printed in (
+            ('forecast', before, result.forecast),
+            ('interval', after, result.interval),
+        ):
+            if printed:
+                drawn = leaves(probe, process, TOLERANCE, rng)
+                inside = ((drawn >= printed[0]) & (drawn <= printed[2])).mean()
+                found[name].append((float(inside), float(np.median(drawn)), *printed))
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
+def verdicts(kind: str, n_units: int, days: int) -> None:
+    """Print how often the verdict is "outside", by the true RMS of |f| - g over the limit."""
+    found = []
+    for seed in range(2 * n_units):
+        ageing = {'bias': 0.0, 'scale': 0.0} if seed % 2 else {}
+        process = Process(**ageing)
+        history = live(kind, 100 + seed, days, process)
+        series = series_of(history.rests, LABORATORY)
+        for day in range(5, days + 1, 5):
+            chosen = series.at(series.day < DAY_ZERO + day)
+            probe = series_of(probes(kind, history.states[day - 1], seed)[0], LABORATORY)
+            limit = LIMIT * root_mean(chosen.claim)
+            ratio = float(np.hypot(root_mean(probe.residual), process.turn_on)) / limit
+            found.append((ratio, 1 - seed % 2, watch(chosen, LABORATORY).exit_code))
+    ratio, is_ageing, is_out = np.array(found).T
+    for name, chosen in (('of constant error', is_ageing == 0), ('that age', is_ageing == 1)):
+        print(f'{kind}: {n_units} units {name}, verdict every 5 days for {days} days')
+        for low, high in pairwise(CLASSES):
+            at = chosen & (ratio >= low) & (ratio < high)
+            print(
+                f'  true RMS {low} .. {high} limits: {int(is_out[at].sum())} of {at.sum()} outside'
+            )
+
+
+def main() -> None:
+    """Print all figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
+    parser.add_argument('--units', type=int, default=20)
+    parser.add_argument('--days', type=int, default=30)
+    arguments = parser.parse_args()
+    for kind in KINDS:
+        for name, rows in forecasts(kind, arguments.units, arguments.days).items():
+            shares, true, _, printed, _ = rows.T
+            factor = np.log(np.maximum(printed, 0.3) / np.maximum(true, 0.3))
+            print(
+                f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of the futures '
+                f'in 10 .. 90 %; median {np.median(printed):.0f} days, true '
+                f'{np.median(true):.0f}, ratio {np.exp(np.median(factor)):.2f} (of a unit: factor '
+                f'{np.exp(np.std(factor)):.1f})'
+            )
+    for kind in KINDS[:2]:
+        verdicts(kind, arguments.units, arguments.days)
+
+
+if __name__ == '__main__':
+    main()
