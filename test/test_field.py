@@ -18,7 +18,7 @@ import field_units
 
 from thermo_comp.errors import FitError
 from thermo_comp.field.ageing import Ageing, Model, rows_of, solve
-from thermo_comp.field.series import series_of
+from thermo_comp.field.series import read_rests, series_of
 from thermo_comp.field.update import update
 from thermo_comp.field.watch import passage, watch
 from thermo_comp.fitting.assembly import parameters_of, with_parameters
@@ -218,6 +218,37 @@ def test_a_start_that_contradicts_all_others_is_left_out():
     result = update(series_of(bad, unit), unit)
     assert result.n_outliers == 1
     assert result.moved[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
+
+
+def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
+    # A computer without a battery clock starts at the date of its image, and the stamps of the
+    # samples are right. Every start, then the last start alone, has such a date.
+    unit = known()
+    logged = rests(unit, upright, jump_of(300.0, 10.0))
+    image = {one.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for one, _ in logged}
+    last = logged[-1][0].start_ns
+    expected = None
+    for number, wrong in enumerate(({}, image, {last: 30 * 10**9})):
+        of_image = [
+            (replace(s, start_ns=wrong.get(s.start_ns, s.start_ns)), rest) for s, rest in logged
+        ]
+        read, source, _ = read_rests([write_log(tmp_path / str(number), of_image)], unit)
+        assert source.name.startswith('rests until 2030-01-20T23:12:40')
+        updated = update(series_of(read, unit), unit)
+        expected = expected or updated
+        assert updated.calibration == expected.calibration
+        assert updated.judged == expected.judged
+
+
+def test_stamps_in_any_order_give_a_valid_covariance(rng):
+    # The stamps of a third of the starts are wrong by up to 10 days: starts overlap.
+    unit = known()
+    logged = rests(unit, upright, no_error)
+    wrong = {s.start_ns: int(rng.choice((0, 0, 864e12 * rng.uniform(-1, 1)))) for s, _ in logged}
+    moved = [(s, replace(r, stamp_ns=r.stamp_ns + wrong[s.start_ns])) for s, r in logged]
+    solution = update(series_of(moved, unit), unit).solution
+    for covariance in (solution.prior, solution.posterior):
+        assert np.linalg.eigvalsh(covariance).min() > -1e-9 * np.trace(covariance)
 
 
 def test_too_few_starts_are_refused():

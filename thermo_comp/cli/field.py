@@ -60,7 +60,7 @@ def update(
             )
             for axis in result.moved
         ],
-        title=f'changes shown by {len(result.series)} rests in {result.series.start[-1] + 1} '
+        title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
         'starts (at rest: bias plus scale at the mean force of the rests)',
     )
     out.points(change_texts(result))

@@ -78,8 +78,8 @@ class Change:
 @dataclass(frozen=True)
 class Rows:
     """
-    Equations of the rests, in order of time, at most `_ROWS` of a start: orthogonal sums with all
-    information of its rests about the six levels.
+    Equations of the rests, in order of the starts, at most `_ROWS` of a start: orthogonal sums
+    with all information of its rests about the six levels.
 
     noise, scatter: variance of the noise, and factor of the rests' scatter variance in a row
     rank: number of the row within its start
@@ -334,7 +334,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]
     walk = np.repeat([ageing.bias**2, ageing.scale**2], 3)
     crossed = rows.by_parameter @ model.prior + (age * rows.by_level * walk) @ to_file.T
-    prior = model.prior + (to_file * walk * float(age[-1, 0])) @ to_file.T
+    prior = model.prior + (to_file * walk * float(age.max())) @ to_file.T
     for change in model.changes:
         onto = bend if change.time is None else to_file * _JUMP_SHARES
         crossed += change.sd**2 * change.columns(rows) @ onto.T

@@ -44,12 +44,13 @@ _UNTIL, _AGED = 'rests until ', ', claim aged '
 @dataclass(frozen=True)
 class Series:
     """
-    Rests in order of time, (n,) and (n, ...); accelerations and their sd in m/s^2.
+    Rests in order of the starts, (n,) and (n, ...); accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the start; `direction`: v; `force`: x; `miss`:
-    ``|f| - g``; `by_parameter`: H, (n, n_parameters); `by_level`: derivatives by the bias of each
-    axis and by its scale times g, (n, 6); `noise`: variance of one rest by samples and
-    thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of `miss`.
+    `time`: days since 1970; `start`: number of the start, in order of appearance; `direction`: v;
+    `force`: x; `miss`: ``|f| - g``; `by_parameter`: H, (n, n_parameters); `by_level`: derivatives
+    by the bias of each axis and by its scale times g, (n, 6); `noise`: variance of one rest by
+    samples and thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of
+    `miss`.
     """
 
     time: Floats
@@ -154,7 +155,7 @@ def read_rests(
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
     """Describe rests for the provenance of an update: the name holds their end and `ahead`."""
-    end = np.datetime64(rests[-1][1].stamp_ns, 'ns').astype('datetime64[s]')
+    end = np.datetime64(max(rest.stamp_ns for _, rest in rests), 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
 
@@ -227,7 +228,7 @@ def series_of(
     residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
     return Series(
         time=averaged(stamps / _DAY_NS),
-        start=np.unique(beginnings[first], return_inverse=True)[1],
+        start=_numbered(beginnings[first]),
         temperature=states[:, BOARD],
         state=states,
         direction=v,
@@ -256,6 +257,12 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
             'the rests were logged with a calibration that has other columns; their thermal state '
             'does not contain the lags of this calibration'
         ) from error
+
+
+def _numbered(start: Ints) -> Ints:
+    """Return numbers of the starts, in order of appearance."""
+    _, first, start = np.unique(start, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
 
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:

@@ -116,14 +116,14 @@ def update(
     last rest for which the covariance is aged [days]. Raises FitError if the rests belong to fewer
     than three starts of the node.
     """
-    n_starts = int(series.start[-1]) + 1
+    n_starts = int(series.start.max()) + 1
     if n_starts < 3:
         raise FitError(
             f'rests of {counted(n_starts, "start")}, need 3 at least: each start has a bias '
             'offset, and the update is judged on left-out starts'
         )
     _, aged, is_update = valid_since(calibration)
-    first, last = float(series.time[0]), float(series.time[-1])
+    first, last = float(series.time.min()), float(series.time.max())
     # The random walk begins where the aged covariance ends or, without ageing, at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since)
@@ -155,7 +155,7 @@ def update(
 
 def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
     """Add the residuals of left-out rests, and a note, to the origin of a calibration."""
-    largest, day = float(np.abs(series.miss).max()), np.datetime64(int(series.time[-1]), 'D')
+    largest, day = float(np.abs(series.miss).max()), np.datetime64(int(series.time.max()), 'D')
     residuals = ResidualSummary(
         f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
     )
