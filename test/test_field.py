@@ -19,7 +19,7 @@ import field_units
 from thermo_comp.errors import FitError
 from thermo_comp.field.ageing import Ageing, Model, rows_of, solve
 from thermo_comp.field.series import read_rests, series_of
-from thermo_comp.field.update import update
+from thermo_comp.field.update import change_texts, refuse_another_unit, update
 from thermo_comp.field.watch import passage, watch
 from thermo_comp.fitting.assembly import parameters_of, with_parameters
 from thermo_comp.unit.calibration import parameter_layout
@@ -165,6 +165,9 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
+    # In one attitude a shock and another gravity are the same.
+    assert [change.may_be_gravity for change in updated.changes] == [True]
+    assert 'or another gravity' in ' '.join(change_texts(updated))
     # Upright rests show a change of 300 ug in bias plus scale of z; turn-ons of 20 ug leave 15 ug.
     assert updated.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
@@ -187,6 +190,64 @@ def test_a_jump_is_distinguished_from_ageing(rng):
     assert aged.changes == ()
     along = np.hypot(aged.ageing.bias, aged.ageing.scale)
     assert along == pytest.approx(60.0 * MICRO_G, rel=0.4)
+
+
+def stepped(history, size, day):
+    """Add a step of gravity [m/s^2] from a day on; the counts of the units are 300 per m/s^2."""
+    return [
+        (s, replace(r, mean=tuple(np.array(r.mean) * (1.0 + size / field_units.G * (d >= day)))))
+        for (s, r), d in zip(history.rests, history.day, strict=True)
+    ]
+
+
+@pytest.mark.parametrize('day', [15, 0])
+def test_another_gravity_is_not_taken_for_three_scales(day):
+    # The unit walks by 15 ug and 10 ppm; gravity differs by 300 ug from day 15 or the first rest.
+    unit, size = field_units.calibration(), 300.0 * MICRO_G
+    history = field_units.live('carried', 2, 30, field_units.Process())
+    aged = update(series_of(history.rests, unit), unit)
+    result = update(series_of(stepped(history, size, day), unit), unit)
+    ((change, found, sd),) = result.solution.gravity
+    assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
+    # From the first rest on, another gravity equals a common walk before it within 10 ppm.
+    assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
+    for before, after in zip(aged.moved, result.moved, strict=True):
+        assert after.scale == pytest.approx(before.scale, abs=30e-6)
+    assert result.judged.after < 40.0 * MICRO_G
+    (text,) = (line for line in change_texts(result) if 'another gravity' in line)
+    assert 'than the stated 9.80665 m/s^2 from 2026-' in text
+    # With a gravity that is certain, the scales of all axes have changed.
+    certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
+    assert certain.solution.gravity == ()
+    assert all(axis.scale > 150e-6 for axis in certain.moved)
+
+
+@pytest.mark.parametrize('kind', ['level', 'carried'])
+def test_ageing_is_not_taken_for_another_gravity_or_unit(kind):
+    unit = field_units.calibration()
+    for seed in range(5):
+        shock_day = np.inf if seed % 2 else 10.0
+        history = field_units.live(kind, seed, 20, field_units.Process(shock_day=shock_day))
+        result = update(series_of(history.rests, unit), unit)
+        assert result.solution.gravity == ()
+        assert all(change.kind == 'levels' for change in result.changes)
+        assert seed % 2 == 0 or result.changes == ()
+        refuse_another_unit(result)
+
+
+@pytest.mark.parametrize('first', [0, 10])
+def test_samples_of_another_unit_are_refused(first):
+    # The other unit differs by percents in scale and milli-g in bias: in all rests, or in half.
+    unit = field_units.calibration()
+    history = field_units.live('carried', 3, 20, field_units.Process())
+    mixed = [
+        (s, replace(r, mean=tuple(np.array(r.mean) * (1.02, 0.985, 1.01) + (2.0, -4.0, 1.0))))
+        if day >= first else (s, r)
+        for (s, r), day in zip(history.rests, history.day, strict=True)
+    ]  # fmt: skip
+    result = update(series_of(mixed, unit), unit)
+    with pytest.raises(FitError, match=r'expected at most 1 mg for this unit by ageing: samples'):
+        refuse_another_unit(result)
 
 
 def test_a_changed_curve_is_detected_and_corrected():
@@ -340,12 +401,21 @@ def test_mistakes_of_update_end_in_one_sentence(tmp_path, unit_file, cli):
     (tmp_path / 'empty').mkdir()
     for arguments, text in (
         (('update', unit_file, log, *new), 'rests: no rest of unit T-1'),
+        (('update', unit_file, log, *new), 'unit T-1 (counts): the rests are of T-2 (counts)'),
         (('update', unit_file, tmp_path / 'empty', *new), 'empty: no rest log: expected a folder'),
         (('update', unit_file, tmp_path / 'none', *new), 'none: no rest log: expected a folder'),
     ):
         assert text in cli(*arguments, code=1).stderr
     bag = ROOT / 'bags' / 'held_out.mcap'
     assert 'evaluated alone' in cli('evaluate', log, bag, '-c', unit_file, code=2).stderr
+    broken = write_log(tmp_path / 'broken', rests(unit, upright, jump_of(3000.0, 2.0), days=4))
+    printed = cli('update', unit_file, broken, *new, code=1).stderr
+    assert 'on 2030-01-03 |f| differs from the gravity 9.80665 m/s^2 by 3 mg RMS' in printed
+    assert '(override with --allow unit)' in printed
+    printed = cli('update', unit_file, broken, *new, '--allow', 'units', code=2).stderr
+    assert "--allow: expected one of gravity, unit, got 'units'" in printed
+    cli('update', unit_file, broken, *new, '--allow', 'unit')
+    (tmp_path / 'new.yaml').unlink()
     rich = tmp_path / 'rich.yaml'
     save_calibration(rich_calibration(), rich)
     log = write_log(tmp_path / 'own', rests(unit, upright, no_error, days=2))

@@ -22,6 +22,7 @@ def update(
     ahead: float = option(
         'Days until the next update, by which the uncertainty is aged.', 1.0, min=0.0, max=3650.0
     ),
+    allow: list[str] | None = option('Name of a conclusion to override, as in its message.'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -37,15 +38,23 @@ def update(
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
     """
     from ..field.series import read_rests, series_of
-    from ..field.update import change_texts
+    from ..field.update import OVERRIDES, change_texts, refuse_another_unit
     from ..field.update import update as run
     from ..unit.calibration_file import load_calibration, save_calibration
 
+    allowed = tuple(allow or ())
+    for word in allowed:
+        if word not in OVERRIDES:
+            raise options.usage(f'--allow: expected one of {", ".join(OVERRIDES)}, got {word!r}')
     check_output(output, CALIBRATION, overwrite=force, others=[calibration, *rests])
     old = load_calibration(calibration)
     logged, source, notes = read_rests(rests, old, ahead=ahead)
     created = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
-    result = run(series_of(logged, old, gravity=where[0]), old, source, created, ahead)
+    series = series_of(logged, old, gravity=where[0])
+    is_certain = 'gravity' in allowed
+    result = run(series, old, source, created, ahead, is_gravity_certain=is_certain)
+    if 'unit' not in allowed:
+        refuse_another_unit(result)
     out.points(notes)
     out.table(
         ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),

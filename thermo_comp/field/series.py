@@ -47,10 +47,10 @@ class Series:
     Rests in order of the starts, (n,) and (n, ...); accelerations and their sd in m/s^2.
 
     `time`: days since 1970; `start`: number of the start, in order of appearance; `direction`: v;
-    `force`: x; `miss`: ``|f| - g``; `by_parameter`: H, (n, n_parameters); `by_level`: derivatives
-    by the bias of each axis and by its scale times g, (n, 6); `noise`: variance of one rest by
-    samples and thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of
-    `miss`.
+    `force`: x; `gravity`: stated g; `miss`: ``|f| - g``; `by_parameter`: H, (n, n_parameters);
+    `by_level`: derivatives by the bias of each axis and by its scale times g, (n, 6); `noise`:
+    variance of one rest by samples and thermometers; `lack`: v times the sd of the lack of fit;
+    `claim`: claimed sd of `miss`.
     """
 
     time: Floats
@@ -59,6 +59,7 @@ class Series:
     state: Floats
     direction: Floats
     force: Floats
+    gravity: Floats
     miss: Floats
     by_parameter: Floats
     by_level: Floats
@@ -120,7 +121,7 @@ def read_rests(
     def is_wanted(start: Start) -> bool:
         is_own = (start.serial, start.input) == (unit.serial, unit.input)
         if not is_own:
-            others.add(start.serial)
+            others.add(f'{start.serial} ({start.input})')
         return is_own
 
     try:
@@ -133,10 +134,13 @@ def read_rests(
     notes = [f'{counted(n_damaged, "damaged line")} skipped'] if n_damaged else []
     if others:
         notes.append(
-            f'rests of {", ".join(sorted(others))} are not of unit {unit.serial}: left out'
+            f'rests of {", ".join(sorted(others))} are not of unit {unit.serial} ({unit.input}): '
+            'left out'
         )
     if not rests:
-        raise RecordingError(f'no rest of unit {unit.serial}', ', '.join(map(str, paths)))
+        text = f'no rest of unit {unit.serial} ({unit.input})'
+        found = f': the rests are of {", ".join(sorted(others))}' if others else ''
+        raise RecordingError(text + found, ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
     # The time in the name of an update's source is rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
@@ -233,6 +237,7 @@ def series_of(
         state=states,
         direction=v,
         force=x,
+        gravity=local,
         miss=size - local,
         by_parameter=_by_parameter(calibration, correction, states, u, v, x, scale),
         by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
