@@ -17,13 +17,16 @@ sys.path.insert(0, str(ROOT / 'benchmarks'))
 import field_units
 
 from thermo_comp.errors import FitError
-from thermo_comp.field.ageing import Ageing, Model, rows_of, solve
+from thermo_comp.field.ageing import Ageing, Model, learn, rows_of, solve
 from thermo_comp.field.series import read_rests, series_of
 from thermo_comp.field.update import change_texts, refuse_another_unit, update
 from thermo_comp.field.watch import passage, watch
 from thermo_comp.fitting.assembly import parameters_of, with_parameters
+from thermo_comp.thermal.lags import Lag, start_root
+from thermo_comp.thermal.state import Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.provenance import Provenance
@@ -421,6 +424,57 @@ def test_mistakes_of_update_end_in_one_sentence(tmp_path, unit_file, cli):
     log = write_log(tmp_path / 'own', rests(unit, upright, no_error, days=2))
     printed = cli('update', rich, log, *new, code=1).stderr
     assert 'logged with a calibration that has other columns' in printed
+
+
+def with_shares(logged, share):
+    return [(s, replace(r, shares=(share,) * len(r.shares))) for s, r in logged]
+
+
+def test_a_rest_differentiates_by_the_unknown_lags_of_its_start():
+    # The unknowns move the lags; the expected derivatives are finite differences of |f|.
+    unit, share, step = rich_calibration(), 0.6, 1e-4
+    logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
+    series, layout = series_of(logged, unit), Layout(Correction(unit).memory)
+    lags = [lag for lag in layout.places if isinstance(lag, Lag)]
+    root = start_root(tuple(lags))
+    for k, column in enumerate(root.T):
+        states = np.array([r.state for _, r in logged])
+        for lag, size in zip(lags, column, strict=True):
+            states[:, layout.places[lag]] += step * share * size
+        moved = [(s, replace(r, state=tuple(x))) for (s, r), x in zip(logged, states, strict=True)]
+        slope = (series.miss - series_of(moved, unit).miss) / step
+        expected = series.by_start[:, k]
+        assert np.allclose(slope, expected, atol=0.03 * np.abs(series.by_start).max())
+    settled = series_of(with_shares(logged, 0.0), unit)
+    assert not settled.by_start.any()
+    assert np.array_equal(settled.noise, series.noise)
+
+
+@pytest.mark.parametrize('lags', [0.0, 1.0])
+def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
+    # Three rests per start, from the first second on: walks of 15 and 10 ug per root day, 20 ug at
+    # a start, 3 ug of scatter, and lags of none or all of the assumed sd, which is 40 to 100 ug.
+    unit = rich_calibration()
+    each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
+    n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]
+    series = replace(each, **{name: np.repeat(getattr(each, name), 3, axis=0) for name in names})
+    series.by_start[:] *= np.tile([1.0, 0.7, 0.4], n)[:, np.newaxis]
+    steps = np.sqrt(np.diff(each.time, prepend=each.time[0]))[:, np.newaxis]
+    sd = np.repeat([15.0, 10.0], 3) * MICRO_G
+    levels = np.cumsum(steps * sd * rng.standard_normal((n, 6)), axis=0)
+    levels[:, :3] += 20.0 * MICRO_G * rng.standard_normal((n, 3))
+    start = lags * rng.standard_normal((n, each.by_start.shape[1]))
+    miss = (series.by_level * np.repeat(levels, 3, axis=0)).sum(axis=1)
+    miss += (series.by_start * np.repeat(start, 3, axis=0)).sum(axis=1)
+    miss += np.sqrt(series.noise + (3.0 * MICRO_G) ** 2) * rng.standard_normal(3 * n)
+    ageing, _, used = learn(replace(series, miss=miss), unit, float(series.time[0]))
+    assert len(used) == 3 * n
+    # Six simulated units vary by 20 % in the bias, 30 % in the scale, 15 % at a start.
+    assert ageing.bias == pytest.approx(15.0 * MICRO_G, rel=0.5)
+    assert ageing.scale == pytest.approx(10.0 * MICRO_G, rel=0.7)
+    assert ageing.turn_on == pytest.approx(20.0 * MICRO_G, rel=0.35)
+    assert ageing.rest == pytest.approx(3.0 * MICRO_G, rel=0.4)
+    assert ageing.lags == pytest.approx(lags, abs=0.25)
 
 
 def test_the_newest_of_many_starts_are_used(monkeypatch):

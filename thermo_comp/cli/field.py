@@ -4,11 +4,15 @@
 
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ..files import CALIBRATION, check_output
 from . import shared_options as options
 from .output import Output, micro, micro_g, picked
 from .shared_options import argument, option
+
+if TYPE_CHECKING:
+    from ..field.ageing import Ageing
 
 #: Exit code of an update that gains nothing.
 NOTHING_GAINED = 3
@@ -84,10 +88,17 @@ def update(
         0 if is_better else NOTHING_GAINED,
         output=output if is_better else None,
         **picked(result, 'moved changes judged'),
-        ageing_m_s2=result.ageing,
+        **_ageing(result.ageing),
         is_better=is_better,
         notes=[*notes, *change_texts(result)],
     )
+
+
+def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
+    """Return the ageing for JSON: standard deviations, and the relative sd of the lags."""
+    values = vars(ageing).copy() if ageing else {}
+    share = values.pop('lags', None)
+    return {'ageing_m_s2': values or None, 'lags_at_start': share}
 
 
 def evaluate_rests(
@@ -126,6 +137,6 @@ def evaluate_rests(
         **picked(result, 'days temperatures left'),
         forecast_days=result.forecast,
         interval_days=result.interval,
-        ageing_m_s2=result.ageing,
+        **_ageing(result.ageing),
         notes=notes,
     )

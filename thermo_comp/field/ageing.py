@@ -5,8 +5,9 @@ Owns the ageing model of a unit: a Gaussian model of the errors at rest, with va
 by evidence.
 
 ``|f| - g`` of rest i at time t_i after start k of the node is ``H_i delta + B_i b(t_i) + S_i
-s(t_i) + B_i o_k + lack + e_i``: delta is the error of the calibration (its posterior), b and s are
-random walks of bias and scale since the calibration, o_k is a bias offset, e independent noise.
+s(t_i) + B_i o_k + L_i l_k + lack + e_i``: delta is the error of the calibration (its posterior), b
+and s are random walks of bias and scale since the calibration, o_k is a bias offset, l_k are the
+unknown lag states at the start, e is independent noise.
 Jumps of the levels or of gravity, and a change of the curve, are added one at a time while the log
 Bayes factor is high enough. The variances maximise the marginal likelihood, with wide priors.
 """
@@ -29,6 +30,9 @@ from .series import Series
 #: Centres of the priors, relative to the turn-on offset: random walk per root day of bias, and of
 #: scale times g; scatter of a rest. Sd of the logarithm of all priors: a factor of 5 either way.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
+#: Centre of the prior of the sd of the lag states at a start, relative to the calibration's
+#: assumption: units that are at rest before their start have smaller lags.
+_LAG_SHARE = 1.0
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
 #: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
@@ -48,17 +52,19 @@ _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
 @dataclass(frozen=True)
 class Ageing:
     """
-    Standard deviations of the ageing model [m/s^2].
+    Standard deviations of the ageing model [m/s^2]; `lags` is relative.
 
     bias, scale: random walk of the bias, and of the scale times g, per root day
     turn_on: bias offset of a start of the node
     rest: scatter from rest to rest
+    lags: unknown lag states at a start, relative to the sd that the calibration assumes
     """
 
     bias: float
     scale: float
     turn_on: float
     rest: float
+    lags: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,7 @@ class Rows:
     by_parameter: Floats
     by_level: Floats
     by_gravity: Floats
+    by_start: Floats
     lack: Floats
     warmth: Floats
     noise: Floats
@@ -120,7 +127,7 @@ class Rows:
 def rows_of(series: Series, scatter: float) -> Rows:
     """Sum the rests of each start, weighted by their noise and an initial scatter [m/s^2]."""
     parts: list[tuple[Floats, ...]] = []
-    variance = series.noise + scatter**2
+    variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
         at = np.flatnonzero(series.start == start)
         weight = np.sqrt(variance[at].mean() / variance[at])
@@ -133,7 +140,8 @@ def rows_of(series: Series, scatter: float) -> Rows:
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
         # Another gravity changes |f| alike in all attitudes.
         ones = np.ones(len(series))
-        summed = (series.miss, series.by_parameter, series.by_level, ones, series.lack)
+        levels = (series.by_parameter, series.by_level, ones)
+        summed = (series.miss, *levels, series.by_start, series.lack)
         parts.append(
             (
                 *(np.full(n, series.time[at].mean()), np.full(n, start)),
@@ -171,6 +179,7 @@ class Model:
             elapsed * (scale @ scale.T),
             np.where(is_same, along, 0.0),
             np.diag(rows.scatter),
+            np.where(is_same, rows.by_start @ rows.by_start.T, 0.0),
         ]
         # The lack of fit is correlated between temperatures that differ by less than about 10 K.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
@@ -213,7 +222,7 @@ class Model:
             (
                 minimize(
                     loss,
-                    np.clip(np.log(step * np.array(shares)), *bounds),
+                    np.clip(np.log([*(step * np.array(shares)), centre.lags]), *bounds),
                     jac=True,
                     method='L-BFGS-B',
                     bounds=list(zip(*bounds, strict=True)),
@@ -237,7 +246,7 @@ def usual(calibration: Calibration) -> Ageing:
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
-    return Ageing(walk, walk, turn_on, _SCATTER_SHARE * turn_on)
+    return Ageing(walk, walk, turn_on, _SCATTER_SHARE * turn_on, _LAG_SHARE)
 
 
 def learn(

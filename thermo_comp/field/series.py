@@ -49,8 +49,9 @@ class Series:
     `time`: days since 1970; `start`: number of the start, in order of appearance; `direction`: v;
     `force`: x; `gravity`: stated g; `miss`: ``|f| - g``; `by_parameter`: H, (n, n_parameters);
     `by_level`: derivatives by the bias of each axis and by its scale times g, (n, 6); `noise`:
-    variance of one rest by samples and thermometers; `lack`: v times the sd of the lack of fit;
-    `claim`: claimed sd of `miss`.
+    variance of one rest by samples and thermometers; `by_start`: derivatives by the unknown lag
+    states at the start of the node, of unit variance each; `lack`: v times the sd of the lack of
+    fit; `claim`: claimed sd of `miss`.
     """
 
     time: Floats
@@ -64,6 +65,7 @@ class Series:
     by_parameter: Floats
     by_level: Floats
     noise: Floats
+    by_start: Floats
     lack: Floats
     claim: Floats
     n_windows: Ints
@@ -224,7 +226,10 @@ def series_of(
     noise = (v**2 * white).sum(axis=1) / sizes
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
     bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
-    slow, claim = (_along(correction, states, shares, model, u, x) for model in (bare, full))
+    slow = _along(correction, states, np.zeros_like(shares), bare, u, x)
+    claim = _along(correction, states, shares, full, u, x)
+    of_start = np.moveaxis(bare.of_start(states.T, shares.T), 2, 0)
+    of_start = of_start[:, :, :3] / K + of_start[:, :, 3:] * x[:, np.newaxis]
     of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
     slow, claim = slow - of_one_sample, claim - of_one_sample
     unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
@@ -242,6 +247,7 @@ def series_of(
         by_parameter=_by_parameter(calibration, correction, states, u, v, x, scale),
         by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
         noise=noise + np.maximum(slow, 0.0),
+        by_start=(of_start * v[:, np.newaxis]).sum(axis=2),
         lack=v * np.sqrt(np.maximum(unexplained - residual, 0.0)),
         claim=np.sqrt(np.maximum(claim, 0.0) + noise),
         n_windows=sizes,

@@ -341,6 +341,8 @@ def change_texts(result: Update) -> list[str]:
         f'{1e6 * ageing.scale / result.calibration.gravity_m_s2:.2g} ppm per root day; '
         f'scatter of starts {ug_text(ageing.turn_on)}, of rests {ug_text(ageing.rest)}'
     ]
+    if result.series.by_start.any():
+        lines[0] += f'; lags at a start {ageing.lags:.2g} of the sd that the calibration assumes'
     for change in result.changes:
         if change.time is None:
             lines.append('the curves of the bias have changed')
