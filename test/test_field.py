@@ -450,6 +450,16 @@ def test_a_rest_differentiates_by_the_unknown_lags_of_its_start():
     assert np.array_equal(settled.noise, series.noise)
 
 
+def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
+    # The residual sd of the file is the scatter of starts, which the ageing model estimates.
+    unit = field_units.calibration()
+    logged = field_units.live('level', 1, 3, field_units.Process()).rests
+    unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]
+    series, early = series_of(logged, unit), series_of(unknown, unit)
+    assert np.allclose(early.noise, series.noise, rtol=1e-9)
+    assert np.sqrt(series.noise.max()) < 8.0 * MICRO_G < early.claim.min()
+
+
 @pytest.mark.parametrize('lags', [0.0, 1.0])
 def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
     # Three rests per start, from the first second on: walks of 15 and 10 ug per root day, 20 ug at

@@ -13,6 +13,7 @@ from .shared_options import argument, option
 
 if TYPE_CHECKING:
     from ..field.ageing import Ageing
+    from ..field.update import Update
 
 #: Exit code of an update that gains nothing.
 NOTHING_GAINED = 3
@@ -46,10 +47,7 @@ def update(
     from ..field.update import update as run
     from ..unit.calibration_file import load_calibration, save_calibration
 
-    allowed = tuple(allow or ())
-    for word in allowed:
-        if word not in OVERRIDES:
-            raise options.usage(f'--allow: expected one of {", ".join(OVERRIDES)}, got {word!r}')
+    allowed = _overrides(allow, OVERRIDES)
     check_output(output, CALIBRATION, overwrite=force, others=[calibration, *rests])
     old = load_calibration(calibration)
     logged, source, notes = read_rests(rests, old, ahead=ahead)
@@ -60,22 +58,7 @@ def update(
     if 'unit' not in allowed:
         refuse_another_unit(result)
     out.points(notes)
-    out.table(
-        ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
-        [
-            (
-                axis.axis,
-                *(micro_g(axis.bias), micro_g(axis.bias_sd)),
-                *(micro(1e6 * axis.scale), micro(1e6 * axis.scale_sd)),
-                *(micro_g(axis.curve), micro_g(axis.curve_sd)),
-                *(micro_g(axis.reading), micro_g(axis.reading_sd)),
-                f'{axis.reading / axis.reading_sd:+.1f}' if axis.is_determined else 'unknown',
-            )
-            for axis in result.moved
-        ],
-        title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
-        'starts (at rest: bias plus scale at the mean force of the rests)',
-    )
+    _show_moved(result, out)
     out.points(change_texts(result))
     out.line(str(result.judged))
     is_better = result.judged.is_better and any(axis.is_determined for axis in result.moved)
@@ -92,6 +75,32 @@ def update(
         is_better=is_better,
         notes=[*notes, *change_texts(result)],
     )
+
+
+def _show_moved(result: 'Update', out: Output) -> None:
+    out.table(
+        ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
+        [
+            (
+                axis.axis,
+                *(micro_g(axis.bias), micro_g(axis.bias_sd)),
+                *(micro(1e6 * axis.scale), micro(1e6 * axis.scale_sd)),
+                *(micro_g(axis.curve), micro_g(axis.curve_sd)),
+                *(micro_g(axis.reading), micro_g(axis.reading_sd)),
+                f'{axis.reading / axis.reading_sd:+.1f}' if axis.is_determined else 'unknown',
+            )
+            for axis in result.moved
+        ],
+        title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
+        'starts (at rest: bias plus scale at the mean force of the rests)',
+    )
+
+
+def _overrides(allow: list[str] | None, names: tuple[str, ...]) -> list[str]:
+    for word in allow or ():
+        if word not in names:
+            raise options.usage(f'--allow: expected one of {", ".join(names)}, got {word!r}')
+    return allow or []
 
 
 def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:

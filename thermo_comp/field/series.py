@@ -24,7 +24,7 @@ from ..errors import RecordingError
 from ..files import read_bounded
 from ..text import counted
 from ..thermal.lags import MemorySpec
-from ..thermal.state import BOARD, Layout
+from ..thermal.state import BOARD, UNKNOWN, WEIGHT, Layout
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.correction import Correction
@@ -118,7 +118,7 @@ def read_rests(
             raise RecordingError(f'no rest log: expected a folder of *{SUFFIX} files', path)
         files += matching
     others: set[str] = set()
-    unit = calibration.unit
+    unit, wanted = calibration.unit, f'{calibration.unit.serial} ({calibration.unit.input})'
 
     def is_wanted(start: Start) -> bool:
         is_own = (start.serial, start.input) == (unit.serial, unit.input)
@@ -135,14 +135,10 @@ def read_rests(
     rests, n_damaged = rests_of(contents, is_wanted)
     notes = [f'{counted(n_damaged, "damaged line")} skipped'] if n_damaged else []
     if others:
-        notes.append(
-            f'rests of {", ".join(sorted(others))} are not of unit {unit.serial} ({unit.input}): '
-            'left out'
-        )
+        notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
     if not rests:
-        text = f'no rest of unit {unit.serial} ({unit.input})'
         found = f': the rests are of {", ".join(sorted(others))}' if others else ''
-        raise RecordingError(text + found, ', '.join(map(str, paths)))
+        raise RecordingError(f'no rest of unit {wanted}{found}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
     # The time in the name of an update's source is rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
@@ -224,17 +220,10 @@ def series_of(
     v = u @ M
     white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
     noise = (v**2 * white).sum(axis=1) / sizes
-    without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
-    bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
-    slow = _along(correction, states, np.zeros_like(shares), bare, u, x)
-    claim = _along(correction, states, shares, full, u, x)
-    of_start = np.moveaxis(bare.of_start(states.T, shares.T), 2, 0)
+    slow, claim, lack = _uncertainty(calibration, correction, states, shares, u, v, x)
+    of_start = SlowUncertainty(calibration, correction).of_start(states.T, shares.T)
+    of_start = np.moveaxis(of_start, 2, 0)
     of_start = of_start[:, :, :3] / K + of_start[:, :, 3:] * x[:, np.newaxis]
-    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
-    slow, claim = slow - of_one_sample, claim - of_one_sample
-    unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
-    slow -= (v**2 * unexplained).sum(axis=1)
-    residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
     return Series(
         time=averaged(stamps / _DAY_NS),
         start=_numbered(beginnings[first]),
@@ -248,7 +237,7 @@ def series_of(
         by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
         noise=noise + np.maximum(slow, 0.0),
         by_start=(of_start * v[:, np.newaxis]).sum(axis=2),
-        lack=v * np.sqrt(np.maximum(unexplained - residual, 0.0)),
+        lack=v * lack,
         claim=np.sqrt(np.maximum(claim, 0.0) + noise),
         n_windows=sizes,
         reference_temperature=calibration.reference_temperature_c,
@@ -297,6 +286,37 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
         first = first if is_same else k
         group[k] = group[k - 1] + (not is_same)
     return group
+
+
+def _uncertainty(
+    calibration: Calibration,
+    correction: Correction,
+    states: Floats,
+    shares: Floats,
+    u: Floats,
+    v: Floats,
+    x: Floats,
+) -> tuple[Floats, Floats, Floats]:
+    """
+    Return the variance of |f| by thermometers and regime, (n,), that of the calibration's claim,
+    (n,), and the sd of the lack of fit of each axis, (n, 3).
+    """
+    without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
+    bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
+    slow = _along(correction, states, np.zeros_like(shares), bare, u, x)
+    claim = _along(correction, states, shares, full, u, x)
+    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
+    slow, claim = slow - of_one_sample, claim - of_one_sample
+    weight, unknown = states[:, WEIGHT], states[:, UNKNOWN]
+    regimes = np.array([1.0 - weight, weight])
+    unexplained = correction.curves.unexplained(states[:, BOARD])
+    # The model of ageing has its own scatter of starts and rests, so the file's is no noise. While
+    # the regime is unknown `_along` includes the residuals of both sets.
+    of_sets = regimes + unknown * regimes[::-1]
+    slow -= (v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
+    residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
+    lack = np.maximum(unexplained - np.array(residual)[:, :, np.newaxis], 0.0)
+    return slow, claim, np.sqrt((regimes[:, np.newaxis] * lack).sum(axis=0).T)
 
 
 def _along(
