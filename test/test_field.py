@@ -374,6 +374,9 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
+    # The date of the new file is that of its last rest, not that of the command.
+    assert written.provenance.date == '2030-01-20T23:12:40Z'
+    assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
     # The new file removes the residual of the old file, and the history shows both residuals.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')

@@ -162,6 +162,12 @@ def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
 
 
+def last_rest(source: Source) -> str:
+    """Return the date of the last rest of an update's source (UTC); '' for a bag."""
+    name = source.name
+    return name.removeprefix(_UNTIL).partition(_AGED)[0] + 'Z' if name.startswith(_UNTIL) else ''
+
+
 def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     """
     Return the start of a calibration's validity [days since 1970], the time up to which its

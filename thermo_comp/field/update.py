@@ -25,7 +25,7 @@ from ..unit.gravity import ug_text
 from ..unit.metrics import means_by
 from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
-from .series import Series, valid_since
+from .series import Series, last_rest, valid_since
 
 #: Names of the conclusions that a user can override: another gravity than stated at the rests, and
 #: samples of another unit.
@@ -155,7 +155,7 @@ def update(
         provenance=replace(
             _with_update(before, series, judged),
             created=created or before.created,
-            tested='',
+            tested=last_rest(source) if source else '',
             sources=(*before.sources, *([source] if source else [])),
         ),
     )
