@@ -271,6 +271,19 @@ def test_a_changed_curve_is_detected_and_corrected():
     assert curves[1] - curves[0] == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
 
 
+def test_the_slopes_over_temperature_age_by_a_fixed_walk():
+    # Level rests do not determine x: the sd of its curve is that of 1 ug/K per root year.
+    unit = known(
+        static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
+    )
+    series = series_of(rests(unit, upright, no_error), unit)
+    result, n = update(series, unit), len(series) // 10
+    span = np.sort(series.temperature)[[n, -1 - n]]
+    expected = 1.0 * MICRO_G * np.sqrt(np.ptp(series.time) / 365.25) * np.ptp(span)
+    assert result.moved[0].curve_sd == pytest.approx(expected, rel=0.02)
+    assert 0.0 < result.moved[2].curve_sd < expected
+
+
 def test_a_start_that_contradicts_all_others_is_left_out():
     unit = known()
     logged = rests(unit, upright, jump_of(100.0, 8.0), days=15)

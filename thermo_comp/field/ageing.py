@@ -7,7 +7,8 @@ by evidence.
 ``|f| - g`` of rest i at time t_i after start k of the node is ``H_i delta + B_i b(t_i) + S_i
 s(t_i) + B_i o_k + L_i l_k + lack + e_i``: delta is the error of the calibration (its posterior), b
 and s are random walks of bias and scale since the calibration, o_k is a bias offset, l_k are the
-unknown lag states at the start, e is independent noise.
+unknown lag states at the start, e is independent noise. The slopes of the bias over temperature
+walk slowly, by a fixed sd.
 Jumps of the levels or of gravity, and a change of the curve, are added one at a time while the log
 Bayes factor is high enough. The variances maximise the marginal likelihood, with wide priors.
 """
@@ -44,6 +45,8 @@ _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
 _LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
+#: Random walk of the curves' slopes [m/s^2 per K per root day]: the smallest of these in a year.
+_SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
 #: Largest number of rows (equations) per start of the node in the solution, and in the search for
 #: the variances; largest number of all rows in the search, whose time grows with its cube.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
@@ -185,6 +188,8 @@ class Model:
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
+        slopes = Change('curve', None, 1.0, 0.0).columns(rows)
+        self.base += _SLOPE_WALK**2 * elapsed * (slopes @ slopes.T)
         for change in changes:
             columns = change.columns(rows)
             self.base += change.sd**2 * columns @ columns.T
@@ -386,7 +391,10 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]
     walk = np.repeat([ageing.bias**2, ageing.scale**2], 3)
     crossed = rows.by_parameter @ model.prior + (age * rows.by_level * walk) @ to_file.T
-    prior = model.prior + (to_file * walk * float(age.max())) @ to_file.T
+    slopes = Change('curve', None, 1.0, 0.0).columns(rows)
+    crossed += _SLOPE_WALK**2 * (age * slopes) @ bend.T
+    per_day = (to_file * walk) @ to_file.T + _SLOPE_WALK**2 * bend @ bend.T
+    prior = model.prior + float(age.max()) * per_day
     lower = np.linalg.cholesky(model.covariance(ageing))
     innovations = solve_triangular(lower, rows.y, lower=True)
     gravity = []
@@ -405,7 +413,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
         gains.T @ innovations,
         prior,
         prior - gains.T @ gains,
-        (to_file * walk * ahead) @ to_file.T,
+        ahead * per_day,
         gains,
         innovations,
         tuple(gravity),
