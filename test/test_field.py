@@ -18,13 +18,16 @@ import field_units
 import field_watch
 
 from thermo_comp.errors import FitError
-from thermo_comp.field.ageing import Ageing, Model, rows_of, solve
-from thermo_comp.field.series import series_of
-from thermo_comp.field.update import update
+from thermo_comp.field.ageing import Ageing, Model, learn, rows_of, solve
+from thermo_comp.field.series import read_rests, series_of
+from thermo_comp.field.update import change_texts, refuse_another_unit, update
 from thermo_comp.field.watch import LIMIT, passage, watch
 from thermo_comp.fitting.assembly import parameters_of, with_parameters
+from thermo_comp.thermal.lags import Lag, start_root
+from thermo_comp.thermal.state import Layout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
+from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.provenance import Provenance
@@ -168,6 +171,9 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
+    # In one attitude a shock and another gravity are the same.
+    assert [change.may_be_gravity for change in updated.changes] == [True]
+    assert 'or another gravity' in ' '.join(change_texts(updated))
     # Upright rests show a change of 300 ug in bias plus scale of z; turn-ons of 20 ug leave 15 ug.
     assert updated.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
@@ -209,6 +215,64 @@ def test_the_present_sd_of_the_old_calibration_contains_its_ageing(rng):
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
+def stepped(history, size, day):
+    """Add a step of gravity [m/s^2] from a day on; the counts of the units are 300 per m/s^2."""
+    return [
+        (s, replace(r, mean=tuple(np.array(r.mean) * (1.0 + size / field_units.G * (d >= day)))))
+        for (s, r), d in zip(history.rests, history.day, strict=True)
+    ]
+
+
+@pytest.mark.parametrize('day', [15, 0])
+def test_another_gravity_is_not_taken_for_three_scales(day):
+    # The unit walks by 15 ug and 10 ppm; gravity differs by 300 ug from day 15 or the first rest.
+    unit, size = field_units.calibration(), 300.0 * MICRO_G
+    history = field_units.live('carried', 2, 30, field_units.Process())
+    aged = update(series_of(history.rests, unit), unit)
+    result = update(series_of(stepped(history, size, day), unit), unit)
+    ((change, found, sd),) = result.solution.gravity
+    assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
+    # From the first rest on, another gravity equals a common walk before it within 10 ppm.
+    assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
+    for before, after in zip(aged.moved, result.moved, strict=True):
+        assert after.scale == pytest.approx(before.scale, abs=30e-6)
+    assert result.judged.after < 40.0 * MICRO_G
+    (text,) = (line for line in change_texts(result) if 'another gravity' in line)
+    assert 'than the stated 9.80665 m/s^2 from 2026-' in text
+    # With a gravity that is certain, the scales of all axes have changed.
+    certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
+    assert certain.solution.gravity == ()
+    assert all(axis.scale > 150e-6 for axis in certain.moved)
+
+
+@pytest.mark.parametrize('kind', ['level', 'carried'])
+def test_ageing_is_not_taken_for_another_gravity_or_unit(kind):
+    unit = field_units.calibration()
+    for seed in range(5):
+        shock_day = np.inf if seed % 2 else 10.0
+        history = field_units.live(kind, seed, 20, field_units.Process(shock_day=shock_day))
+        result = update(series_of(history.rests, unit), unit)
+        assert result.solution.gravity == ()
+        assert all(change.kind == 'levels' for change in result.changes)
+        assert seed % 2 == 0 or result.changes == ()
+        refuse_another_unit(result)
+
+
+@pytest.mark.parametrize('first', [0, 10])
+def test_samples_of_another_unit_are_refused(first):
+    # The other unit differs by percents in scale and milli-g in bias: in all rests, or in half.
+    unit = field_units.calibration()
+    history = field_units.live('carried', 3, 20, field_units.Process())
+    mixed = [
+        (s, replace(r, mean=tuple(np.array(r.mean) * (1.02, 0.985, 1.01) + (2.0, -4.0, 1.0))))
+        if day >= first else (s, r)
+        for (s, r), day in zip(history.rests, history.day, strict=True)
+    ]  # fmt: skip
+    result = update(series_of(mixed, unit), unit)
+    with pytest.raises(FitError, match=r'expected at most 1 mg for this unit by ageing: samples'):
+        refuse_another_unit(result)
+
+
 def test_a_changed_curve_is_detected_and_corrected():
     # The z bias changes by 5 ug/K, and the log has temperatures of 15 to 25 degC.
     unit = known(
@@ -227,6 +291,19 @@ def test_a_changed_curve_is_detected_and_corrected():
     assert curves[1] - curves[0] == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
 
 
+def test_the_slopes_over_temperature_age_by_a_fixed_walk():
+    # Level rests do not determine x: the sd of its curve is that of 1 ug/K per root year.
+    unit = known(
+        static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
+    )
+    series = series_of(rests(unit, upright, no_error), unit)
+    result, n = update(series, unit), len(series) // 10
+    span = np.sort(series.temperature)[[n, -1 - n]]
+    expected = 1.0 * MICRO_G * np.sqrt(np.ptp(series.time) / 365.25) * np.ptp(span)
+    assert result.moved[0].curve_sd == pytest.approx(expected, rel=0.02)
+    assert 0.0 < result.moved[2].curve_sd < expected
+
+
 def test_a_start_that_contradicts_all_others_is_left_out():
     unit = known()
     logged = rests(unit, upright, jump_of(100.0, 8.0), days=15)
@@ -238,6 +315,37 @@ def test_a_start_that_contradicts_all_others_is_left_out():
     result = update(series_of(bad, unit), unit)
     assert result.n_outliers == 1
     assert result.moved[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
+
+
+def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
+    # A computer without a battery clock starts at the date of its image, and the stamps of the
+    # samples are right. Every start, then the last start alone, has such a date.
+    unit = known()
+    logged = rests(unit, upright, jump_of(300.0, 10.0))
+    image = {one.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for one, _ in logged}
+    last = logged[-1][0].start_ns
+    expected = None
+    for number, wrong in enumerate(({}, image, {last: 30 * 10**9})):
+        of_image = [
+            (replace(s, start_ns=wrong.get(s.start_ns, s.start_ns)), rest) for s, rest in logged
+        ]
+        read, source, _ = read_rests([write_log(tmp_path / str(number), of_image)], unit)
+        assert source.name.startswith('rests until 2030-01-20T23:12:40')
+        updated = update(series_of(read, unit), unit)
+        expected = expected or updated
+        assert updated.calibration == expected.calibration
+        assert updated.judged == expected.judged
+
+
+def test_stamps_in_any_order_give_a_valid_covariance(rng):
+    # The stamps of a third of the starts are wrong by up to 10 days: starts overlap.
+    unit = known()
+    logged = rests(unit, upright, no_error)
+    wrong = {s.start_ns: int(rng.choice((0, 0, 864e12 * rng.uniform(-1, 1)))) for s, _ in logged}
+    moved = [(s, replace(r, stamp_ns=r.stamp_ns + wrong[s.start_ns])) for s, r in logged]
+    solution = update(series_of(moved, unit), unit).solution
+    for covariance in (solution.prior, solution.posterior):
+        assert np.linalg.eigvalsh(covariance).min() > -1e-9 * np.trace(covariance)
 
 
 def test_too_few_starts_are_refused():
@@ -354,6 +462,9 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
+    # The date of the new file is that of its last rest, not that of the command.
+    assert written.provenance.date == '2030-01-20T23:12:40Z'
+    assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
     # The new file removes the residual of the old file, and the history shows both residuals.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
@@ -387,17 +498,87 @@ def test_mistakes_of_update_end_in_one_sentence(tmp_path, unit_file, cli):
     (tmp_path / 'empty').mkdir()
     for arguments, text in (
         (('update', unit_file, log, *new), 'rests: no rest of unit T-1'),
+        (('update', unit_file, log, *new), 'unit T-1 (counts): the rests are of T-2 (counts)'),
         (('update', unit_file, tmp_path / 'empty', *new), 'empty: no rest log: expected a folder'),
         (('update', unit_file, tmp_path / 'none', *new), 'none: no rest log: expected a folder'),
     ):
         assert text in cli(*arguments, code=1).stderr
     bag = ROOT / 'bags' / 'held_out.mcap'
     assert 'evaluated alone' in cli('evaluate', log, bag, '-c', unit_file, code=2).stderr
+    broken = write_log(tmp_path / 'broken', rests(unit, upright, jump_of(3000.0, 2.0), days=4))
+    printed = cli('update', unit_file, broken, *new, code=1).stderr
+    assert 'on 2030-01-03 |f| differs from the gravity 9.80665 m/s^2 by 3 mg RMS' in printed
+    assert '(override with --allow unit)' in printed
+    printed = cli('update', unit_file, broken, *new, '--allow', 'units', code=2).stderr
+    assert "--allow: expected one of gravity, unit, got 'units'" in printed
+    cli('update', unit_file, broken, *new, '--allow', 'unit')
+    (tmp_path / 'new.yaml').unlink()
     rich = tmp_path / 'rich.yaml'
     save_calibration(rich_calibration(), rich)
     log = write_log(tmp_path / 'own', rests(unit, upright, no_error, days=2))
     printed = cli('update', rich, log, *new, code=1).stderr
     assert 'logged with a calibration that has other columns' in printed
+
+
+def with_shares(logged, share):
+    return [(s, replace(r, shares=(share,) * len(r.shares))) for s, r in logged]
+
+
+def test_a_rest_differentiates_by_the_unknown_lags_of_its_start():
+    # The unknowns move the lags; the expected derivatives are finite differences of |f|.
+    unit, share, step = rich_calibration(), 0.6, 1e-4
+    logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
+    series, layout = series_of(logged, unit), Layout(Correction(unit).memory)
+    lags = [lag for lag in layout.places if isinstance(lag, Lag)]
+    root = start_root(tuple(lags))
+    for k, column in enumerate(root.T):
+        states = np.array([r.state for _, r in logged])
+        for lag, size in zip(lags, column, strict=True):
+            states[:, layout.places[lag]] += step * share * size
+        moved = [(s, replace(r, state=tuple(x))) for (s, r), x in zip(logged, states, strict=True)]
+        slope = (series.residual - series_of(moved, unit).residual) / step
+        expected = series.by_start[:, k]
+        assert np.allclose(slope, expected, atol=0.03 * np.abs(series.by_start).max())
+    settled = series_of(with_shares(logged, 0.0), unit)
+    assert not settled.by_start.any()
+    assert np.array_equal(settled.noise, series.noise)
+
+
+def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
+    # The residual sd of the file is the scatter of starts, which the ageing model estimates.
+    unit = field_units.calibration()
+    logged = field_units.live('level', 1, 3, field_units.Process()).rests
+    unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]
+    series, early = series_of(logged, unit), series_of(unknown, unit)
+    assert np.allclose(early.noise, series.noise, rtol=1e-9)
+    assert np.sqrt(series.noise.max()) < 8.0 * MICRO_G < early.claim.min()
+
+
+@pytest.mark.parametrize('lags', [0.0, 1.0])
+def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
+    # Three rests per start, from the first second on: walks of 15 and 10 ug per root day, 20 ug at
+    # a start, 3 ug of scatter, and lags of none or all of the assumed sd, which is 40 to 100 ug.
+    unit = rich_calibration()
+    each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
+    n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]
+    series = replace(each, **{name: np.repeat(getattr(each, name), 3, axis=0) for name in names})
+    series.by_start[:] *= np.tile([1.0, 0.7, 0.4], n)[:, np.newaxis]
+    steps = np.sqrt(np.diff(each.time, prepend=each.time[0]))[:, np.newaxis]
+    sd = np.repeat([15.0, 10.0], 3) * MICRO_G
+    levels = np.cumsum(steps * sd * rng.standard_normal((n, 6)), axis=0)
+    levels[:, :3] += 20.0 * MICRO_G * rng.standard_normal((n, 3))
+    start = lags * rng.standard_normal((n, each.by_start.shape[1]))
+    residual = (series.by_level * np.repeat(levels, 3, axis=0)).sum(axis=1)
+    residual += (series.by_start * np.repeat(start, 3, axis=0)).sum(axis=1)
+    residual += np.sqrt(series.noise + (3.0 * MICRO_G) ** 2) * rng.standard_normal(3 * n)
+    ageing, _, used = learn(replace(series, residual=residual), unit, float(series.time[0]))
+    assert len(used) == 3 * n
+    # Six simulated units vary by 20 % in the bias, 30 % in the scale, 15 % at a start.
+    assert ageing.bias == pytest.approx(15.0 * MICRO_G, rel=0.5)
+    assert ageing.scale == pytest.approx(10.0 * MICRO_G, rel=0.7)
+    assert ageing.turn_on == pytest.approx(20.0 * MICRO_G, rel=0.35)
+    assert ageing.rest == pytest.approx(3.0 * MICRO_G, rel=0.4)
+    assert ageing.lags == pytest.approx(lags, abs=0.25)
 
 
 def test_the_newest_of_many_starts_are_used(monkeypatch):

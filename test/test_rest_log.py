@@ -76,7 +76,9 @@ def logged(folder):
 
 def finder():
     state = (20.0,) * 7
-    return RestFinder(np.full(3, 300.0), np.full(3, NOISE**2), 32767.0, lambda: (state, ()))
+    return RestFinder(
+        np.full(3, 300.0), np.full(3, NOISE**2), 32767.0, lambda: (state, ()), 1.0 / RATE_HZ
+    )
 
 
 def test_windows_are_means_of_ten_seconds_at_rest():
@@ -97,6 +99,32 @@ def test_windows_are_means_of_ten_seconds_at_rest():
         rests += pieces.add(stamps[cut], samples[cut])
     assert [one.stamp_ns for one in rests] == [one.stamp_ns for one in whole]
     assert np.allclose([one.mean for one in rests], [one.mean for one in whole], atol=1e-9)
+
+
+@pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
+def test_rests_are_found_at_any_rate_of_samples(rate, rng):
+    # Two minutes of rest, in another attitude from the first minute on, with scattered stamps;
+    # noise of a sample as at `RATE_HZ`, and as of a white density above.
+    n = round(120 * rate)
+    cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
+    stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)
+    excess = np.sqrt(max(1.0, rate / RATE_HZ))
+    samples = (30.0, -20.0, 2941.0) + 300.0 * NOISE * excess * rng.standard_normal((n, 3))
+    samples[n // 2 :] = samples[n // 2 :, [2, 1, 0]]
+    whole = finder().add(stamps, samples)
+    # At most two windows are lost at the change, and one at the end.
+    assert sum(one.n for one in whole) >= 0.6 * n
+    assert len(whole) >= 6
+    for one in whole:
+        is_first = one.stamp_ns < START_NS + 60 * SECOND_NS
+        expected = (30.0, -20.0, 2941.0) if is_first else (2941.0, -20.0, 30.0)
+        assert np.abs(np.array(one.mean) - expected).max() < 5.0 * 3.0 * excess / np.sqrt(one.n)
+    pieces, found = finder(), []
+    for cut in np.split(np.arange(n), np.sort(rng.choice(n, 20, replace=False))):
+        if len(cut):
+            found += pieces.add(stamps[cut], samples[cut])
+    assert [one.stamp_ns for one in found] == [one.stamp_ns for one in whole]
+    assert np.allclose([one.mean for one in found], [one.mean for one in whole], atol=1e-9)
 
 
 @pytest.mark.parametrize('fault', ['moves', 'shakes', 'stuck', 'tilts', 'saturated', 'gap'])

@@ -82,16 +82,21 @@ def info(
 
 
 def _calibration(out: Output, path: Path) -> None:
+    from ..field.series import last_rest
     from ..online.trial import tried
     from ..unit.calibration_file import load_calibration
 
     calibration = load_calibration(path)
     tried(calibration, path)
     unit, provenance = calibration.unit, calibration.provenance
+    n_logs = sum(bool(last_rest(source)) for source in provenance.sources)
+    data = counted(len(provenance.sources) - n_logs, 'bag')
+    if n_logs:
+        data += f' and {counted(n_logs, "rest log")}'
     out.line(f'{path}: unit {unit.serial}, {unit.input} up to {unit.full_scale:g}')
     out.line(
         f'  fitted {provenance.created or "at an unknown time"} by thermo_comp '
-        f'{provenance.tool_version or "?"} from {counted(len(provenance.sources), "bag")}, '
+        f'{provenance.tool_version or "?"} from {data}, '
         f'model {provenance.model or "?"}'
     )
     out.line(

@@ -4,11 +4,16 @@
 
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ..files import CALIBRATION, check_output
 from . import shared_options as options
 from .output import Output, micro, micro_g, picked
 from .shared_options import argument, option
+
+if TYPE_CHECKING:
+    from ..field.ageing import Ageing
+    from ..field.update import Update
 
 #: Exit code of an update that gains nothing.
 NOTHING_GAINED = 3
@@ -22,6 +27,7 @@ def update(
     ahead: float = option(
         'Days until the next update, by which the uncertainty is aged.', 1.0, min=0.0, max=3650.0
     ),
+    allow: list[str] | None = option('Name of a conclusion to override, as in its message.'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -37,32 +43,22 @@ def update(
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
     """
     from ..field.series import read_rests, series_of
-    from ..field.update import change_texts
+    from ..field.update import OVERRIDES, change_texts, refuse_another_unit
     from ..field.update import update as run
     from ..unit.calibration_file import load_calibration, save_calibration
 
+    allowed = _overrides(allow, OVERRIDES)
     check_output(output, CALIBRATION, overwrite=force, others=[calibration, *rests])
     old = load_calibration(calibration)
     logged, source, notes = read_rests(rests, old, ahead=ahead)
     created = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
-    result = run(series_of(logged, old, gravity=where[0]), old, source, created, ahead)
+    series = series_of(logged, old, gravity=where[0])
+    is_certain = 'gravity' in allowed
+    result = run(series, old, source, created, ahead, is_gravity_certain=is_certain)
+    if 'unit' not in allowed:
+        refuse_another_unit(result)
     out.points(notes)
-    out.table(
-        ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
-        [
-            (
-                axis.axis,
-                *(micro_g(axis.bias), micro_g(axis.bias_sd)),
-                *(micro(1e6 * axis.scale), micro(1e6 * axis.scale_sd)),
-                *(micro_g(axis.curve), micro_g(axis.curve_sd)),
-                *(micro_g(axis.reading), micro_g(axis.reading_sd)),
-                f'{axis.reading / axis.reading_sd:+.1f}' if axis.is_determined else 'unknown',
-            )
-            for axis in result.moved
-        ],
-        title=f'changes shown by {len(result.series)} rests in {result.series.start[-1] + 1} '
-        'starts (at rest: bias plus scale at the mean force of the rests)',
-    )
+    _show_moved(result, out)
     out.points(change_texts(result))
     out.line(str(result.judged))
     is_better = result.judged.is_better and any(axis.is_determined for axis in result.moved)
@@ -80,10 +76,43 @@ def update(
         0 if is_better else NOTHING_GAINED,
         output=output if is_better else None,
         **picked(result, 'moved changes judged'),
-        ageing_m_s2=result.ageing,
+        **_ageing(result.ageing),
         is_better=is_better,
         notes=[*notes, *change_texts(result)],
     )
+
+
+def _show_moved(result: 'Update', out: Output) -> None:
+    out.table(
+        ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
+        [
+            (
+                axis.axis,
+                *(micro_g(axis.bias), micro_g(axis.bias_sd)),
+                *(micro(1e6 * axis.scale), micro(1e6 * axis.scale_sd)),
+                *(micro_g(axis.curve), micro_g(axis.curve_sd)),
+                *(micro_g(axis.reading), micro_g(axis.reading_sd)),
+                f'{axis.reading / axis.reading_sd:+.1f}' if axis.is_determined else 'unknown',
+            )
+            for axis in result.moved
+        ],
+        title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
+        'starts (at rest: bias plus scale at the mean force of the rests)',
+    )
+
+
+def _overrides(allow: list[str] | None, names: tuple[str, ...]) -> list[str]:
+    for word in allow or ():
+        if word not in names:
+            raise options.usage(f'--allow: expected one of {", ".join(names)}, got {word!r}')
+    return allow or []
+
+
+def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
+    """Return the ageing for JSON: standard deviations, and the relative sd of the lags."""
+    values = vars(ageing).copy() if ageing else {}
+    share = values.pop('lags', None)
+    return {'ageing_m_s2': values or None, 'lags_at_start': share}
 
 
 def evaluate_rests(
@@ -122,6 +151,6 @@ def evaluate_rests(
         **picked(result, 'days temperatures left'),
         forecast_days=result.forecast,
         interval_days=result.interval,
-        ageing_m_s2=result.ageing,
+        **_ageing(result.ageing),
         notes=notes,
     )

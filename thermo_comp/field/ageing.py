@@ -5,16 +5,19 @@ Owns the ageing model of a unit: a Gaussian model of the errors at rest, with va
 by evidence.
 
 ``|f| - g`` of rest i at time t_i after start k of the node is ``H_i delta + B_i b(t_i) + S_i
-s(t_i) + B_i o_k + lack + e_i``: delta is the error of the calibration (its posterior), b and s are
-random walks of bias and scale since the calibration, o_k is a bias offset, e independent noise.
-Jumps of the levels, and a change of the curve, are added one at a time while the log Bayes factor
-is high enough. The variances maximise the marginal likelihood, with wide priors.
+s(t_i) + B_i o_k + L_i l_k + lack + e_i``: delta is the error of the calibration (its posterior), b
+and s are random walks of bias and scale since the calibration, o_k is a bias offset, l_k are the
+unknown lag states at the start, e is independent noise. The slopes of the bias over temperature
+walk slowly, by a fixed sd.
+Jumps of the levels or of gravity, and a change of the curve, are added one at a time while the log
+Bayes factor is high enough. The variances maximise the marginal likelihood, with wide priors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -28,14 +31,22 @@ from .series import Series
 #: Centres of the priors, relative to the turn-on offset: random walk per root day of bias, and of
 #: scale times g; scatter of a rest. Sd of the logarithm of all priors: a factor of 5 either way.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
+#: Centre of the prior of the sd of the lag states at a start, relative to the calibration's
+#: assumption: units that are at rest before their start have smaller lags.
+_LAG_SHARE = 1.0
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
-#: Prior standard deviations tried for a jump of the levels [m/s^2].
+#: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Relative sizes of a jump in the biases and in the scales times g, which a shock changes less.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
+#: Least log Bayes factor of a change against none (150:1), and of another gravity against a jump
+#: of the levels (20:1): where the attitudes do not distinguish them, a jump is the explanation.
+_LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
+#: Random walk of the curves' slopes [m/s^2 per K per root day]: the smallest of these in a year.
+_SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
 #: Largest number of rows (equations) per start of the node in the solution, and in the search for
 #: the variances; largest number of all rows in the search, whose time grows with its cube.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
@@ -44,42 +55,49 @@ _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
 @dataclass(frozen=True)
 class Ageing:
     """
-    Standard deviations of the ageing model [m/s^2].
+    Standard deviations of the ageing model [m/s^2]; `lags` is relative.
 
     bias, scale: random walk of the bias, and of the scale times g, per root day
     turn_on: bias offset of a start of the node
     rest: scatter from rest to rest
+    lags: unknown lag states at a start, relative to the sd that the calibration assumes
     """
 
     bias: float
     scale: float
     turn_on: float
     rest: float
+    lags: float = 0.0
 
 
 @dataclass(frozen=True)
 class Change:
     """
-    A jump of the levels at `time` [days since 1970] or, if `time` is None, a change of the curve.
+    A jump of the levels or of gravity at `time` [days since 1970], or a change of the curve.
+
+    sd: prior standard deviation of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
+    may_be_gravity: a jump of the levels that another gravity explains almost as well
     """
 
+    kind: Literal['levels', 'gravity', 'curve']
     time: float | None
     sd: float
     log_bayes_factor: float
+    may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return the derivatives of the ageing model's rows by the change, (n, 6) or (n, 3)."""
+        """Return the derivatives of the ageing model's rows by the change, (n, 6 or 1 or 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
-        is_after = (rows.time >= self.time)[:, np.newaxis]
-        return np.asarray(rows.by_level * _JUMP_SHARES * is_after)
+        of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
+        return np.asarray(of_jump * (rows.time >= self.time)[:, np.newaxis])
 
 
 @dataclass(frozen=True)
 class Rows:
     """
-    Equations of the rests, in order of time, at most `_ROWS` for each start of the node:
-    orthogonal sums with all information of its rests about the six levels.
+    Equations of the rests, in order of the starts, at most `_ROWS` of a start: orthogonal sums
+    with all information of its rests about the six levels.
 
     noise, scatter: variance of the noise, and factor of the rests' scatter variance in a row
     rank: number of the row within its start
@@ -91,11 +109,18 @@ class Rows:
     y: Floats
     by_parameter: Floats
     by_level: Floats
+    by_gravity: Floats
+    by_start: Floats
     lack: Floats
     warmth: Floats
     noise: Floats
     scatter: Floats
     rank: Ints
+
+    @property
+    def by_jump(self) -> Floats:
+        """Derivatives by a jump of the levels, in `_JUMP_SHARES`, and of gravity, (n, 7)."""
+        return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
         """Return the rows that a mask selects."""
@@ -105,7 +130,7 @@ class Rows:
 def rows_of(series: Series, scatter: float) -> Rows:
     """Sum the rests of each start, weighted by their noise and an initial scatter [m/s^2]."""
     parts: list[tuple[Floats, ...]] = []
-    variance = series.noise + scatter**2
+    variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
         at = np.flatnonzero(series.start == start)
         weight = np.sqrt(variance[at].mean() / variance[at])
@@ -116,7 +141,10 @@ def rows_of(series: Series, scatter: float) -> Rows:
         # rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
-        summed = (series.residual, series.by_parameter, series.by_level, series.lack)
+        # Another gravity changes |f| alike in all attitudes.
+        ones = np.ones(len(series))
+        levels = (series.by_parameter, series.by_level, ones)
+        summed = (series.residual, *levels, series.by_start, series.lack)
         parts.append(
             (
                 *(np.full(n, series.time[at].mean()), np.full(n, start)),
@@ -154,11 +182,14 @@ class Model:
             elapsed * (scale @ scale.T),
             np.where(is_same, along, 0.0),
             np.diag(rows.scatter),
+            np.where(is_same, rows.by_start @ rows.by_start.T, 0.0),
         ]
         # The lack of fit is correlated between temperatures that differ by less than about 10 K.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
+        slopes = Change('curve', None, 1.0, 0.0).columns(rows)
+        self.base += _SLOPE_WALK**2 * elapsed * (slopes @ slopes.T)
         for change in changes:
             columns = change.columns(rows)
             self.base += change.sd**2 * columns @ columns.T
@@ -196,7 +227,7 @@ class Model:
             (
                 minimize(
                     loss,
-                    np.clip(np.log(step * np.array(shares)), *bounds),
+                    np.clip(np.log([*(step * np.array(shares)), centre.lags]), *bounds),
                     jac=True,
                     method='L-BFGS-B',
                     bounds=list(zip(*bounds, strict=True)),
@@ -230,16 +261,18 @@ def usual(calibration: Calibration) -> Ageing:
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
-    return Ageing(walk, walk, turn_on, _SCATTER_SHARE * turn_on)
+    return Ageing(walk, walk, turn_on, _SCATTER_SHARE * turn_on, _LAG_SHARE)
 
 
-def learn(series: Series, calibration: Calibration, since: float) -> tuple[Ageing, Model, Series]:
+def learn(
+    series: Series, calibration: Calibration, since: float, *, is_gravity_certain: bool = False
+) -> tuple[Ageing, Model, Series]:
     """
     Estimate variances and changes by evidence, without starts that contradict all other starts.
 
-    At most four changes are added, each with a log Bayes factor of at least 5. A start of the node
-    is left out if one of its rows is more than 5 sd from the prediction by all other rows. Returns
-    the variances, the model of all rows, and the rests used.
+    At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
+    of the node is left out if one of its rows is more than 5 sd from the prediction by all other
+    rows. Returns the variances, the model of all rows, and the rests used.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)
@@ -251,10 +284,8 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
         while True:
             model = Model(few, calibration, since, changes)
             ageing, inverse = model.fitted(centre)
-            best = max(
-                _candidates(model, inverse), key=lambda jump: jump.log_bayes_factor, default=None
-            )
-            if best is None or best.log_bayes_factor < 5.0 or len(changes) == 4:
+            best = _best(_candidates(model, inverse), is_gravity_certain)
+            if best is None or len(changes) == 4:
                 break
             changes += (best,)
         everything = Model(rows, calibration, since, changes)
@@ -270,35 +301,59 @@ def learn(series: Series, calibration: Calibration, since: float) -> tuple[Agein
     return ageing, everything, used
 
 
+def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
+    """Choose the most probable change; None if no change has enough evidence."""
+    best: dict[str, Change] = {}
+    for change in candidates:
+        if change.log_bayes_factor > _gain(best.get(change.kind)):
+            best[change.kind] = change
+    gravity = None if is_gravity_certain else best.get('gravity')
+    others = (change for kind, change in best.items() if kind != 'gravity')
+    other = max(others, key=_gain, default=None)
+    lead = _gain(gravity) - max(_gain(other), 0.0)
+    if gravity is not None and lead >= _LEAST_LEAD and _gain(gravity) >= _LEAST_GAIN:
+        return gravity
+    if other is None or _gain(other) < _LEAST_GAIN:
+        return None
+    return replace(other, may_be_gravity=other.kind == 'levels' and lead > -_LEAST_LEAD)
+
+
+def _gain(change: Change | None) -> float:
+    return -np.inf if change is None else change.log_bayes_factor
+
+
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
     """
     Yield possible jumps before each start, and a change of the curve, with log Bayes factors.
     """
     rows = model.rows
-    alpha, by_level = inverse @ rows.y, rows.by_level * _JUMP_SHARES
+    alpha, by_jump = inverse @ rows.y, rows.by_jump
     _, first = np.unique(rows.start, return_index=True)
-    n = len(first)
-    precision = np.empty((n, n, 6, 6))
-    for j in range(6):
-        half = np.add.reduceat(inverse * by_level[:, j], first, axis=1)
-        for i in range(6):
-            precision[:, :, i, j] = np.add.reduceat(by_level[:, [i]] * half, first, axis=0)
-    gradient = np.add.reduceat(by_level * alpha[:, np.newaxis], first, axis=0)
+    n, width = len(first), by_jump.shape[1]
+    precision = np.empty((n, n, width, width))
+    for j in range(width):
+        half = np.add.reduceat(inverse * by_jump[:, j], first, axis=1)
+        for i in range(width):
+            precision[:, :, i, j] = np.add.reduceat(by_jump[:, [i]] * half, first, axis=0)
+    gradient = np.add.reduceat(by_jump * alpha[:, np.newaxis], first, axis=0)
     # A jump before a start also shifts all later starts.
     after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
     gradient = np.cumsum(gradient[::-1], axis=0)[::-1]
-    known = {change.time for change in model.changes}
+    known = {(change.kind, change.time) for change in model.changes}
+    places: tuple[tuple[Literal['levels', 'gravity'], slice], ...]
+    places = ('levels', slice(6)), ('gravity', slice(6, width))
     for k in range(n):
         time = float(rows.time[first[k]])
-        for sd in _JUMPS if time not in known else ():
-            gain = _log_bayes_factor(after[k, k], gradient[k], sd) - np.log(n * len(_JUMPS))
-            yield Change(time, sd, gain)
-    if None in known:
+        for kind, at in places:
+            for sd in _JUMPS if (kind, time) not in known else ():
+                gain = _log_bayes_factor(after[k, k][at, at], gradient[k, at], sd)
+                yield Change(kind, time, sd, gain - float(np.log(n * len(_JUMPS))))
+    if ('curve', None) in known:
         return
-    columns = Change(None, 1.0, 0.0).columns(rows)
+    columns = Change('curve', None, 1.0, 0.0).columns(rows)
     for sd in _BENDS:
         gain = _log_bayes_factor(columns.T @ inverse @ columns, columns.T @ alpha, sd)
-        yield Change(None, sd, gain - float(np.log(len(_BENDS))))
+        yield Change('curve', None, sd, gain - float(np.log(len(_BENDS))))
 
 
 def _log_bayes_factor(precision: Floats, gradient: Floats, sd: float) -> float:
@@ -319,6 +374,7 @@ class Solution:
     prior, posterior: covariances before and after the rests
     future: covariance that is added during the time of use after the last rest
     gains, innovations: factors of the shift; estimates by fewer rows are partial sums
+    gravity: jumps of gravity, each with its size and the sd of the size [m/s^2]
     """
 
     shift: Floats
@@ -327,6 +383,7 @@ class Solution:
     future: Floats
     gains: Floats
     innovations: Floats
+    gravity: tuple[tuple[Change, float, float], ...] = ()
 
     def before(self, row: int) -> Floats:
         """Return the shift that follows from the first rows only."""
@@ -344,19 +401,30 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]
     walk = np.repeat([ageing.bias**2, ageing.scale**2], 3)
     crossed = rows.by_parameter @ model.prior + (age * rows.by_level * walk) @ to_file.T
-    prior = model.prior + (to_file * walk * float(age[-1, 0])) @ to_file.T
-    for change in model.changes:
-        onto = bend if change.time is None else to_file * _JUMP_SHARES
-        crossed += change.sd**2 * change.columns(rows) @ onto.T
-        prior += change.sd**2 * onto @ onto.T
+    slopes = Change('curve', None, 1.0, 0.0).columns(rows)
+    crossed += _SLOPE_WALK**2 * (age * slopes) @ bend.T
+    per_day = (to_file * walk) @ to_file.T + _SLOPE_WALK**2 * bend @ bend.T
+    prior = model.prior + float(age.max()) * per_day
     lower = np.linalg.cholesky(model.covariance(ageing))
-    gains = solve_triangular(lower, crossed, lower=True)
     innovations = solve_triangular(lower, rows.y, lower=True)
+    gravity = []
+    for change in model.changes:
+        columns = change.columns(rows)
+        if change.kind == 'gravity':  # the file has no parameter for it
+            gain = change.sd**2 * solve_triangular(lower, columns[:, 0], lower=True)
+            variance = max(float(change.sd**2 - gain @ gain), 0.0)
+            gravity.append((change, float(gain @ innovations), float(np.sqrt(variance))))
+            continue
+        onto = bend if change.kind == 'curve' else to_file * _JUMP_SHARES
+        crossed += change.sd**2 * columns @ onto.T
+        prior += change.sd**2 * onto @ onto.T
+    gains = solve_triangular(lower, crossed, lower=True)
     return Solution(
         gains.T @ innovations,
         prior,
         prior - gains.T @ gains,
-        (to_file * walk * ahead) @ to_file.T,
+        ahead * per_day,
         gains,
         innovations,
+        tuple(gravity),
     )

@@ -3,11 +3,12 @@
 """
 Owns the detection of rests in a stream of samples: windows of 10 s without motion.
 
-Samples are summed by whole seconds of their stamps. A second is still if its standard deviation is
-that of the noise and its mean agrees with the mean of the second before (thresholds as in
-`online.checks.GravityCheck`). Ten still seconds in a row form a window. In a long rest all windows
-of the first ten minutes are kept, then one window per minute up to an hour, then one window per
-five minutes.
+Samples are summed by whole seconds of their stamps; a cell is as many seconds as have at least
+five samples, which is one second from 5 Hz on. A cell is still if its standard deviation is that
+of the noise and its mean agrees with the mean of the cell before (thresholds as in
+`online.checks.GravityCheck`). Still cells in a row form a window once they span ten seconds. In a
+long rest all windows of the first ten minutes are kept, then one window per minute up to an hour,
+then one window per five minutes.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,19 +20,24 @@ from ..online.checks import LARGEST_CHANGE, SCATTER_FACTOR, SMALLEST_WINDOW
 from ..typing import Floats, Stamps
 from .rest import Rest
 
-SECONDS = 10  # length of a window of a rest [s]
+SECONDS = 10  # shortest length of a window of a rest [s]
+#: Largest difference of the numbers of two seconds with samples in a row: at 1 Hz, stamps that
+#: scatter leave a second empty at times.
+_LARGEST_STEP = 2
 _SECOND_NS = 1_000_000_000
 #: Pairs (k, n): from the window number k of a rest on, every n-th window is kept.
 _SPACING = ((360, 30), (60, 6), (0, 1))
 
 
 @dataclass
-class _Second:
+class _Cell:
     """
-    Sums over one second of the stamps; subtracting the first sample, `origin`, keeps them small.
+    Sums over the seconds `begin` to `last`; subtracting the first sample, `origin`, keeps them
+    small.
     """
 
-    number: int
+    begin: int
+    last: int
     origin: Floats
     n: int = 0
     total: Floats = field(default_factory=lambda: np.zeros(0))
@@ -51,17 +57,22 @@ class RestFinder:
     """Finds the rests in a stream of samples of one unit."""
 
     def __init__(
-        self, scale: Floats, noise: Floats, full_scale: float, state_now: StateNow
+        self,
+        scale: Floats,
+        noise: Floats,
+        full_scale: float,
+        state_now: StateNow,
+        cycle_s: float = 0.0,
     ) -> None:
         # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample
-        # [m^2/s^4], by axis.
+        # [m^2/s^4], by axis, at one sample per `cycle_s`; faster samples have more noise.
         self._scale, self._noise, self._full_scale = scale, float(noise.sum()), full_scale
-        self._state_now = state_now
-        self._second: _Second | None = None
-        self._run: list[_Second] = []
+        self._state_now, self._cycle_s = state_now, cycle_s
+        self._cell: _Cell | None = None
+        self._run: list[_Cell] = []
         self._states: list[tuple[Sequence[float], Sequence[float]]] = []
         self._n_windows = 0
-        self._last: list[_Second] = []  # sums of the last second of the previous window
+        self._last: list[_Cell] = []  # sums of the last cell of the previous window
 
     def add(self, stamps: Stamps, samples: Floats) -> list[Rest]:
         """
@@ -72,63 +83,68 @@ class RestFinder:
         cuts = np.flatnonzero(np.diff(seconds)) + 1
         for begin, end in zip([0, *cuts], [*cuts, len(stamps)], strict=True):
             number, part = int(seconds[begin]), samples[begin:end]
-            if self._second is None or self._second.number != number:
-                if self._second is not None:
-                    rests += self._close(self._second, number)
-                self._second = _Second(number, part[0], total=np.zeros(part.shape[1]))
-            second, centred = self._second, part - self._second.origin
-            second.n += len(part)
-            second.total += centred.sum(axis=0)
-            second.squares += (centred[:, :3] ** 2).sum(axis=0)
+            cell = self._cell
+            if cell is not None and number != cell.last:
+                is_next = 0 < number - cell.last <= _LARGEST_STEP
+                if not is_next or cell.n >= SMALLEST_WINDOW:
+                    rests += self._close(cell, is_followed=is_next)
+                    cell = None
+            if cell is None:
+                cell = _Cell(number, number, part[0], total=np.zeros(part.shape[1]))
+            deviation, self._cell, cell.last = part - cell.origin, cell, number
+            cell.n += len(part)
+            cell.total += deviation.sum(axis=0)
+            cell.squares += (deviation[:, :3] ** 2).sum(axis=0)
         return rests
 
-    def _close(self, second: _Second, following: int) -> list[Rest]:
-        state = self._state_now() if self._is_still(second) else None
+    def _close(self, cell: _Cell, *, is_followed: bool) -> list[Rest]:
+        state = self._state_now() if self._is_still(cell) else None
         if state is None:
             self._forget()
             return []
-        self._run.append(second)
+        self._run.append(cell)
         self._states.append(state)
         rests = []
-        if len(self._run) == SECONDS:
+        if cell.last + 1 - self._run[0].begin >= SECONDS:
             spacing = next(spacing for begin, spacing in _SPACING if self._n_windows >= begin)
             if self._n_windows % spacing == 0:
                 rests.append(self._window())
             self._n_windows += 1
-            # The first second of the next window is compared with the last second of this window.
+            # The first cell of the next window is compared with the last cell of this window.
             self._run, self._states = [], []
-            self._last = [second]
-        if following != second.number + 1:
+            self._last = [cell]
+        if not is_followed:
             self._forget()
         return rests
 
     def _forget(self) -> None:
         self._run, self._states, self._n_windows, self._last = [], [], 0, []
 
-    def _is_still(self, second: _Second) -> bool:
-        n = second.n
-        if n < SMALLEST_WINDOW or not np.isfinite(second.squares).all():
+    def _is_still(self, cell: _Cell) -> bool:
+        n = cell.n
+        if n < SMALLEST_WINDOW or not np.isfinite(cell.squares).all():
             return False
-        if np.abs(second.mean[:3]).max() >= self._full_scale:
+        if np.abs(cell.mean[:3]).max() >= self._full_scale:
             return False
-        scatter = (second.squares - second.total[:3] ** 2 / n) / (n - 1) / self._scale**2
+        scatter = (cell.squares - cell.total[:3] ** 2 / n) / (n - 1) / self._scale**2
+        noise = self._noise * max(1.0, n * self._cycle_s / (cell.last + 1 - cell.begin))
         # Constant samples are a fault of the converter, not a rest.
-        if not 0.0 < scatter.sum() <= SCATTER_FACTOR**2 * self._noise:
+        if not 0.0 < scatter.sum() <= SCATTER_FACTOR**2 * noise:
             return False
-        change = LARGEST_CHANGE + 4.0 * np.sqrt(2.0 * self._noise / (3.0 * n))
+        change = LARGEST_CHANGE + 4.0 * np.sqrt(2.0 * noise / (3.0 * n))
         return all(
-            (np.abs(second.mean[:3] - other.mean[:3]) <= change * np.abs(self._scale)).all()
+            (np.abs(cell.mean[:3] - other.mean[:3]) <= change * np.abs(self._scale)).all()
             for other in (self._run[-1:] or self._last) + self._run[:1]
         )
 
     def _window(self) -> Rest:
-        n = sum(second.n for second in self._run)
-        weights = np.array([second.n for second in self._run]) / n
-        mean = weights @ np.array([second.mean for second in self._run])
-        within = sum(second.squares - second.total[:3] ** 2 / second.n for second in self._run)
+        n = sum(cell.n for cell in self._run)
+        weights = np.array([cell.n for cell in self._run]) / n
+        mean = weights @ np.array([cell.mean for cell in self._run])
+        within = sum(cell.squares - cell.total[:3] ** 2 / cell.n for cell in self._run)
         states, shares = (np.array(part) for part in zip(*self._states, strict=True))
         return Rest(
-            self._run[0].number * _SECOND_NS + SECONDS * _SECOND_NS // 2,
+            (self._run[0].begin + self._run[-1].last + 1) * _SECOND_NS // 2,
             n,
             tuple(mean[:3].tolist()),
             tuple(np.sqrt(within / (n - len(self._run))).tolist()),

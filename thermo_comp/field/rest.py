@@ -29,6 +29,8 @@ _OF_START, _OF_REST = b' {', b' ['
 class Start:
     """
     A start of the node, or a later change of its calibration, with the `start_ns` of the start.
+
+    `start_ns` identifies a start, but dates nothing: many computers set their clock only later.
     """
 
     start_ns: int
@@ -178,11 +180,20 @@ def thinned(content: bytes) -> bytes:
 def rests_of(
     contents: Iterable[bytes], is_wanted: Callable[[Start], bool]
 ) -> tuple[list[tuple[Start, Rest]], int]:
-    """Decode several files into rests in order of their stamps, without duplicates."""
+    """
+    Decode several files into rests without duplicates, in order of the starts and of the stamps.
+
+    Starts are in order of the stamp of their last rest: `start_ns`, and the first stamps, may have
+    been taken before the computer's clock was set.
+    """
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
     n_damaged = 0
     for content in contents:
         rests, n = decode(content)
         n_damaged += n
         everything |= {(s.start_ns, r.stamp_ns): (s, r) for s, r in rests if is_wanted(s)}
-    return [everything[key] for key in sorted(everything)], n_damaged
+    last: dict[int, int] = {}
+    for start_ns, stamp_ns in everything:
+        last[start_ns] = max(stamp_ns, last.get(start_ns, 0))
+    ordered = sorted(everything, key=lambda key: (last[key[0]], *key))
+    return [everything[key] for key in ordered], n_damaged

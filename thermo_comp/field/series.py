@@ -24,7 +24,7 @@ from ..errors import RecordingError
 from ..files import read_bounded
 from ..text import counted
 from ..thermal.lags import MemorySpec
-from ..thermal.state import BOARD, Layout
+from ..thermal.state import BOARD, RATE, UNKNOWN, WEIGHT, Layout
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.correction import Correction
@@ -44,12 +44,14 @@ _UNTIL, _AGED = 'rests until ', ', claim aged '
 @dataclass(frozen=True)
 class Series:
     """
-    Rests in order of time, (n,) and (n, ...); accelerations and their sd in m/s^2.
+    Rests in order of the starts, (n,) and (n, ...); accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the start; `direction`: v; `force`: x; `residual`:
-    ``|f| - g``; `by_parameter`: H, (n, n_parameters); `by_level`: derivatives by the bias of each
-    axis and by its scale times g, (n, 6); `noise`: variance of one rest by samples and
-    thermometers; `lack`: v times the sd of the lack of fit; `claim`: claimed sd of `residual`.
+    `time`: days since 1970; `start`: number of the start, in order of appearance; `direction`: v;
+    `force`: x; `gravity`: stated g; `residual`: ``|f| - g``; `by_parameter`: H, (n, n_parameters);
+    `by_level`: derivatives by the bias of each axis and by its scale times g, (n, 6); `noise`:
+    variance of one rest by samples and thermometers; `by_start`: derivatives by the unknown lag
+    states at the start of the node, of unit variance each; `lack`: v times the sd of the lack of
+    fit; `claim`: claimed sd of `residual`.
     """
 
     time: Floats
@@ -58,10 +60,12 @@ class Series:
     state: Floats
     direction: Floats
     force: Floats
+    gravity: Floats
     residual: Floats
     by_parameter: Floats
     by_level: Floats
     noise: Floats
+    by_start: Floats
     lack: Floats
     claim: Floats
     n_windows: Ints
@@ -114,12 +118,12 @@ def read_rests(
             raise RecordingError(f'no rest log: expected a folder of *{SUFFIX} files', path)
         files += matching
     others: set[str] = set()
-    unit = calibration.unit
+    unit, wanted = calibration.unit, f'{calibration.unit.serial} ({calibration.unit.input})'
 
     def is_wanted(start: Start) -> bool:
         is_own = (start.serial, start.input) == (unit.serial, unit.input)
         if not is_own:
-            others.add(start.serial)
+            others.add(f'{start.serial} ({start.input})')
         return is_own
 
     try:
@@ -131,11 +135,10 @@ def read_rests(
     rests, n_damaged = rests_of(contents, is_wanted)
     notes = [f'{counted(n_damaged, "damaged line")} skipped'] if n_damaged else []
     if others:
-        notes.append(
-            f'rests of {", ".join(sorted(others))} are not of unit {unit.serial}: left out'
-        )
+        notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
     if not rests:
-        raise RecordingError(f'no rest of unit {unit.serial}', ', '.join(map(str, paths)))
+        found = f': the rests are of {", ".join(sorted(others))}' if others else ''
+        raise RecordingError(f'no rest of unit {wanted}{found}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
     # The time in the name of an update's source is rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
@@ -153,10 +156,16 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Describe the rests of an update; its name has the time of the last rest, and `ahead`."""
-    end = np.datetime64(rests[-1][1].stamp_ns, 'ns').astype('datetime64[s]')
+    """Describe rests for the provenance of an update: the name holds their end and `ahead`."""
+    end = np.datetime64(max(rest.stamp_ns for _, rest in rests), 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
+
+
+def last_rest(source: Source) -> str:
+    """Return the date of the last rest of an update's source (UTC); '' for a bag."""
+    name = source.name
+    return name.removeprefix(_UNTIL).partition(_AGED)[0] + 'Z' if name.startswith(_UNTIL) else ''
 
 
 def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
@@ -217,26 +226,26 @@ def series_of(
     v = u @ M
     white = averaged(np.maximum((sd / K) ** 2, correction.noise) / n[:, np.newaxis])
     noise = (v**2 * white).sum(axis=1) / sizes
-    without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
-    bare, full = (SlowUncertainty(part, correction) for part in (without, calibration))
-    slow, claim = (_along(correction, states, shares, model, u, x) for model in (bare, full))
-    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
-    slow, claim = slow - of_one_sample, claim - of_one_sample
-    unexplained = np.broadcast_to(correction.curves.unexplained(states[:, BOARD])[0].T, x.shape)
-    slow -= (v**2 * unexplained).sum(axis=1)
-    residual = np.array([axis.residual_sd_m_s2**2 for axis in calibration.static.axes()])
+    slow, claim, lack = _uncertainty(calibration, correction, states, shares, u, v, x)
+    of_start = SlowUncertainty(calibration, correction).of_start(
+        states.T, shares.T, np.abs(states[:, RATE])
+    )
+    of_start = np.moveaxis(of_start, 2, 0)
+    of_start = of_start[:, :, :3] / K + of_start[:, :, 3:] * x[:, np.newaxis]
     return Series(
         time=averaged(stamps / _DAY_NS),
-        start=np.unique(beginnings[first], return_inverse=True)[1],
+        start=_numbered(beginnings[first]),
         temperature=states[:, BOARD],
         state=states,
         direction=v,
         force=x,
+        gravity=local,
         residual=size - local,
         by_parameter=_by_parameter(calibration, correction, states, u, v, x, scale),
         by_level=np.hstack((v * K / scale, v * x / calibration.gravity_m_s2)),
         noise=noise + np.maximum(slow, 0.0),
-        lack=v * np.sqrt(np.maximum(unexplained - residual, 0.0)),
+        by_start=(of_start * v[:, np.newaxis]).sum(axis=2),
+        lack=v * lack,
         claim=np.sqrt(np.maximum(claim, 0.0) + noise),
         n_windows=sizes,
         reference_temperature=calibration.reference_temperature_c,
@@ -256,6 +265,12 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
             'the rests were logged with a calibration that has other columns; their thermal state '
             'does not contain the lags of this calibration'
         ) from error
+
+
+def _numbered(start: Ints) -> Ints:
+    """Return numbers of the starts, in order of appearance."""
+    _, first, start = np.unique(start, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
 
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
@@ -279,6 +294,37 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
         first = first if is_same else k
         group[k] = group[k - 1] + (not is_same)
     return group
+
+
+def _uncertainty(
+    calibration: Calibration,
+    correction: Correction,
+    states: Floats,
+    shares: Floats,
+    u: Floats,
+    v: Floats,
+    x: Floats,
+) -> tuple[Floats, Floats, Floats]:
+    """
+    Return the variance of |f| by thermometers and regime, (n,), that of the calibration's claim,
+    (n,), and the sd of the lack of fit of each axis, (n, 3).
+    """
+    without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
+    bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
+    slow = _along(correction, states, np.zeros_like(shares), bare, u, x)
+    claim = _along(correction, states, shares, full, u, x)
+    of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
+    slow, claim = slow - of_one_sample, claim - of_one_sample
+    weight, unknown = states[:, WEIGHT], states[:, UNKNOWN]
+    regimes = np.array([1.0 - weight, weight])
+    unexplained = correction.curves.unexplained(states[:, BOARD])
+    # The model of ageing has its own scatter of starts and rests, so the file's is no noise. While
+    # the regime is unknown `_along` includes the residuals of both sets.
+    of_sets = regimes + unknown * regimes[::-1]
+    slow -= (v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
+    residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
+    lack = np.maximum(unexplained - np.array(residual)[:, :, np.newaxis], 0.0)
+    return slow, claim, np.sqrt((regimes[:, np.newaxis] * lack).sum(axis=0).T)
 
 
 def _along(

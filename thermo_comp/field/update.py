@@ -8,7 +8,7 @@ An axis is updated only if the rests reduce the sd of some reading of the axis t
 reading's prior sd; the other axes keep their values, with an increased covariance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,10 +22,17 @@ from ..typing import Bools, Floats
 from ..unit.calibration import AXES, Calibration, RegimeSet, parameter_layout
 from ..unit.correction import Correction
 from ..unit.gravity import ug_text
+from ..unit.metrics import means_by
 from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
-from .series import Series, valid_since
+from .series import Series, last_rest, valid_since
 
+#: Names of the conclusions that a user can override: another gravity than stated at the rests, and
+#: samples of another unit.
+OVERRIDES = ('gravity', 'unit')
+#: Largest RMS of |f| - g of a start that ageing explains, relative to gravity (a shock of 1 mg),
+#: and in claimed sd; both must be exceeded, for a poor sensor has a claim of some milli-g.
+_LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
 #: Default time after the last rest for which the covariance is aged [days].
 AHEAD_DAYS = 1.0
 
@@ -112,25 +119,28 @@ def update(
     source: Source | None = None,
     created: str = '',
     ahead: float = AHEAD_DAYS,
+    *,
+    is_gravity_certain: bool = False,
 ) -> Update:
     """
     Update a calibration by rests.
 
     `source`, `created`: source and date for the new file's provenance; `ahead`: time after the
-    last rest for which the covariance is aged [days]. Raises FitError if the rests belong to fewer
-    than three starts of the node.
+    last rest for which the covariance is aged [days]; `is_gravity_certain`: never explain the
+    rests by another gravity than stated. Raises FitError if the rests belong to fewer than three
+    starts of the node.
     """
-    n_starts = int(series.start[-1]) + 1
+    n_starts = int(series.start.max()) + 1
     if n_starts < 3:
         raise FitError(
             f'rests of {counted(n_starts, "start")}, need 3 at least: each start has a bias '
             'offset, and the update is judged on left-out starts'
         )
     _, aged, is_update = valid_since(calibration)
-    first, last = float(series.time[0]), float(series.time[-1])
+    first, last = float(series.time.min()), float(series.time.max())
     # The random walk begins where the aged covariance ends or, without ageing, at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
-    ageing, model, used = learn(series, calibration, since)
+    ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     to_file, bend = _levels(calibration), _slopes(calibration)
     solution = solve(model, ageing, to_file, bend, ahead)
     determined, moved = _moved(used, calibration, model, solution, ageing)
@@ -149,7 +159,7 @@ def update(
         provenance=replace(
             _with_update(before, series, judged),
             created=created or before.created,
-            tested='',
+            tested=last_rest(source) if source else '',
             sources=(*before.sources, *([source] if source else [])),
         ),
     )
@@ -159,7 +169,7 @@ def update(
 
 def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
     """Add the residuals of left-out rests, and a note, to the origin of a calibration."""
-    largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time[-1]), 'D')
+    largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time.max()), 'D')
     residuals = ResidualSummary(
         f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
     )
@@ -246,13 +256,15 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
     rows, squares = model.rows, []
+    of_gravity = _of_gravity(series, solution)
     for label in np.unique(labels)[1:]:
         at = labels == label
         earlier = int(np.searchsorted(rows.start, series.start[at].min()))
         shift = np.where(determined, solution.before(earlier), 0.0)
-        left = series.residual[at] - series.by_parameter[at] @ shift
+        residual = series.residual[at] - of_gravity[at]
+        left = residual - series.by_parameter[at] @ shift
         share = series.n_windows[at] / series.n_windows[at].sum()
-        squares.append((float(share @ series.residual[at] ** 2), float(share @ left**2)))
+        squares.append((float(share @ residual**2), float(share @ left**2)))
     before, after = np.array(squares).T
     gain = before - after
     gain_sd = float(gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else np.inf
@@ -265,6 +277,34 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
         gain_sd,
         int((gain < -gain_sd).sum()),
     )
+
+
+def _of_gravity(series: Series, solution: Solution) -> Floats:
+    """Return the part of ``|f| - g`` by jumps of gravity."""
+    time = means_by(series.start, series.time)[series.start]
+    result = np.zeros(len(series))
+    for change, size, _ in solution.gravity:
+        # The times of starts and jumps may differ by rounding.
+        result += size * (time > (change.time or 0.0) - 1e-6)
+    return result
+
+
+def refuse_another_unit(result: Update) -> None:
+    """Raise FitError if the rests differ from gravity by more than ageing explains."""
+    series = result.series
+    residual = series.residual - _of_gravity(series, result.solution)
+    rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))
+    largest = np.maximum(_LARGEST_PART * series.gravity.mean(), _LARGEST_SIGMAS * claim)
+    worst = int(np.argmax(rms / largest))
+    if rms[worst] > largest[worst]:
+        at = np.flatnonzero(series.start == worst)[0]
+        day = np.datetime64(int(series.time[at]), 'D')
+        raise FitError(
+            f'on {day} |f| differs from the gravity {series.gravity[at]:.5f} m/s^2 by '
+            f'{ug_text(rms[worst])} RMS, expected at most {ug_text(largest[worst])} for this unit '
+            'by ageing: samples of another unit, another gravity, or damage (override with '
+            '--allow unit)'
+        )
 
 
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
@@ -291,6 +331,19 @@ def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) 
     return replace(part, **axes)
 
 
+def _gravity_texts(result: Update) -> Iterator[str]:
+    for change, size, sd in result.solution.gravity:
+        time = change.time or 0.0
+        stated = result.series.gravity[np.argmin(np.abs(result.series.time - time))]
+        yield (
+            f'another gravity than the stated {stated:.5f} m/s^2 from '
+            f'{np.datetime64(int(time * 86400.0), "s")} on, '
+            f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} in '
+            'all attitudes: no scale was changed for it; state the gravity of the place '
+            '(local_gravity, --gravity), or override with --allow gravity if the stated is right'
+        )
+
+
 def change_texts(result: Update) -> list[str]:
     """Describe the ageing, the changes, and the axes that the rests do not determine."""
     ageing = result.ageing
@@ -299,12 +352,21 @@ def change_texts(result: Update) -> list[str]:
         f'{1e6 * ageing.scale / result.calibration.gravity_m_s2:.2g} ppm per root day; '
         f'scatter of starts {ug_text(ageing.turn_on)}, of rests {ug_text(ageing.rest)}'
     ]
+    if result.series.by_start.any():
+        lines[0] += f'; lags at a start {ageing.lags:.2g} of the sd that the calibration assumes'
     for change in result.changes:
         if change.time is None:
             lines.append('the curves of the bias have changed')
-        else:
+        elif change.kind == 'levels':
             day = np.datetime64(int(change.time * 86400.0), 's')
-            lines.append(f'the bias jumped before {day}: a shock, not ageing')
+            text = f'the bias jumped before {day}: a shock, not ageing'
+            if change.may_be_gravity:
+                text += (
+                    '; or another gravity, which the attitudes do not distinguish: if the unit '
+                    'was moved, state the gravity of the place (local_gravity, --gravity)'
+                )
+            lines.append(text)
+    lines += _gravity_texts(result)
     undetermined = [change.axis for change in result.moved if not change.is_determined]
     if undetermined:
         lines.append(

@@ -191,6 +191,7 @@ class RestKeeper:
                 np.array(correction.noise),
                 calibration.unit.full_scale,
                 self._state_now,
+                calibration.unit.cycle_time_s,
             )
 
     def _state_now(self) -> tuple[Sequence[float], Sequence[float]] | None:

@@ -77,10 +77,14 @@ class SlowUncertainty:
         parts = zip(*(np.split(array, cuts, -1) for array in arrays), strict=True)
         return np.hstack([self._at(*part) for part in parts])
 
-    def _at(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
+    def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
+        """
+        Differentiate bias [input units] and scale [relative] by the unknowns of a start, which
+        have unit variance, shape (n_unknown, 6, n). `rates`: largest rate of the board temperature
+        since the start, or a smaller one that is known, (n,) [K/s].
+        """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
-        phi = table.held(table.raw(states)) * factors
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
         # If the start was in a ramp, the parts were behind the board, by an unknown amount up to
@@ -88,29 +92,37 @@ class SlowUncertainty:
         behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
-        regressors = self._correction.curves.regressors(states, phi) if self._blocks else []
+        return np.concatenate((by_root, in_ramp[np.newaxis]))
+
+    def _at(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
+        of_start = self.of_start(states, start_shares, rates)
+        table = self._correction.table
+        regressors = (
+            self._correction.curves.regressors(states, table.values(states))
+            if self._blocks
+            else []
+        )
         of_misalignment, var_misalignment = self._misalignment
-        n_start, (n, rank) = len(by_root), (states.shape[1], of_misalignment.shape[1])
-        errors = np.zeros((9, n_start + 1 + rank, n))
+        n_start, (n, rank) = len(of_start), (states.shape[1], of_misalignment.shape[1])
+        errors = np.zeros((9, n_start + rank, n))
         # A larger element of the misalignment increases the force, a larger bias or scale factor
         # decreases it.
-        errors[6:, n_start + 1 :] = -of_misalignment[:, :, np.newaxis]
+        errors[6:, n_start:] = -of_misalignment[:, :, np.newaxis]
         added = np.zeros((3, 3, n))
         beyond: list[Floats] = []
         nonlinear = self._correction.of_force
         for axis, K in enumerate(self._K):
             on_bias, on_scale = errors[2 * axis : 2 * axis + 2]
-            on_bias[:n_start], on_scale[:n_start] = by_root[:, axis] / K, by_root[:, axis + 3]
-            on_bias[n_start], on_scale[n_start] = in_ramp[axis] / K, in_ramp[axis + 3]
+            on_bias[:n_start], on_scale[:n_start] = of_start[:, axis] / K, of_start[:, axis + 3]
             if self._blocks:
                 (of_bias, var_bias), (of_scale, var_scale), of_force = self._blocks[axis]
                 by_bias, by_scale = regressors[axis] / K, regressors[axis + 3]
-                on_bias[n_start + 1 :] = _combined(of_bias, by_bias)
-                on_scale[n_start + 1 :] = _combined(of_scale, by_scale)
+                on_bias[n_start:] = _combined(of_bias, by_bias)
+                on_scale[n_start:] = _combined(of_scale, by_scale)
                 added[axis, 0] = in_order(var_bias[:, np.newaxis] * by_bias**2, 0)
                 added[axis, 2] = in_order(var_scale[:, np.newaxis] * by_scale**2, 0)
                 if nonlinear is not None:
-                    both = on_bias[n_start + 1 :], on_scale[n_start + 1 :]
+                    both = on_bias[n_start:], on_scale[n_start:]
                     beyond.append(
                         nonlinear.variance(nonlinear.held(states[BOARD]), *of_force, *both)
                     )

@@ -33,7 +33,7 @@ class GroupEvidence:
 
 @dataclass(frozen=True)
 class Source:
-    """One bag of the data of a fit."""
+    """One bag of the data of a fit, or a rest log of an update."""
 
     name: str
     sha256: str = ''
@@ -66,7 +66,9 @@ class Provenance:
     sources: tuple[Source, ...] = ()
     residuals: tuple[ResidualSummary, ...] = ()
     notes: tuple[str, ...] = ()
-    tested: Annotated[str, "End of the last bag (UTC), if the bags' stamps are dates."] = ''
+    tested: Annotated[str, "End of the last bag or rest (UTC), if the bags' stamps are dates."] = (
+        ''
+    )
 
     @property
     def date(self) -> str:
