@@ -119,8 +119,13 @@ def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng
     with subprocess.Popen(
         [sys.executable, '-c', SLOW_LISTENER], stdout=subprocess.PIPE, text=True
     ) as listener:
-        report = play(tmp_path / 'bag.mcap', rate=0.0)
-        printed, _ = listener.communicate(timeout=2 * TIMEOUT)
+        try:
+            # The listener is a new process, which may start slowly on a busy machine.
+            report = play(tmp_path / 'bag.mcap', rate=0.0, wait_s=TIMEOUT)
+            printed, _ = listener.communicate(timeout=2 * TIMEOUT)
+        finally:
+            # Without this, a listener that waits for messages would block the end of the test.
+            listener.kill()
     assert report.n_messages == {'/accel/counts': 7000}
     expected = hashlib.sha256(b''.join(messages_of(tmp_path / 'bag.mcap'))).hexdigest()
     assert printed.strip() == expected
