@@ -72,8 +72,8 @@ def update(
     else:
         out.line(f'nothing gained: {output} is not written, keep {calibration}')
         sds = [
-            f'{axis.axis} {micro_g(axis.present_sd)} ug ({micro_g(axis.claimed_sd)} ug in the file)'
-            for axis in result.moved
+            f'{one.axis} {micro_g(one.present_sd)} ug ({micro_g(one.claimed_sd)} ug in the file)'
+            for one in result.moved
         ]
         out.line(f'sd of bias plus scale at rest, aged to the last rest: {", ".join(sds)}')
     out.end(
