@@ -400,25 +400,29 @@ def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
 
 @pytest.mark.parametrize('attitudes', [upright, in_any_attitude])
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
-    # The unit has 0.6 of the limit along gravity (RMS) up to day 20 and 1.5 of the limit later,
+    # The unit has 1.5 of the limit along gravity (RMS) from day 20 to 34, else 0.6 of the limit,
     # with a turn-on of 5 ug, and is disturbed on day 12. The logs end on different days.
     unit = known()
     limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
 
     def error(day):
-        size = 1.5 if day >= 20.0 else 0.6
+        size = 1.5 if 20.0 <= day < 34.0 else 0.6
         # Each component has this size: so has the RMS along the vertical, and along any direction.
         return np.full(3, limit * (20.0 if 12.0 <= day < 13.0 else size))
 
     series = series_of(rests(unit, attitudes, error, 40, turn_on=5.0 * MICRO_G), unit)
     first = int(series.day[0])
-    for n_days in (11, 13, 14, 16, 18, 20, 24, 26, 28, 33, 40):
+    for n_days in (11, 13, 14, 16, 18, 20, 24, 26, 28, 33, 34, 40):
         result = watch(series.at(series.day < first + n_days), unit)
-        since = {13: 12}.get(n_days, 20 if n_days > 20 else None)
+        since = {13: 12}.get(n_days, 20 if 20 < n_days <= 34 else None)
         assert (result.exit_code, result.left) == (
             (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
         )
         assert ('outside its claim since' in str(result)) == (since is not None)
+        # In an attitude along the error a single day has 1.04 of the limit.
+        back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
+        assert (result.back in back) == (n_days > 34)
+        assert ('again within its claim since' in str(result)) == (result.back is not None)
         # A unit within its claim has no forecast of the past.
         assert since is not None or f'about {result.last}' not in str(result)
 

@@ -136,10 +136,11 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week follows a change late. Two days within the claim end an excess; the present
-    # error of the ageing model begins an excess if the last day agrees.
-    is_out[-1] &= is_row_out[-2:].any()
-    is_out[-1] |= is_row_out[-1] and bool(forecast) and forecast[1] == 0.0
+    # The RMS of a week follows a change late. Two days within the claim end an excess, and the
+    # last day begins an excess, if the present error of the ageing model agrees.
+    is_error_out = bool(forecast) and forecast[1] == 0.0
+    is_out[-1] &= is_error_out or is_row_out[-2:].any()
+    is_out[-1] |= is_error_out and is_row_out[-1]
     left = back = None
     if is_out[-1]:
         is_early = ~is_out if recent[-1] > 1.0 else ~is_row_out
@@ -148,6 +149,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
+        # If the last week is outside, its last two days are within.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -194,7 +196,11 @@ def _forecasts(
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
     # Each start adds its offset to the error: the limit of the levels is smaller by this scatter.
+    # An earlier disturbance raises the scatter of the model, but not that of the recent rests.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
+    scatter = min(
+        scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)
+    )
     limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
     bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
     # Delta method for the logarithm of the variance by which the error grows.
