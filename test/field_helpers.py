@@ -2,16 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns rests of a unit with any calibration, for tests, as the unit's node logs rests."""
 
+from dataclasses import replace
+
+import builders
 import numpy as np
 
 from thermo_comp.field.rest import Rest, Start, encode
+from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.gravity import MICRO_G
+from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import ramp_states
 
 DAY_NS = 86_400 * 10**9
 #: 2030-01-01, after any calibration that a test makes, in days since 1970.
 FIRST_DAY = 21_915
+ZERO = np.zeros(3)
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
@@ -58,3 +64,25 @@ def upright(_rng):
 def in_any_attitude(rng):
     u = rng.standard_normal(3)
     return np.asarray(u / np.linalg.norm(u))
+
+
+def known(**keys):
+    """Make a calibration with an sd of 10 ug of its biases and of 10 ppm of its scales."""
+    value = builders.calibration(noise_density_m_s2_sqrt_hz=(60 * MICRO_G,) * 3, **keys)
+    layout = parameter_layout(value)
+    sd = np.zeros(layout.n_parameters)
+    to_file = np.zeros((layout.n_parameters, 6))
+    for axis in range(3):
+        bias, scale = layout.bias[axis], layout.scale[axis]
+        to_file[[bias.static, bias.dynamic], axis] = 300.0 * 10 * MICRO_G
+        to_file[[scale.static, scale.dynamic], axis + 3] = 10e-6
+    sd[layout.misalignment :] = 1e-6
+    return replace(value, posterior=posterior_of(to_file @ to_file.T + np.diag(sd**2)))
+
+
+def no_error(_days):
+    return ZERO
+
+
+def jump_of(size, day):
+    return lambda days: size * MICRO_G * np.array([0.0, 0.0, float(days >= day)])

@@ -1,27 +1,24 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Updates in the field against the truth, the best filter and closed forms; the drift watch."""
+"""Updates in the field against the truth, the best filter and closed forms."""
 
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import calibration, rich_calibration
+from builders import rich_calibration
 from conftest import ROOT, parsed
-from field_helpers import in_any_attitude, rests, upright, write_log
-from scipy.stats import norm
+from field_helpers import in_any_attitude, jump_of, known, no_error, rests, upright, write_log
 
 sys.path.insert(0, str(ROOT / 'benchmarks'))
 
 import field_units
-import field_watch
 
 from thermo_comp.errors import FitError
 from thermo_comp.field.ageing import Ageing, Model, learn, rows_of, solve
 from thermo_comp.field.series import read_rests, series_of
 from thermo_comp.field.update import change_texts, refuse_another_unit, update
-from thermo_comp.field.watch import LIMIT, passage, watch
 from thermo_comp.fitting.assembly import parameters_of, with_parameters
 from thermo_comp.thermal.lags import Lag, start_root
 from thermo_comp.thermal.state import Layout
@@ -29,32 +26,7 @@ from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.gravity import MICRO_G
-from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.provenance import Provenance
-
-ZERO = np.zeros(3)
-
-
-def known(**keys):
-    """Make a calibration with an sd of 10 ug of its biases and of 10 ppm of its scales."""
-    value = calibration(noise_density_m_s2_sqrt_hz=(60 * MICRO_G,) * 3, **keys)
-    layout = parameter_layout(value)
-    sd = np.zeros(layout.n_parameters)
-    to_file = np.zeros((layout.n_parameters, 6))
-    for axis in range(3):
-        bias, scale = layout.bias[axis], layout.scale[axis]
-        to_file[[bias.static, bias.dynamic], axis] = 300.0 * 10 * MICRO_G
-        to_file[[scale.static, scale.dynamic], axis + 3] = 10e-6
-    sd[layout.misalignment :] = 1e-6
-    return replace(value, posterior=posterior_of(to_file @ to_file.T + np.diag(sd**2)))
-
-
-def no_error(_days):
-    return ZERO
-
-
-def jump_of(size, day):
-    return lambda days: size * MICRO_G * np.array([0.0, 0.0, float(days >= day)])
 
 
 def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
@@ -353,98 +325,6 @@ def test_too_few_starts_are_refused():
     logged = rests(unit, upright, no_error, days=1)[:8]
     with pytest.raises(FitError, match='rests of 2 starts, need 3 at least'):
         update(series_of(logged, unit), unit)
-
-
-def walked(rate, bound, axes=1, mean=0.0):
-    """Forecast a random walk from a known point; the variance grows by `rate` on each axis."""
-    start = np.full(axes, mean)
-    return passage(start, np.zeros((axes, axes)), np.sqrt(rate) * np.eye(axes), bound)
-
-
-def test_the_first_passage_follows_the_reflection_principle():
-    # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
-    # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t. In three dimensions the walk
-    # stays in a ball with 2 sum over k > 0 of (-1)^(k + 1) exp(-(k pi)^2 r t / 2 c^2).
-    rate, bound = 4.0, 50.0
-    k, n = np.arange(-40, 41), np.arange(1, 200)
-    for probability, days, of_ball in zip(
-        (0.1, 0.5, 0.9), walked(rate, bound), walked(rate, bound, 3), strict=True
-    ):
-        s = np.sqrt(rate * days)
-        inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
-        # 2000 simulated walks have a standard error of 0.011 at the median.
-        assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.025)
-        stays = 2.0 * (-1.0) ** (n + 1) @ np.exp(-((n * np.pi) ** 2) * rate * of_ball / 5000.0)
-        assert stays == pytest.approx(1.0 - probability, abs=0.025)
-    # A random walk passes a near bound earlier; a unit that does not age never reaches a bound,
-    # and a unit beyond the bound has passed it.
-    assert walked(rate, bound, mean=30.0)[1] < walked(rate, bound)[1]
-    assert walked(1e-12, bound) == (np.inf,) * 3
-    assert walked(rate, bound, mean=51.0) == (0.0,) * 3
-
-
-def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
-    # WHY: signed errors of opposite attitudes had cancelled: forecasts were 3 to 5 times too long.
-    # WHAT: the times at which walks of known sd leave the tolerance lie in the printed interval.
-    shares, ratios = [], []
-    for kind in ('fixed', 'up and down', 'faces', 'carried'):
-        for rows in field_watch.forecasts(kind, 4, 20).values():
-            shares += rows[:, 0].tolist()
-            ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The interval is stated as 80 %; 32 rows, whose variances are uncertain, leave 5 % of error.
-    assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
-    # The median time of a single unit is uncertain by a factor of 1.5, so that of four by 1.3.
-    assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6
-    assert 0.45 < min(ratios) < max(ratios) < 2.2
-
-
-@pytest.mark.parametrize('attitudes', [upright, in_any_attitude])
-def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
-    # The unit has 1.5 of the limit along gravity (RMS) from day 20 to 34, else 0.6 of the limit,
-    # with a turn-on of 5 ug, and is disturbed on day 12. The logs end on different days.
-    unit = known()
-    limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
-
-    def error(day):
-        size = 1.5 if 20.0 <= day < 34.0 else 0.6
-        # Each component has this size: so has the RMS along the vertical, and along any direction.
-        return np.full(3, limit * (20.0 if 12.0 <= day < 13.0 else size))
-
-    series = series_of(rests(unit, attitudes, error, 40, turn_on=5.0 * MICRO_G), unit)
-    first = int(series.day[0])
-    for n_days in (11, 13, 14, 16, 18, 20, 24, 26, 28, 33, 34, 40):
-        result = watch(series.at(series.day < first + n_days), unit)
-        since = {13: 12}.get(n_days, 20 if 20 < n_days <= 34 else None)
-        assert (result.exit_code, result.left) == (
-            (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
-        )
-        assert ('outside its claim since' in str(result)) == (since is not None)
-        # In an attitude along the error a single day has 1.04 of the limit.
-        back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
-        assert (result.back in back) == (n_days > 34)
-        assert ('again within its claim since' in str(result)) == (result.back is not None)
-        # A unit within its claim has no forecast of the past.
-        assert since is not None or f'about {result.last}' not in str(result)
-
-
-def test_the_watch_names_the_day_and_the_class_of_temperature():
-    unit = known(
-        static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
-    )
-    healthy = watch(series_of(rests(unit, upright, no_error), unit), unit)
-    assert (healthy.exit_code, healthy.left) == (0, None)
-    assert 'within its claim up to 2030-01-20' in str(healthy)
-    assert sum(row.n_rests for row in healthy.days) == sum(
-        row.n_rests for row in healthy.temperatures
-    )
-    assert [row.name for row in healthy.temperatures] == ['10 .. 20 degC', '20 .. 30 degC']
-    assert [row.name for row in healthy.periods] == [row.name for row in healthy.days]
-    year = watch(series_of(rests(unit, upright, no_error, days=61), unit), unit)
-    assert [row.n_rests for row in year.periods] == [9] * 20 + [3]
-    assert healthy.forecast[0] < healthy.forecast[1] <= healthy.forecast[2]
-    assert watch(series_of(rests(unit, upright, no_error), unit), unit, 1.0).forecast[0] == np.inf
-    aged = watch(series_of(rests(unit, upright, jump_of(400.0, 10.0)), unit), unit)
-    assert (aged.exit_code, aged.left, aged.forecast) == (1, '2030-01-11', ())
 
 
 @pytest.fixture
