@@ -133,9 +133,8 @@ class SensorCheck:
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
         # In a ramp, or after a real step, the change continues.
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
-        return abs(step) > possible + _SIGMAS * self.sensor.settings.noise_sd_c and abs(
-            after
-        ) < CONTINUED_SHARE * min(abs(step), continued)
+        is_step = abs(step) > possible + _SIGMAS * self.sensor.settings.noise_sd_c
+        return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
         """Judge a reading [degC] before it is used: return whether the estimator may use it."""
