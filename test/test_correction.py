@@ -468,6 +468,33 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 
 
+def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
+    # WHY: bags of soaks have rates below 0.1 K/min, and a ramp multiplied the variance of all
+    # parameters by several hundred, although that of the lag grew with the ramp already.
+    axis = axis_set(residual_sd_m_s2=1e-5)
+    soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
+    sds = []
+    for response in ((), (term('board', tau_s=600.0),)):
+        correction = Correction(calibration(static=soaks, dynamic=soaks, response=response))
+        state = np.zeros(Layout(correction.memory).width)
+        state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
+        line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
+        sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
+    # Without a lag the sd grows with the 19 half ranges by which the ramp is too fast.
+    assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
+
+
+def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
+    # WHY: a difference of 10 K after bags with 0.1 K is 100 times too large, its square 10000
+    # times, and the claimed sd was that of a distance of 10000 half ranges: 0.1 g.
+    unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
+    correction = Correction(unit)
+    state = np.zeros(Layout(correction.memory).width)
+    state[BOARD], state[correction.layout.places[unit.response[0].source]] = 20.0, 10.0
+    excess = correction.excess(state, is_dynamic=False)
+    assert 99.0 < excess.relative < 150.0
+
+
 def test_a_part_that_is_still_outside_the_range_widens_the_claimed_sd():
     bent = axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6)
     unit = calibration(

@@ -23,6 +23,7 @@ Tracker, fit, correction, covariance and calibration file use this table of colu
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAlias
 
@@ -33,7 +34,7 @@ from ..thermal.lags import BOARD_INPUT, Lag, MemorySpec, Play
 from ..thermal.quantity import Quantity
 from ..thermal.state import BOARD, WEIGHT, Gradient, Layout, Rate
 from ..typing import Floats
-from .functions import hold
+from .functions import by_element, hold
 from .schema import check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
@@ -261,6 +262,10 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
 _DURING: Final = ('always', 'static', 'dynamic')
 
 
+def _root(order: int, x: float) -> float:
+    return float(x ** (1.0 / order))
+
+
 class ColumnTable:
     """
     Evaluates columns at thermal states (width, n), each state alone; results: (n_columns, n).
@@ -284,6 +289,11 @@ class ColumnTable:
         self._power = np.array([column.power for column in columns], np.int64)
         self._lowered = np.maximum(self._power - 1, 0)
         self._during = np.array([_DURING.index(column.during) for column in columns], np.int64)
+        orders = np.array([column.term.order for column in columns], np.int64)
+        self._roots = [
+            (np.flatnonzero(orders == order), partial(_root, order))
+            for order in set(orders.tolist()) - {1}
+        ]
         #: Whether any column applies in one regime alone.
         self.differs = bool(self._during.any())
         # Columns that differ only in power, range or regime share one evaluation.
@@ -326,10 +336,14 @@ class ColumnTable:
 
     def excess(self, raw: Floats) -> Floats:
         """
-        Return how far the value of each column is outside the column's range, in half ranges.
+        Return how far the value of each column is outside the column's range, in half ranges; for
+        a power of a quantity, how far the quantity is outside its range.
         """
         lower, upper = self._range
-        return np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
+        excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
+        for rows, root in self._roots:
+            excess[rows] = by_element(root, 1.0 + excess[rows]) - 1.0
+        return excess
 
     def factors(self, board: Floats, weight: Floats) -> tuple[Floats, Floats]:
         """Return the factor phi / u (power of t times regime weight) and its derivative by t."""

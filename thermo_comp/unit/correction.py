@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..thermal.lags import BOARD_INPUT, MemorySpec
+from ..thermal.lags import BOARD_INPUT, Lag, MemorySpec
 from ..thermal.state import BOARD, UNKNOWN, VAR_BOARD, WEIGHT, Layout
 from ..typing import Floats
 from .calibration import Calibration
@@ -125,6 +125,7 @@ class Correction:
         self._pairs, self._pair_starts = np.unique(pair[self._pair_columns], return_index=True)
         by_board = np.array([quantity.by_board for quantity in layout.pairs])
         self._signs = by_board[:, np.newaxis, np.newaxis]
+        self._has_lags = any(isinstance(column.source, Lag) for column in self.table.columns)
         self._lagged = [layout.places[lag] for lag in layout.lags if lag.input == BOARD_INPUT]
 
     def bias_scale(self, states: Floats) -> Floats:
@@ -162,9 +163,10 @@ class Correction:
     def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
         """Return how far a thermal state is outside the calibrated ranges."""
         states = np.array(state)[:, np.newaxis]
-        over, too_fast, relative = (row[:, 0].tolist() for row in self.curves.excess(states))
-        weight = state[WEIGHT]
-        curves = (1.0 - weight) * relative[0] + weight * relative[1]
+        excess = (row[:, 0].tolist() for row in self.curves.excess(states))
+        over, too_fast, relative, by_rate = excess
+        shares = 1.0 - state[WEIGHT], state[WEIGHT]
+        curves = sum(w * (a + b) for w, a, b in zip(shares, relative, by_rate, strict=True))
         raw = self.table.raw(states)
         beyond = (raw - self.table.held(raw))[:, 0].tolist()
         columns = zip(beyond, self.table.columns, strict=True)
@@ -261,7 +263,10 @@ class Correction:
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         static_weight, beyond_range = 1.0 - weight, raw - held
-        excess, _, relative = self.curves.excess(states)
+        excess, _, relative, by_rate = self.curves.excess(states)
+        if not self._has_lags:
+            # The variance of lags contains the effect of ramps of any rate.
+            relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])

@@ -60,17 +60,17 @@ class Curves:
         ]
         self._has_lacks = any(part.lack_of_fit for part in sets)
 
-    def excess(self, states: Floats) -> tuple[Floats, Floats, Floats]:
+    def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """
-        Return distances outside the ranges, (2, n): temperature [K], rate [K/s], half ranges.
+        Return distances outside the ranges, (2, n): temperature [K], rate [K/s], then both in half
+        ranges.
         """
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         if not (over.any() or too_fast.any()):
-            return over, too_fast, np.zeros_like(over)
+            return over, too_fast, np.zeros_like(over), np.zeros_like(over)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
-        relative = np.abs(over) / (span / 2.0) + np.abs(too_fast) / (rate_span / 2.0)
-        return over, too_fast, relative
+        return over, too_fast, np.abs(over) / (span / 2.0), np.abs(too_fast) / (rate_span / 2.0)
 
     def values(self, board: Floats) -> Floats:
         """Evaluate bias [input units] and relative scale at board temperatures, (2, 6, n)."""
