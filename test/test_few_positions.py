@@ -97,6 +97,22 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     )
 
 
+def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
+    # WHY: without tilts in the model, a tilt of 4 urad/K with an axis at 0.03 g gave a slope of
+    # its scale factor of 137 ppm/K.
+    bags = []
+    for up, tilt in (((1.0, 0.0, 0.03), 4e-6), ((0.0, 1.0, -0.03), -4e-6)):
+        rest = Rest(rng, level=tuple(GRAVITY * np.array(up)), sd=0.1 * MG)
+        celsius = rest.temperature(rest.time) - 20.0
+        rest.accel[:, 2] += celsius * (0.1 * MG + GRAVITY * tilt)
+        bags.append(rest.source(name=str(up)))
+    z = fit(bags, OPTIONS).calibration.static.z
+    at = np.array([0.0, 10.0])
+    # 15000 samples (noise 0.1 mg) determine the mean slope of the two rests to 1 ug/K.
+    assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
+    assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 50e-6
+
+
 def test_one_position_becomes_parameters_of_an_autopilot(one_position):
     text = export_calibration(one_position.calibration, 'px4', device_id=1).text
     rows = [line.split() for line in text.splitlines() if line.startswith('1')]

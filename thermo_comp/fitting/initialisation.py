@@ -55,10 +55,10 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """Fit the windows, with or without a prior calibration."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
-    if options.model == 'golovach' or n_directions < POSITIONS_NEEDED:
-        # P attitudes give 3 P drifts for 6 unknown drifts of the unit (bias and scale of each
-        # axis) and 2 P unknown tilts of supports: below 6 attitudes a tilt cannot be distinguished
-        # from a drift of the unit. In the paper's model tilts would absorb errors of its two sets.
+    if options.model == 'golovach' or n_directions < 2:
+        # In one attitude a tilt of the support cannot be distinguished from a drift of the unit; in
+        # several, the prior of the tilt limits it. In the paper's model tilts would absorb errors
+        # of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     if known is None and _has_soaks_only(windows):
         data = _at_rest(data)
