@@ -97,6 +97,26 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     )
 
 
+def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
+    # WHY: norms of one attitude do not separate bias and scale; the fit took the drift for that
+    # of the scale, and claimed 0 for the drift of the bias, which error it left on two axes.
+    slope = 0.1 * SLOPE
+    bags = []
+    for celsius in (5.0, 20.0, 35.0):
+        rest = Rest(rng, level=tuple(GRAVITY * UP), sd=0.1 * MG, warm=celsius, fall=0.0)
+        rest.accel += (celsius - 20.0) * MG * slope
+        bags.append(rest.source(name=f'{celsius:g}'))
+    calibration = fit(bags, OPTIONS).calibration
+    covariance = calibration.posterior.covariance()
+    curves = zip(calibration.static.axes(), parameter_layout(calibration).bias, strict=True)
+    for (axis, block), drift in zip(curves, 10.0 * MG * slope, strict=True):
+        family = axis.bias_function
+        along = np.subtract(family.basis(15.0), family.basis(5.0))
+        at = block.static + 1 + np.arange(family.n_free)
+        sd = np.sqrt(along @ covariance[np.ix_(at, at)] @ along)
+        assert abs(drift - (family.value(15.0) - family.value(5.0))) < 3.0 * sd
+
+
 def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
     # WHY: without tilts in the model, a tilt of 4 urad/K with an axis at 0.03 g gave a slope of
     # its scale factor of 137 ppm/K.

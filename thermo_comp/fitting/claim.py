@@ -160,10 +160,11 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
         # The effect of a lag is that of the curve at a delayed temperature, so the largest slope
-        # of the curve limits it (RMS of the three axes).
+        # of the curve limits it (RMS of the three axes), with the columns that the data do not
+        # exclude.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
-        steepest = posterior.state.weights[:, :, is_curve] / kelvins[is_curve]
-        slopes = np.sqrt(np.mean(np.sum(steepest**2, axis=2), axis=1))
+        square = np.mean(posterior.state.weights**2, axis=1) + sd**2
+        slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
         # Curves over temperature deviate from their largest slope by up to a half.

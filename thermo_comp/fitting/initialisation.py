@@ -62,6 +62,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
         data = replace(data, tilt=data.tilt[:, :0])
     if known is None and _has_soaks_only(windows):
         data = _at_rest(data)
+        windows = replace(windows, data=data)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
@@ -103,8 +104,10 @@ def _at_rest(data: Windows) -> Windows:
     """Return the windows with columns that are constant in each position."""
     # A lag of unknown size changes the readings of a soak by as much as the remaining drift of the
     # temperature does: norms of positions determine the curve, drifts within soaks do not.
-    means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
-    return replace(data, columns=means[data.position], start=np.zeros_like(data.start))
+    columns = data.columns - within_positions(data.columns, data.position)
+    square, of_means = (np.mean(values**2, axis=0) for values in (data.columns, columns))
+    kelvins = data.kelvins * np.sqrt(of_means / np.where(square > 0.0, square, 1.0))
+    return replace(data, columns=columns, kelvins=kelvins, start=np.zeros_like(data.start))
 
 
 def initial_state(regression: Regression, start: ConstantCalibration, up: Floats) -> State:
@@ -248,9 +251,10 @@ def _steepness(windows: ThermalWindows, start: ConstantCalibration, options: Fit
     data = windows.data
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
-    kelvins = float(np.std(windows.temperature)) or 1.0
     if data.n_positions < POSITIONS_NEEDED:
-        return drift / kelvins
+        change = within_positions(windows.temperature[:, None], data.position)
+        return drift / (float(np.sqrt(np.mean(change**2))) or 1.0)
+    kelvins = float(np.std(windows.temperature)) or 1.0
     # If each rest has one temperature, the drift appears as a difference between the rests' norms.
     force = (position_means(data) - start.bias) / start.scale
     sizes = sizes_of(windows, options)
