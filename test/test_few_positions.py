@@ -117,6 +117,28 @@ def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
         assert abs(drift - (family.value(15.0) - family.value(5.0))) < 3.0 * sd
 
 
+def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_each_rest(rng):
+    # WHY: the warm-up of the board, which the sensor does not follow, gave a slope of 0, and the
+    # differences between the norms of 36 rests were taken for mountings that do not repeat.
+    bags = []
+    for celsius in (5.0, 20.0, 35.0):
+        for up in positions(12, 3):
+            rest = Rest(rng, level=tuple(GRAVITY * up), sd=0.1 * MG, warm=celsius, fall=-1.0)
+            rest.accel += (celsius - 20.0) * 0.1 * MG * SLOPE
+            bags.append(rest.source(name=f'{len(bags)}'))
+    result = fit(bags, OPTIONS)
+    calibration, at = result.calibration, np.array([6.0, 36.0])
+    curves = [axis.bias_function for axis in calibration.static.axes()]
+    slopes = np.array([np.diff(curve.value(at))[0] / 30.0 for curve in curves])
+    # 36 norms with a noise of 1 ug: the warm-up, 1 K in 600 s, limits the temperature to 0.1 K.
+    np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
+    assert 'misfit' not in {finding.name for finding in result.findings}
+    # Soaks do not show how far the sensor lags the board in a ramp: by up to all of the slope.
+    variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
+    of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
+    assert np.sqrt(np.mean(of_lags)) == pytest.approx(np.sqrt(np.mean(slopes**2)), rel=0.7)
+
+
 def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
     # WHY: without tilts in the model, a tilt of 4 urad/K with an axis at 0.03 g gave a slope of
     # its scale factor of 137 ppm/K.

@@ -21,6 +21,7 @@ from .initial_triad import (
     white_noise_of,
     within_positions,
 )
+from .left_out import is_better
 from .nonlinear import starting_sd, with_terms
 from .options import FitOptions
 from .priors import informative_priors, with_calibration
@@ -52,23 +53,34 @@ class Problem:
 
 
 def regress(windows: ThermalWindows, problem: Problem) -> Fit:
-    """Fit the windows, with or without a prior calibration."""
+    """
+    Fit the windows, with or without a prior calibration.
+
+    If positions differ in temperature by more than their temperatures change, the curve is that
+    of the positions' means, unless drifts within the positions improve it on left-out data.
+    """
+    if problem.options.prior is not None or not _has_soaks(windows):
+        return _regress(windows, problem)
+    at_rest = replace(windows, data=_at_rest(windows.data))
+    fit, of_drifts = _regress(at_rest, problem, is_at_rest=True), _regress(windows, problem)
+    return of_drifts if is_better(fit.selected.score, of_drifts.selected.score) else fit
+
+
+def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = False) -> Fit:
+    """Fit the windows; `is_at_rest`: whether columns are constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
     if options.model == 'golovach' or n_directions < 2:
-        # In one attitude a tilt of the support cannot be distinguished from a drift of the unit; in
-        # several, the prior of the tilt limits it. In the paper's model tilts would absorb errors
-        # of its two sets.
+        # In one attitude a tilt of the support cannot be distinguished from a drift of the unit.
+        # In the paper's model tilts would absorb errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
-    if known is None and _has_soaks_only(windows):
-        data = _at_rest(data)
-        windows = replace(windows, data=data)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
     if n_directions >= POSITIONS_NEEDED:
         prior = _with_faces(prior, problem.up)
-    candidates = _candidates(windows, start, options, has_one_direction=n_directions == 1)
+    steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
+    candidates = _candidates(windows, steepness, options, has_one_direction=n_directions == 1)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
         *others, widest = informative_priors(known, regression, state, windows.model, options)
@@ -92,12 +104,11 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     return Fit(windows, regression, selected, candidates.typical)
 
 
-def _has_soaks_only(windows: ThermalWindows) -> bool:
-    """Whether the RMS change of the temperature in a position is below 1 % of that in the test."""
-    t, position = windows.temperature, windows.data.position
-    within = within_positions(t[:, None], position)[:, 0]
-    square = np.bincount(position, within**2) / np.bincount(position)
-    return bool(square.max() < 1e-4 * np.var(t))
+def _has_soaks(windows: ThermalWindows) -> bool:
+    """Whether temperatures change less in the positions than from one position to the next."""
+    t = windows.temperature
+    within = within_positions(t[:, None], windows.data.position)[:, 0]
+    return bool(np.var(within) < np.var(t - within))
 
 
 def _at_rest(data: Windows) -> Windows:
@@ -211,11 +222,7 @@ def _mounting_scale(noise: float) -> float:
 
 
 def _candidates(
-    windows: ThermalWindows,
-    start: ConstantCalibration,
-    options: FitOptions,
-    *,
-    has_one_direction: bool,
+    windows: ThermalWindows, steepness: float, options: FitOptions, *, has_one_direction: bool
 ) -> Candidates:
     """Return the columns that may take part, with the typical and largest sd of their weights."""
     data = windows.data
@@ -225,7 +232,7 @@ def _candidates(
     is_candidate &= windows.has_temperature
     parts = np.stack((is_candidate, is_candidate & data.in_scale))
     # The smallest typical slope of the bias is 0.1 ug/K, better than navigation grade.
-    slope = float(np.clip(_steepness(windows, start, options), 1e-6, STEEPEST[0] / 3.0))
+    slope = float(np.clip(steepness, 1e-6, STEEPEST[0] / 3.0))
     slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
     fixed = np.zeros(parts.shape, dtype=bool)
     if has_one_direction:
@@ -246,7 +253,9 @@ def _candidates(
     return Candidates(typical, largest, forced, fixed)
 
 
-def _steepness(windows: ThermalWindows, start: ConstantCalibration, options: FitOptions) -> float:
+def _steepness(
+    windows: ThermalWindows, start: ConstantCalibration, options: FitOptions, *, is_at_rest: bool
+) -> float:
     """Return the RMS change of the readings per kelvin, as if it were the bias's [m/s^2 per K]."""
     data = windows.data
     within = within_positions(data.mean / start.scale, data.position)
@@ -264,7 +273,7 @@ def _steepness(windows: ThermalWindows, start: ConstantCalibration, options: Fit
         # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f|.
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
-    if _has_soaks_only(windows):
+    if is_at_rest:
         # The constants explain a part of the differences between norms: take the RMS change of the
         # norms, per unit of all slopes, that the constants do not explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
