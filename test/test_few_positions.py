@@ -172,6 +172,27 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
     assert 2.5e-3 < fit(bags, OPTIONS).calibration.static.x.residual_sd_m_s2 < 1e-2
 
 
+def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
+    # WHY: each of three recordings has a temperature of its own; their turn-ons were claimed as an
+    # error of their mean alone, and those of mountings as independent: 1.6, 1.8 and 1.9 variances.
+    turn_on, ups, dwell = 5e-3, positions(9, 3), 600
+    bags = []
+    for celsius in (-15.0, 20.0, 55.0):
+        force = GRAVITY * np.repeat(ups, dwell, axis=0)
+        noise = 1e-3 * rng.standard_normal(force.shape)
+        samples = force + SLOPE * 1e-4 * celsius + turn_on * rng.standard_normal(3) + noise
+        time_s = 0.1 * np.arange(len(force))
+        board = celsius + 0.01 * rng.standard_normal(len(force))
+        bags.append(tc.Columns(time_s, samples, {'board': (time_s, board)}, name=str(celsius)))
+    unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
+    for bag in (bags[0], bags[2]):
+        out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
+        # The leverage of a line through three equidistant points is 5/6 at its ends; the next
+        # turn-on adds its variance.
+        variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
+        assert variance == pytest.approx((1.0 + 5.0 / 6.0) * turn_on**2, rel=0.05)
+
+
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     # WHY: positions cut into rests, which agree, had 1/20 of the true sd of the offset.
     whole, cut = (

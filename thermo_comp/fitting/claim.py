@@ -95,20 +95,20 @@ def claim_of(
         prior = replace(prior, misalignment_sd=prior.unseen_misalignment_sd)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
-    # The mountings of a turn-on share its offset, so the mean over the turn-ons is an error of the
-    # bias.
-    n_turn_ons = regression.windows.n_turn_ons
-    shared = offset_sd**2 * (1.0 / n_turn_ons - 1.0 / (mounting[-1] + 1))
+    # The mountings of a turn-on share its offset: a stated sd is that of this offset, an estimated
+    # one that of the independent offsets of mountings, beside which there are turn-ons.
+    shared_sd, independent_sd = offset_sd, prior.offset_sd
     if prior.offset_scale > 0.0:
         tried = prior.offset_scale * _GRID, _LOG_DENSITY
         if known_offset_sd:
             tried = known_offset_sd * _KNOWN_GRID, _KNOWN_LOG_DENSITY
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
-        turn_on_sd = _turn_on_sd(regression, posterior, *tried)
-        offset_sd = float(np.hypot(offset_sd, turn_on_sd))
-        shared = turn_on_sd**2 / n_turn_ons
+        shared_sd, independent_sd = _turn_on_sd(regression, posterior, *tried), 0.0
+        offset_sd = float(np.hypot(offset_sd, shared_sd))
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
-    covariance[layout.bias, layout.bias] += shared
+    if shared_sd and _shares_turn_ons(regression):
+        each, shared = _by_offsets(regression, posterior)
+        covariance += shared_sd**2 * (shared.T @ shared) - independent_sd**2 * (each.T @ each)
     if candidates is not None:
         widened = _with_unseen(regression, posterior, candidates)
         with_unseen = regression.solve(posterior.state, widened, n_steps=0)
@@ -260,10 +260,7 @@ def _turn_on_sd(
     The norms show how well turn-ons repeat only if there are several; for a single turn-on the sd
     is that of the prior; `tried` and `log_density` as in `_over_mountings`.
     """
-    if (
-        regression.windows.n_turn_ons == regression.windows.mounting[-1] + 1
-        or not regression.gravity
-    ):
+    if not regression.gravity or not _shares_turn_ons(regression):
         return 0.0
     without_norms = replace(posterior.prior, offset_sd=float(tried[-1]))
     by_drifts = regression.solve(posterior.state, without_norms, n_steps=1).root
@@ -271,6 +268,31 @@ def _turn_on_sd(
     weight = evidence + log_density
     weight = np.exp(weight - weight.max())
     return float(np.sqrt(weight @ tried**2 / weight.sum()))
+
+
+def _shares_turn_ons(regression: Regression) -> bool:
+    """Whether a turn-on has several mountings."""
+    windows = regression.windows
+    return windows.n_turn_ons < windows.mounting[-1] + 1
+
+
+def _by_offsets(regression: Regression, posterior: Posterior) -> tuple[Floats, Floats]:
+    """
+    Return the derivatives of the unit's unknowns by the bias offset of each position, shape
+    (3 n_positions, n_unit), and by that of each turn-on, which its positions share,
+    (3 n_turn_ons, n_unit).
+
+    Offsets of turn-ons at different temperatures change the curve; those of turn-ons with one
+    program change the bias by their mean.
+    """
+    point = regression.at(posterior.state, posterior.prior)
+    turn_on = regression.windows.turn_on_of_position
+    each = np.array([
+        [point.by_offset(position, axis) for axis in range(3)] for position in range(len(turn_on))
+    ])  # fmt: skip
+    shared = np.tensordot(np.unique(turn_on)[:, None] == turn_on, each, 1)
+    n = each.shape[-1]
+    return each.reshape(-1, n), shared.reshape(-1, n)
 
 
 def _norm_evidence(

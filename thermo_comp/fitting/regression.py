@@ -141,7 +141,7 @@ class Point:
     @cached_property
     def reduced(self) -> Reduced:
         """The normal equations of the unit, with the unknowns of positions and bags eliminated."""
-        return self._reduced(self.normal)
+        return self._reduced(self.normal, self.deviation)
 
     @property
     def norm_by_axes(self) -> Floats:
@@ -161,9 +161,9 @@ class Point:
             result[:, places] += self.norm_by_axes[:, [axis]] * of_unit
         return result
 
-    def _reduced(self, normal: Normal) -> Reduced:
+    def _reduced(self, normal: Normal, deviation: Floats) -> Reduced:
         in_sigmas = normal.scaled(self.prior.sigma**-2.0)
-        reduced = eliminate(in_sigmas, self.layout, self.precision, self.deviation)
+        reduced = eliminate(in_sigmas, self.layout, self.precision, deviation)
         if self._has_common_start:
             total = self.state.start.sum(axis=0)
             reduced = reduced.with_prior_of_sum(total, self._common_variance)
@@ -181,6 +181,16 @@ class Point:
             places = np.flatnonzero(mounting == number)
             normal = self.tangent.at(places).normal(at_state[places])
             yield places, self.reduced.without(places, normal.scaled(self.prior.sigma**-2.0))
+
+    def by_offset(self, position: int, axis: int) -> Floats:
+        """
+        Return the derivatives of the unit's unknowns by the prior mean of the bias offset of a
+        position, shape (n_unit,).
+        """
+        deviation = self.deviation.copy()
+        deviation[self.layout.offset[position, axis]] -= 1.0
+        step, _ = self.unit_step(self._reduced(self.normal, deviation).whole)
+        return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
         """
@@ -217,7 +227,8 @@ class Point:
 
     def linear_step(self) -> Floats:
         """Return the step with the nonlinear unknowns held by a damping factor."""
-        return self._solution(self._reduced(_damped(self.normal, self.layout)))[0]
+        reduced = self._reduced(_damped(self.normal, self.layout), self.deviation)
+        return self._solution(reduced)[0]
 
     def moved(self, step: Floats) -> Point:
         """Add a step to the state of the regression."""
