@@ -273,7 +273,7 @@ def _turn_on_sd(
 def _shares_turn_ons(regression: Regression) -> bool:
     """Whether a turn-on has several mountings."""
     windows = regression.windows
-    return windows.n_turn_ons < windows.mounting[-1] + 1
+    return bool(windows.n_turn_ons < windows.mounting[-1] + 1)
 
 
 def _by_offsets(regression: Regression, posterior: Posterior) -> tuple[Floats, Floats]:
