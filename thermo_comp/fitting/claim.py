@@ -107,8 +107,11 @@ def claim_of(
         offset_sd = float(np.hypot(offset_sd, shared_sd))
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
     if shared_sd and _shares_turn_ons(regression):
-        each, shared = _by_offsets(regression, posterior)
-        covariance += shared_sd**2 * (shared.T @ shared) - independent_sd**2 * (each.T @ each)
+        turn_on = regression.windows.turn_on_of_position
+        covariance += shared_sd**2 * _of_offsets(regression, posterior, turn_on)
+        if independent_sd:
+            each = np.arange(len(turn_on))
+            covariance -= independent_sd**2 * _of_offsets(regression, posterior, each)
     if candidates is not None:
         widened = _with_unseen(regression, posterior, candidates)
         with_unseen = regression.solve(posterior.state, widened, n_steps=0)
@@ -276,23 +279,20 @@ def _shares_turn_ons(regression: Regression) -> bool:
     return bool(windows.n_turn_ons < windows.mounting[-1] + 1)
 
 
-def _by_offsets(regression: Regression, posterior: Posterior) -> tuple[Floats, Floats]:
+def _of_offsets(regression: Regression, posterior: Posterior, group: Ints) -> Floats:
     """
-    Return the derivatives of the unit's unknowns by the bias offset of each position, shape
-    (3 n_positions, n_unit), and by that of each turn-on, which its positions share,
-    (3 n_turn_ons, n_unit).
+    Return the covariance of the unit's unknowns by bias offsets of unit variance, each common to
+    the positions of a group, shape (n_unit, n_unit); `group`: of each position.
 
     Offsets of turn-ons at different temperatures change the curve; those of turn-ons with one
     program change the bias by their mean.
     """
     point = regression.at(posterior.state, posterior.prior)
-    turn_on = regression.windows.turn_on_of_position
-    each = np.array([
-        [point.by_offset(position, axis) for axis in range(3)] for position in range(len(turn_on))
+    by_offsets = np.array([
+        point.by_offset(np.flatnonzero(group == number), axis)
+        for number in np.unique(group) for axis in range(3)
     ])  # fmt: skip
-    shared = np.tensordot(np.unique(turn_on)[:, None] == turn_on, each, 1)
-    n = each.shape[-1]
-    return each.reshape(-1, n), shared.reshape(-1, n)
+    return np.asarray(by_offsets.T @ by_offsets)
 
 
 def _norm_evidence(

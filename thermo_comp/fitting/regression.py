@@ -182,13 +182,13 @@ class Point:
             normal = self.tangent.at(places).normal(at_state[places])
             yield places, self.reduced.without(places, normal.scaled(self.prior.sigma**-2.0))
 
-    def by_offset(self, position: int, axis: int) -> Floats:
+    def by_offset(self, places: Ints, axis: int) -> Floats:
         """
-        Return the derivatives of the unit's unknowns by the prior mean of the bias offset of a
-        position, shape (n_unit,).
+        Return the derivatives of the unit's unknowns by the prior mean of a bias offset that some
+        positions share, shape (n_unit,).
         """
         deviation = self.deviation.copy()
-        deviation[self.layout.offset[position, axis]] -= 1.0
+        deviation[self.layout.offset[places, axis]] -= 1.0
         step, _ = self.unit_step(self._reduced(self.normal, deviation).whole)
         return step - self.solution[0][: self.layout.n_unit]
 
