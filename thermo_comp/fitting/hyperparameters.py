@@ -62,10 +62,10 @@ def settle(
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
-        posterior = regression.solve(posterior.state, prior, n_steps=1)
         if change < 0.05:
             break
-    return posterior
+        posterior = regression.step(posterior.state, prior)
+    return regression.solve(posterior.state, prior, n_steps=1)
 
 
 def _updated(

@@ -278,9 +278,9 @@ class Point:
         if reduced.common is not None:
             of_prior += layout.start.shape[1] * float(np.log(prior.start_share))
         log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
-        evidence = -0.5 * (self.misfit + end.prior_misfit + log_hessian - of_prior)
+        evidence = -0.5 * (end.misfit + end.prior_misfit + log_hessian - of_prior)
         return Posterior(
-            *(prior, end.state, layout, determined, unit_root, variance, self.square, evidence)
+            *(prior, end.state, layout, determined, unit_root, variance, end.square, evidence)
         )
 
 
@@ -315,6 +315,13 @@ class Regression(Equations):
                 return point.posterior(end)
             point = end
         return point.posterior(point)
+
+    def step(self, state: State, prior: Prior) -> Posterior:
+        """Take one step towards the mode; the covariance is that of the equations at `state`."""
+        self.whiten(prior.noise)
+        point = self.at(state, prior)
+        end = point.stepped()
+        return point.posterior(end if end.energy <= point.energy else point)
 
     def inactive(self, posterior: Posterior, wanted: Bools) -> Inactive:
         """Return sparsity and quality factors of inactive columns, (m,), at the mode."""
