@@ -29,7 +29,7 @@ def exact_unit(seed: int) -> UnitModel:
     Make a unit whose drift is only a quadratic of the board's temperature.
 
     The unit has no self-heating, so that its bags contain the reference state, in which no heat
-    flows. A bound on the constants at a state that was not visited would not be meaningful.
+    flows. A bound on constants at a state outside the bags would not be meaningful.
     """
     rng = np.random.default_rng(seed)
 

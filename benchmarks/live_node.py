@@ -74,7 +74,7 @@ class Recorder:
 
     def __init__(self, path: Path, ros_args: Sequence[str]) -> None:
         self._writer, self._ros_args = BagWriter(path, overwrite=path.exists()), ros_args
-        self._came: list[tuple[str, list[bytes]]] = []
+        self._received: list[tuple[str, list[bytes]]] = []
 
     def __enter__(self) -> Recorder:
         with ExitStack() as stack:
@@ -98,11 +98,11 @@ class Recorder:
             self._writer.abort()
             return
         with self._writer as writer:
-            imus = (_stamps(some) for name, some in self._came if name == IMU_OUT.name)
+            imus = (_stamps(some) for name, some in self._received if name == IMU_OUT.name)
             first_ns = next(imus, np.zeros(1, np.int64))[:1]
             for topic in OUTPUTS:
                 newest, times, messages = first_ns, [], []
-                for name, some in self._came:
+                for name, some in self._received:
                     newest = _stamps(some) if name == IMU_OUT.name else newest[-1:]
                     if name == topic.name:
                         times.append(newest if topic == IMU_OUT else newest.repeat(len(some)))
@@ -114,13 +114,13 @@ class Recorder:
         for name, subscription in self._heard.items():
             messages, *_ = subscription.drain()
             if messages:
-                self._came.append((name, messages))
+                self._received.append((name, messages))
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of messages received so far, by relative topic name."""
         counts = dict.fromkeys((topic.name for topic in OUTPUTS), 0)
-        for name, messages in self._came:
+        for name, messages in self._received:
             counts[name] += len(messages)
         return counts
 

@@ -262,8 +262,8 @@ def run(
     ----------
     case, unit, study : str, int, Study
         What is fitted.
-    done : dict of str to Calibration
-        Fits of this unit by study, for those that take one as a prior; the fit is added.
+    done : dict of str to Calibration Fits of this unit by study, for studies with a prior; the new
+        fit is added.
     earlier : mapping of (str, int) to mapping of str to Score
         Scores of the baselines by title and unit, from an earlier run; others are computed.
 

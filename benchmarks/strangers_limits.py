@@ -183,7 +183,7 @@ def rms(values: Floats | Sequence[float]) -> float:
 
 
 def judged_ratio(score: Score) -> float:
-    """Return the limited ratio: that over three axes or, if no truth is known, of the norm."""
+    """Return the ratio that is limited: over three axes or, without a known truth, of the norm."""
     return score.norm_ratio if np.isnan(score.ratio) else score.ratio
 
 

@@ -275,7 +275,7 @@ def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within 10 s only the thermometer's part of the variance changes: 30 counts/K, some mK.
+        # Within 10 s only the variance by the thermometer changes: 30 counts/K times some mK.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0

@@ -173,7 +173,7 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
 
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: positions cut into rests, which agree, had 1/20 of the true sd of the offset.
+    # WHY: with positions cut into several rests, the sd of the offset was 1/20 of the true sd.
     whole, cut = (
         fit([turned(rng, np.repeat(positions(9, 3), n, axis=0))], OPTIONS) for n in (1, 5)
     )
@@ -220,7 +220,7 @@ def test_a_calibration_has_the_date_of_its_test(rng):
 
 
 def test_a_prior_tells_how_well_turn_ons_repeat(rng):
-    # WHY: six positions with a prior that states 8 ug claimed the 43 ug of a unit without prior.
+    # WHY: with a prior of 8 ug, the sd of mountings was 43 ug, as for a unit without a prior.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=2e-4)).calibration
     assert known.static.x.residual_sd_m_s2 == pytest.approx(2e-4)
     six = [turned(rng, positions(6, 4))]

@@ -93,7 +93,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The series sums the rests of a start at one time, which costs under a fifth of the sd.
+        # The series merges the rests of a start at one time: an error below a fifth of the sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -146,7 +146,7 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     # In one attitude a shock and another gravity are the same.
     assert [change.may_be_gravity for change in updated.changes] == [True]
     assert 'or another gravity' in ' '.join(change_texts(updated))
-    # Upright rests show a change of 300 ug in bias plus scale of z; turn-ons of 20 ug leave 15 ug.
+    # Upright rests determine the sum of bias and scale of z, 300 ug, to 15 ug (turn-ons of 20 ug).
     assert updated.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
     old_sd, new_sd = (
@@ -197,14 +197,14 @@ def stepped(history, size, day):
 
 @pytest.mark.parametrize('day', [15, 0])
 def test_another_gravity_is_not_taken_for_three_scales(day):
-    # The unit walks by 15 ug and 10 ppm; gravity differs by 300 ug from day 15 or the first rest.
+    # Walks are 15 ug and 10 ppm; gravity differs by 300 ug from day 15, or from the first rest on.
     unit, size = field_units.calibration(), 300.0 * MICRO_G
     history = field_units.live('carried', 2, 30, field_units.Process())
     aged = update(series_of(history.rests, unit), unit)
     result = update(series_of(stepped(history, size, day), unit), unit)
     ((change, found, sd),) = result.solution.gravity
     assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
-    # From the first rest on, another gravity equals a common walk before it within 10 ppm.
+    # A step before the first rest cannot be distinguished from a walk of 10 ppm of all scales.
     assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
     for before, after in zip(aged.moved, result.moved, strict=True):
         assert after.scale == pytest.approx(before.scale, abs=30e-6)
@@ -440,8 +440,8 @@ def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
 
 @pytest.mark.parametrize('lags', [0.0, 1.0])
 def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
-    # Three rests per start, from the first second on: walks of 15 and 10 ug per root day, 20 ug at
-    # a start, 3 ug of scatter, and lags of none or all of the assumed sd, which is 40 to 100 ug.
+    # Three rests per start, the first at once. Walks are 15 and 10 ug per root day, turn-ons 20
+    # ug, the scatter 3 ug; lags have none or all of the assumed sd, 40 to 100 ug.
     unit = rich_calibration()
     each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
     n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]

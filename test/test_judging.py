@@ -328,7 +328,7 @@ class TestVerdict:
         _, upper = CLAIMING.static.temperature_range_c
         judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert judgement.kind is Verdict.OUTSIDE
-        # WHY: for windows outside the calibrated rates the message named only temperatures.
+        # WHY: the message named only temperatures for windows outside the calibrated rates.
         assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
         # A soak 0.01 K beyond the range counts as inside: the thermometer's noise may cause this.

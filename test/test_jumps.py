@@ -41,7 +41,7 @@ def test_jump_along_gravity(rng, with_gyro):
 
 @pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
 def test_jump_in_a_slow_log(rng, rate_hz):
-    # WHY: the gap between the rests beside a jump is some 200 samples long, 80 s at 2 Hz.
+    # WHY: at 2 Hz the gap between the rests around a jump, some 200 samples, is 80 s.
     rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
     source = rest.source()

@@ -159,7 +159,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
     bump = np.array([450.0, -400.0, 500.0])
     _, study = study_of('bump', bump=bump, bump_c=17.0)
-    # The groups that the fit chooses from all groups, which takes three times as long.
+    # Only the groups that a fit of all groups chooses: a third of the time.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The fit approximates a bell with an sd of 0.85 K by lines between knees every 0.5 K.
@@ -262,7 +262,7 @@ def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
 
 @pytest.mark.parametrize('case', [soaks, third_node])
 def test_without_parts_or_ramps_the_fit_has_a_bank_of_lags(case):
-    # Soaks do not determine a time constant; with a third node no axis is a curve of one part.
+    # Soaks determine no time constant; a hidden node makes no axis a curve of one part.
     study = next(case(0))
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]))
     assert {term.tau_s for term in calibration.response if term.kind == 'board'} <= {*FINE_TAUS}

@@ -26,7 +26,7 @@ from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: Only the groups of the unit's physics, a third of all columns, which halves the time.
+#: Only the groups of the unit's physics: a third of the columns, half of the time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 

@@ -186,7 +186,7 @@ class TestGrowing:
 
 
 def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path):
-    # WHY: the hours that a killed run had recorded were left in a hidden file without any message.
+    # WHY: the recording of a killed run was left in a hidden file without a message.
     bags = tmp_path / 'bags'
     killed = subprocess.run(
         [sys.executable, '-c', CRASH, session, bags, str(START_NS + 200 * 10**9)], check=False

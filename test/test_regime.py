@@ -129,13 +129,13 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # Slowest: 0.2 K/min in steps of 1 K behind a lag of 15 min, as two steps are needed.
+        # The slowest is 0.2 K/min in steps of 1 K behind a lag of 15 min: it needs two steps.
         assert each[-1][0] < 0.5 * end_s
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_have_no_false_switches(sensor):
-    # At the required 0.05 switches an hour (2 per opening) over 2 openings in 15 h have p < 0.01.
+    # At 0.05 switches an hour, two per opening, more than 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):

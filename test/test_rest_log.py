@@ -206,7 +206,7 @@ def test_thinning_halves_the_rests_and_keeps_each_start():
 def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     monkeypatch.setattr(rest_log, 'DAY_BYTES', 2000)
     monkeypatch.setattr(rest_log, 'FOLDER_BYTES', 5000)
-    monkeypatch.setattr(rest_log, '_FLOOR', 500)
+    monkeypatch.setattr(rest_log, '_UNTHINNED_BYTES', 500)
     log = RestLog(str(tmp_path))
     for day in range(6):
         for k in range(40):

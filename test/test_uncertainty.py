@@ -30,7 +30,7 @@ def test_a_start_in_a_ramp_is_claimed():
             compensator.push('case', stamp, 10.0 + risen - flicker)
             row = compensator.process(stamp, 0.0, 0.0, 1.0)
         sd[rate, end] = math.sqrt(row[3] - compensator.thermal.correction.noise[0])
-    # One time constant after the start a share of 1/e is left; 300 counts per m/s^2.
+    # One time constant after the start 1/e of the lag remains, at 300 counts per m/s^2.
     left = 30.0 / 300.0 / math.e
     assert sd.pop((0.0, 60)) == pytest.approx(0.387 * left, rel=0.2)
     assert [*sd.values()] == pytest.approx([math.hypot(1.0, 0.387) * left] * 2, rel=0.2)
@@ -60,7 +60,7 @@ def test_without_its_sensor_from_the_start_the_gradient_is_that_of_the_fit():
         stamp = 10**12 + second * SECOND_NS
         compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
         row = compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2)
-    # A gradient of -1 K: -30 counts of 300 per m/s^2, within some mK of the board's rate.
+    # A gradient of -1 K changes the counts by -30, at 300 counts per m/s^2.
     assert row[0] == pytest.approx(1.1, abs=0.01)
     assert not compensator.thermal.tracker.loose_k(-1.0)
 

@@ -24,8 +24,8 @@ from .update import Update, update
 
 #: Largest error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
-#: Days of a window that decides whether the unit is outside: the scatter of single starts is
-#: averaged, and the drift of half a window is small in comparison with that until the limit.
+#: Length of the window whose RMS decides the verdict [days]: long enough to average the scatter of
+#: single starts, and short against the time in which a unit drifts to its limit.
 _WINDOW_DAYS = 7
 #: Smallest number of starts whose attitudes the forecast uses, if the last window has fewer.
 _LEAST_STARTS = 10
@@ -136,8 +136,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week follows a change late. Two days within the claim end an excess, and the
-    # last day begins an excess, if the present error of the ageing model agrees.
+    # The RMS of a week follows a change late. If the ageing model's error at the last rest agrees,
+    # one day outside the claim begins an excess, and two days within the claim end an excess.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -195,8 +195,8 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # Each start adds its offset to the error: the limit of the levels is smaller by this scatter.
-    # An earlier disturbance raises the scatter of the model, but not that of the recent rests.
+    # The offsets of the starts add to the error: their variance reduces the limit. It is at most
+    # that of the recent rests, because a disturbance before them increases the model's variance.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     scatter = min(
         scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)

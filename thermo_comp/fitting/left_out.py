@@ -100,7 +100,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains the errors in the folds that another model has as well."""
+        """Whether white noise explains the errors in the folds that the other model has, too."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
         # Up to 1.7 times the noise: in a soak, changes of the temperature by hundredths of a

@@ -186,9 +186,8 @@ class _PartCurves:
         if self._square(best, axis) > enough:
             starts = [best]
             if self._has_case:
-                # The residual has a valley of several minima, along which this difference is
-                # constant: the time constant less the time by which the temperature between board
-                # and case leads the board.
+                # The residual has several minima in a valley, in which the time constant grows
+                # with the time by which the temperature between board and case leads the board.
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in starts):

@@ -283,7 +283,6 @@ def _rows(
     board, weight = states[BOARD], states[WEIGHT]
     raw, (factors, _) = table.raw(states), table.factors(board, weight)
     curves = model.sets.columns(board - model.reference_temperature, weight)
-    # Derivative of each column by the initial state of its lag.
     by_start = np.zeros_like(raw)
     slopes = table.slopes(states)[0] * factors
     for k, column in enumerate(table.columns):
@@ -360,7 +359,7 @@ def _sections(position: Ints, time: Floats) -> Ints:
 def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Floats) -> Floats:
     """
     Return the temperature change that corresponds to the RMS of each column [K], shape (m,): the
-    RMS over the largest slope of the column in these data; 0 for a column that is constant.
+    RMS divided by the largest slope of the column in these data; 0 for a constant column.
     """
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0

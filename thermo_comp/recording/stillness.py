@@ -195,9 +195,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # Samples that are stamped on their arrival come in bursts at a constant interval, of 5
-            # s at most, as of a buffer that is polled; the pauses of a tumble by hand differ. A
-            # cell contains two bursts.
+            # A polled buffer gives bursts of samples at a constant interval of 5 s at most, unlike
+            # the pauses of a tumble by hand. A cell contains two bursts.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -261,7 +260,7 @@ def _quantum_of(samples: Floats) -> Floats:
         changes = np.sort(changes[changes > 0.0])
         if not len(changes):
             continue
-        # Equal multiples of a step differ by rounding only.
+        # Changes by the same multiple of the step differ by rounding only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         # All changes must be whole multiples of the smallest change.
         steps = changes / changes[0]

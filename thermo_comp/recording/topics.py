@@ -265,7 +265,7 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # of several possible Imu topics none is chosen
+            return  # several Imu topics are ambiguous
 
 
 def _corrected(present: Present, metadata: Mapping[str, str]) -> str:

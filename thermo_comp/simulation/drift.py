@@ -69,8 +69,8 @@ class Effect(ABC):
 @dataclass(frozen=True)
 class PartEffect(Effect):
     """
-    Tempco of a part, or stress or thermo-EMF between two parts: deviation of `part` less that of
-    `cold` [K] and, for coefficients that change with temperature, the difference of the squares.
+    Tempco of a part, or stress or thermo-EMF between two parts. The first signal is the deviation
+    of `part` less that of `cold` [K], the second signal the difference of their squares.
     """
 
     part: str

@@ -28,7 +28,6 @@ UNWATCHED_SHARE: Final = 0.25
 #: temperature, because the air flow may differ: in K, and as a share of the gradient in the fit.
 SELF_HEATING_CHANGE_K: Final = 1.0
 SELF_HEATING_CHANGE: Final = 0.5
-#: A range without limits.
 ANY_RANGE: Final = (-inf, inf)
 
 

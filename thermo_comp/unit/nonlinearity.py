@@ -34,7 +34,7 @@ Kind = Literal['square', 'odd_square', 'cube']
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
 #: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 .. 60 ug/g^2.
 K2_SD = 1e-4
-#: Largest |f| of a rest that counts as at 1 g, over gravity.
+#: Largest |f| / gravity of a rest that counts as at 1 g.
 AT_REST = 1.01
 #: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
 #: sufficient.
@@ -175,7 +175,7 @@ def nonlinear_covariance(
 class BeyondForce(NamedTuple):
     """
     The variance of an unknown square term that begins at the largest |f| of the fit [m/s^2];
-    `growth`: variance over the fourth power of twice the distance beyond this force.
+    `growth`: variance / fourth power of twice the distance beyond this force.
     """
 
     edge: float
