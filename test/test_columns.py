@@ -134,7 +134,7 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     state = np.zeros((Layout(spec).width, 1))
     lag = Layout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # Each bend has derivatives by its quantity of the state and by the board temperature.
+    # A bend depends on its quantity of the thermal state and on the board temperature.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))

@@ -39,7 +39,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Test every second parameter: as blocks have odd lengths, each kind is tested on some axis.
+    # Testing every second parameter tests each kind on some axis, as blocks have odd lengths.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -171,19 +171,19 @@ def test_a_jump_is_distinguished_from_ageing(rng):
 
 
 def test_the_present_sd_of_the_old_calibration_contains_its_ageing(rng):
-    # The bias walks by 60 ug per root day for 30 days: the sd of a bias grows to 329 ug.
+    # Random walk: 60 ug per root day times the root of 30 days is 329 ug.
     unit = known()
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).moved
-    # The sd of the biases is 10 ug, and that of the readings of z is that of bias plus scale.
+    # The sd of a bias is 10 ug; a reading of z also has the sd of the scale.
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
     # One attitude does not separate bias from scale, so up to half the variance goes to the scale.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The rests show the error of z, up to its turn-on of 20 ug.
+    # The rests determine the error of z to the turn-on of 20 ug.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -232,7 +232,7 @@ def test_ageing_is_not_taken_for_another_gravity_or_unit(kind):
 
 @pytest.mark.parametrize('first', [0, 10])
 def test_samples_of_another_unit_are_refused(first):
-    # The other unit differs by percents in scale and milli-g in bias: in all rests, or in half.
+    # All rests, or half of them, are of a unit with other scale (percents) and bias (milli-g).
     unit = field_units.calibration()
     history = field_units.live('carried', 3, 20, field_units.Process())
     mixed = [
@@ -264,7 +264,7 @@ def test_a_changed_curve_is_detected_and_corrected():
 
 
 def test_the_slopes_over_temperature_age_by_a_fixed_walk():
-    # Level rests do not determine x: the sd of its curve is that of 1 ug/K per root year.
+    # Level rests do not determine x, so the sd of its curve grows by 1 ug/K per root year.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
@@ -349,7 +349,7 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     # The date of the new file is that of its last rest, not that of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # The new file removes the residual of the old file, and the history shows both residuals.
+    # The new file has no residual, the old file has one; the history shows both.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'

@@ -114,7 +114,7 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
 def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
-    # WHY: filtered samples of phones counted as independent: a rest was cut into 8 .. 37 rests.
+    # WHY: low-pass filtered samples counted as independent: one rest became 8 to 37 rests.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
     bag = reduce_source(rest.source(), full_scale=None)
@@ -126,7 +126,7 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
 def test_a_jump_in_noise_behind_a_low_pass_is_found(rng, tau_s, sd):
-    # WHY: coloured noise of 3 mg remains in means over 10 s: jumps of 20 mg were missed.
+    # WHY: means over 10 s keep coloured noise of 3 mg, so jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)

@@ -135,7 +135,7 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     assert len(raw) >= 17 * len(sets) // n_sets
     # Compare drifts about their mean, because one attitude does not determine the constants.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # 1.5 mg/sqrt(Hz) leaves 0.19 mg in a minute; the first of five parts is extrapolated.
+    # Means of a minute have a noise of 0.19 mg; the first of five parts is extrapolated.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 

@@ -78,7 +78,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # A coarse sensor must cross two edges of its quantum: median 146 s (94 mK), +-6 s.
+        # A coarse sensor must cross two edges, 94 mK on average: a median of 146 s, +-6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -102,7 +102,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # With a known onset the delay is a lower bound of the CUSUM's delay, within a second.
+        # A test with known onset is faster than CUSUM by at most a second.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -182,7 +182,8 @@ def test_the_rate_of_false_alarms_is_that_of_the_setting():
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
     # Expected: filter gain by the Riccati equation, noise and correlation by the impulse response,
-    # alarms by Rice's formula. The detector's closed forms are first order in its pace: to 4 %.
+    # alarms by Rice's formula. The closed forms neglect terms of second order in the detector's
+    # pace, up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -239,7 +240,7 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_the_dynamic_regime_ends_when_the_lag_has_died_away():
-    # The board relaxes to 0.05 K/min 50 min after the stop; dwell adds 60 s, noise 10 %.
+    # The rate of the board is 0.05 K/min 50 min after the ramp; dwell adds 60 s, noise 10 %.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)
@@ -256,7 +257,7 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The slower of two lags decides: half the rate is reached one lag times ln 2 later.
+    # The slower lag decides: the rate has halved a time of lag times ln 2 later.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
@@ -283,7 +284,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # `closes: case` gives the bits of a run without a board; without a case the board decides.
+    # With `closes: case` the board has no effect; without a case the board decides.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -295,7 +296,7 @@ TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 @pytest.mark.parametrize('lost', [None, 'case', 'board'])
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
 def test_a_reversal_is_no_rest(lost, quantum):
-    # At the top of a triangle a coarse reading is constant for minutes, but the state is dynamic.
+    # Where a ramp reverses, coarse readings are constant for minutes; the state is dynamic.
     parts = {lost: gone} if lost else {}
     changes = run_once(TRIANGLE, quantum=quantum, end=16000.0, **parts)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -329,7 +330,7 @@ def test_direction_follows_a_reversal():
 
 
 def test_a_held_reading_does_not_turn_the_direction():
-    # WHY: the staircase of measurements every 30 s published every second looks like reversals.
+    # WHY: measurements every 30 s, published every second, gave false reversals.
     rng = np.random.default_rng(1)
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)

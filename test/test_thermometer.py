@@ -78,7 +78,7 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_claimed_variances_match_squared_errors(errors, sensor, part):
-    # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claimed
+    # Ideally, the mean squared error equals the claimed variance. In soaks and ramps the claimed
     # variance allows for changes that have not begun, and is a few times too large; at an onset or
     # an end a change begins. The few errors of a coarse sensor scatter by a factor of 2.
     begin, end = PARTS[part]
