@@ -117,13 +117,13 @@ def _parts(state: Floats, warmth: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def measured(force: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Return the counts [K] of a unit with deviations `state` under forces (n, 3)."""
+    """Return the samples [counts / `K`] of a unit with deviations `state` under forces (n, 3)."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray(np.linalg.solve(M, force.T).T * scale + bias)
 
 
 def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Correct counts [K] with a calibration file of deviations `state`."""
+    """Correct samples [counts / `K`] with a calibration file of deviations `state`."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray((counts - bias) / scale @ M.T)
 
@@ -199,7 +199,7 @@ class BestFilter:
         self._now, self._is_shocked, self._start = 0.0, False, -1
 
     def take(self, now: float, start: int, counts: Floats, warmth: float, variance: float) -> None:
-        """Take the mean of a rest [K], `now` in days, the variance of its norm."""
+        """Take the mean [counts / `K`] of a rest, `now` in days, the variance of its norm."""
         process = self.process
         if start != self._start:
             elapsed, self._now, self._start = now - self._now, now, start

@@ -75,7 +75,7 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
 
 
 def verdicts(kind: str, n_units: int, days: int) -> None:
-    """Print how often the verdict is "outside", by the true RMS of |f| - g over the limit."""
+    """Print how often the verdict is "outside", by the true RMS of |f| - g / limit."""
     found = []
     for seed in range(2 * n_units):
         ageing = {'bias': 0.0, 'scale': 0.0} if seed % 2 else {}

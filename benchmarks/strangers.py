@@ -12,7 +12,7 @@ Units and recordings come from `strangers_units.py` and `strangers_cases.py`, wh
 with the package; the package is used only through its fit and its correction of arrays. Every row
 is measured on recordings that were not fitted, unless the row states otherwise. Errors are RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
-is the RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
+is the RMS of error / claimed sd. Figures are RMS over the units. MISS marks a limit of
 `strangers_limits.py` that a row exceeds; the exit code is then 1. The baselines fitted by the
 package take most of the time; ``--baselines strangers.json`` reads them from an earlier run.
 """
@@ -181,7 +181,7 @@ def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
     bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
-        # One pose does not determine the scale factors: take the norm of the samples over gravity.
+        # One pose does not determine the scale factors: take the norm of the samples / gravity.
         scale = rms(np.linalg.norm(bags[0].samples, axis=1)) / GRAVITY
         return {name: by_drift(bags, scale, order=order) for name, order in orders.items()}
     return {name: by_norm(bags, study.gravity, order=order) for name, order in orders.items()}

@@ -318,8 +318,8 @@ def _uncertainty(
     weight, unknown = states[:, WEIGHT], states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(states[:, BOARD])
-    # The ageing model has the residuals of the sets, so they are subtracted; while the regime is
-    # unknown, the variance contains those of both sets.
+    # The ageing model adds the residuals of the sets itself, so they are subtracted here: those of
+    # both sets while the regime is unknown.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]

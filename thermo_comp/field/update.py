@@ -4,8 +4,8 @@
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
 A rest determines the error along gravity alone, so the attitudes decide which axes are determined.
-An axis is updated only if the rests reduce the sd of some reading of the axis to 0.6 of that
-reading's prior sd; the other axes keep their values, with an increased covariance.
+An axis is updated only if the rests reduce the sd of some combination of its bias and scale to 0.6
+of the prior sd; the other axes keep their values, with an increased covariance.
 """
 
 from collections.abc import Iterator, Sequence

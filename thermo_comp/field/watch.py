@@ -195,8 +195,9 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # The offsets of the starts add to the error: their variance reduces the limit. It is at most
-    # that of the recent rests, because a disturbance before them increases the model's variance.
+    # The offsets of the starts add to the error, so their variance reduces the limit: the smaller
+    # of the model's variance, which an earlier disturbance increases, and that of the recent
+    # rests.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     scatter = min(
         scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)
@@ -240,7 +241,7 @@ def passage(
     variance. The time is 0 if the norm exceeds the bound at the beginning, else at least 0.01.
     """
     rng = np.random.default_rng(1)
-    # Directions in which the error is below a thousandth of its size are left out.
+    # Directions with less than a thousandth of the largest error are left out.
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, walk, covariance = onto @ mean, onto @ walk, onto @ covariance @ onto.T

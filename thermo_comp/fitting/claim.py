@@ -360,7 +360,7 @@ def drift_variance(
 def _points(
     temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
 ) -> tuple[LackOfFit, ...]:
-    """Average the excess of some windows in at most 5 bins of temperature, 10 windows or more."""
+    """Average the excess in at most 5 bins of temperature, each of 10 windows or more."""
     n_bins = min(5, int(rows.sum()) // 10)
     if not n_bins:
         return ()

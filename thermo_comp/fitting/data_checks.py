@@ -321,7 +321,7 @@ def judge_result(
     others = f'{left_out:.1f} ug on data left out, ' if overall.left_out.n else ''
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
-    # Up to twice the white noise, noise explains a residual.
+    # Noise explains a residual of up to twice the white noise.
     if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:
         why = 'temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
         if drift <= max(2.0 * noise, 0.3 * overall.fitted.rms):

@@ -98,8 +98,8 @@ def _updated(
         changes.append(float(np.abs(step)) / 3.0)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
-        # Elements count only if the data determine more than one of them.
+        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth. The
+        # elements are used only if the data determine more than one of them.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
@@ -182,7 +182,7 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     least = np.full(3, 1e-8)
     if not regression.windows.has_drifts:
         # Without columns that change the slow noise describes the whole drift of a position, and
-        # the white noise would be estimated as zero. Second differences do not contain a drift.
+        # the white noise would be estimated as zero. A drift cancels in second differences.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 

@@ -104,7 +104,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         if (square <= (shape.most_noise * noise) ** 2).all():
             if shape.has_stress:
                 return parts
-            # Curves alone explain the drift; in left-out sections they are extrapolated.
+            # Curves alone explain the drift, but extrapolate to left-out sections.
             return replace(parts, most_drift=10.0 * float(noise.mean()))
         # A larger residual has another cause, for example slow noise: the lags are then accepted
         # only if they reduce the RMS residual of each axis to an eighth or less of the residual

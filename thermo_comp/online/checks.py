@@ -157,7 +157,7 @@ class GravityCheck:
         self._n_agreeing = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
-        #: Samples since |f| stepped from one rest to another, and the stamp of the first of them.
+        #: Samples since |f| stepped from one rest to another, and the stamp of the first sample.
         self._off: list[Sequence[float]] = []
         self._off_ns = 0
         self._is_resting = False  # whether the last sample agreed with the last still window

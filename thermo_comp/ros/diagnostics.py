@@ -32,7 +32,7 @@ from .relay import Relay
 from .waitloop import WaitLoop
 
 IDLE_S = 5.0  # silence of the samples after which readings apply [s]; Fast DDS may be 3 s late
-#: Time by which stamps of readings are ahead of the samples' if the clocks differ [s].
+#: Readings stamped later than the samples by more than this time are of another clock [s].
 AHEAD_S = 5.0
 #: Delay of the next sample, in cycles and in s, beyond both of which the samples have stopped.
 SILENT_CYCLES, SILENT_S = 5.0, 0.5

@@ -24,8 +24,8 @@ LARGEST_RATE: Final = 0.2
 #: readings may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: The first reading is wrong if its change to the second reading does not continue: if the next
-#: change is less than this share of it.
+#: The first reading is wrong if the change after the second reading is less than this share of the
+#: change before.
 CONTINUED_SHARE: Final = 0.25
 
 #: A sensor's readings count as standing still after this number of equal readings over at least
@@ -47,8 +47,8 @@ LARGEST_ERROR: Final = 60.0
 #: share of the temperature change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: Number of consecutive readings after which a sensor leads, and smallest ratio of the slower rate
-#: to the faster rate in them; from the smaller ratio on, a lead of the board adds variance.
+#: A sensor leads after this number of consecutive readings with at least this ratio of the slower
+#: to the faster rate. Above `DOUBTFUL_RATE_SHARE` a lead of the board adds variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03

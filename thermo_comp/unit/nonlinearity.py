@@ -51,7 +51,7 @@ Real = TypeVar('Real', float, Floats)
 class NonlinearTerm:
     """One term of the nonlinearity; `coefficient` and `per_kelvin` are for x, y, z."""
 
-    kind: Annotated[Kind, 'K2 f^2, Kq |f| f or K3 f^3.']
+    kind: Annotated[Kind, 'K2 f^2, Kq abs(f) f or K3 f^3.']
     coefficient: Annotated[
         Vector, 'Coefficient at the reference temperature [g/g^2; K3 in g/g^3].'
     ]
@@ -83,12 +83,14 @@ class Nonlinearity:
 
     force_range_m_s2: Annotated[
         tuple[Annotated[float, QUANTITIES['error']], Annotated[float, QUANTITIES['error']]],
-        'Smallest and largest |f| in the data of the fit.',
+        'Smallest and largest norm of the specific force in the fit.',
     ]
     beyond_sd_g_g2: Annotated[
-        float, QUANTITIES['nonlinearity'], 'Sd of an unknown square term beyond the largest |f|.'
+        float, QUANTITIES['nonlinearity'], 'Sd of an unknown square term beyond the largest norm.'
     ]
-    terms: tuple[NonlinearTerm, ...] = ()
+    terms: Annotated[
+        tuple[NonlinearTerm, ...], 'Square, odd square and cube in this order, at most one each.'
+    ] = ()
 
     def __post_init__(self) -> None:
         check_ranges(self, force_range_m_s2=QUANTITIES['error'])
