@@ -8,7 +8,7 @@ Measures verdict and forecasts of the drift watch against simulated units (`fiel
 Units of five kinds of attitudes age by random walks of known sd and write rests. The bound is a
 tolerance of 200 ug. For each unit 200 futures are drawn: its random walk goes on until the RMS of
 |f| - g over the attitudes of use, with the scatter of the starts, exceeds the bound. The figures
-are the share of futures within the printed 10 to 90 % interval, and the median time over the
+are the share of futures within the printed 10 to 90 % interval, and the median time divided by the
 printed median. Then the verdicts of level and carried units, half of which do not age, are taken
 every five days; the figures are the share of "outside", by classes of the true RMS.
 """

@@ -140,8 +140,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # The offset of a new mounting is constant in a pose and cancels in its drift: subtract the
-        # smallest variance, that at the reference, where the curve over temperature adds nothing.
+        # The offset of a new mounting cancels in the drift of one pose: subtract the smallest
+        # variance, that at the reference temperature.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]

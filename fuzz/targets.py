@@ -104,10 +104,7 @@ noise_density_m_s2_sqrt_hz: [1, 1, 1]
 
 
 def check_mcap(data: bytes) -> None:
-    """
-    Read any bytes as a bag: an error is one line, the output not larger than the input can
-    contain.
-    """
+    """Read any bytes as a bag: an error is one line, the output is limited by the input's size."""
     with suppress(RecordingError):
         try:
             BAG.write_bytes(data)

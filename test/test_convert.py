@@ -192,7 +192,7 @@ def test_every_odd_row_is_accounted_for(tmp_path):
     # A clipped row and rows in wrong order stay in the bag, because the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
-    # The log time keeps the order of the file where stamps do not.
+    # Log times keep the order of the file, in which some stamps fall.
     assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 

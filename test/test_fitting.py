@@ -307,7 +307,8 @@ def test_saturated_samples_are_refused(rng):
 
 
 def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
-    # Misalignments of some mrad explain the norms of nine positions, as would mountings of 5 mg.
+    # Misalignments of some mrad explain the norms of nine positions, as would mounting offsets of
+    # 5 mg.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     # The groups of the unit's physics, which halve the time.

@@ -90,7 +90,7 @@ def test_population_is_the_mean_unit_and_its_scatter():
 
 
 def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(rng):
-    # WHY: one position and the prior of twelve units: a claimed sd of 0.9 mg, an error of 4.7 mg.
+    # WHY: with one position and a prior of twelve units the error was 4.7 mg, its sd 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 

@@ -4,9 +4,8 @@
 The detector on short runs: early, few false alarms, no missed ramps; long runs are in
 benchmarks/regime.py.
 
-All runs are seeded. A limit on a median of n delays holds with the benchmark's spread: the median
-of 24 delays scatters by about 0.3 of their sd, 1 s at 1 mK; the median of 12 delays with coarse
-steps by 4 s.
+All runs are seeded. The limits allow for the scatter of medians: that of 24 delays at 1 mK
+scatters by 1 s, that of 12 delays with coarse steps by 4 s.
 """
 
 import math

@@ -33,8 +33,8 @@ Triple = tuple[Column, Column, Column]
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible sample intervals [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: If the attitude changes by `_TURN` rad between successive blocks of `_BLOCK` still samples
-#: (scatter below `_QUIET` g), intervals are plausible up to `_SLOW_S` s and times in ms are not.
+#: A turn by `_TURN` rad between successive blocks of `_BLOCK` still samples (scatter below
+#: `_QUIET` g) excludes times in ms; intervals are then plausible up to `_SLOW_S` s.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
 #: Range of stamps since 1970 [s], 2000 to 2038, and their largest interval; a count of us since

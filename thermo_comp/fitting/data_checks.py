@@ -146,8 +146,8 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,); 0 where it is noise: the mean
-    temperature changes by less than half of it from one window to the next.
+    Return the rate of the board temperature [K/min], shape (n,); 0 where the rate is noise: the
+    mean temperature changes by less than half of the rate from one window to the next.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):

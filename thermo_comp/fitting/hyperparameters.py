@@ -88,8 +88,8 @@ def _updated(
     changes.append(change)
     tilt_sd = prior.tilt_sd
     if state.tilt.size:
-        # Scale of the half-normal prior: 15 urad/K, aluminium of 23 ppm/K heated unevenly, times
-        # the RMS of the board temperature about the reference, at least 1 K.
+        # Scale of the half-normal prior of tilts: 15 urad/K, aluminium of 23 ppm/K heated
+        # unevenly, times the RMS of the board temperature about the reference, at least 1 K.
         bound = 1.5e-5 * max(float(regression.windows.kelvins[0]), 1.0)
         square = (tilt_sd / bound) ** 2
         effective, power = determined[layout.tilt].sum(), np.sum(state.tilt**2)
@@ -155,7 +155,7 @@ def _offset_sd(posterior: Posterior) -> tuple[float, float]:
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, prior.offset_sd, slope, bend + 0.1)
-    # Bounds [m/s^2]: a thousandth of the prior's scale; 5 mg, typical of the cheapest MEMS.
+    # Bounds of the sd [m/s^2]: 1/1000 of the prior's scale; 5 mg, as of the cheapest MEMS.
     new = float(np.clip(prior.offset_sd * np.exp(step), 1e-3 * prior.offset_scale, 0.05))
     return new, float(np.abs(np.log(new / prior.offset_sd))) if effective > 1.0 else 0.0
 

@@ -152,7 +152,7 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     other errors of the norms to second order. The covariance keeps the larger sd.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    # Sd for the estimate [rad]: the cross-axis sensitivity of good consumer MEMS.
+    # Sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
     of_faces, sd = 2.5e-3, prior.misalignment_scale
     # The RMS of `by_element` is below 0.1 for faces within a few degrees, and 0.3 for edges.
     if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= of_faces:
@@ -200,9 +200,9 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
-    # Bounds: 30 ug, typical of navigation grade, and 0.5 mg, typical of consumer MEMS; the tail
-    # of the Student prior allows for more. The lower bound is smaller for almost no noise, because
-    # an offset 1e6 times as large as the noise cannot be estimated in double precision.
+    # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer MEMS; the
+    # tail of the Student prior allows for more. The lower bound is smaller for almost no noise,
+    # because an offset 1e6 times as large as the noise cannot be estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-6), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 

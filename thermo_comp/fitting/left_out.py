@@ -103,8 +103,8 @@ class Folds:
         """Whether white noise explains the errors in the folds that the other model has, too."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
-        # Up to 1.7 times the noise: in a soak, changes of the temperature by hundredths of a
-        # kelvin, whose lag is not known, add to the white noise.
+        # Errors of up to 1.7 times the noise count as noise: in a soak, changes of the temperature
+        # by hundredths of a kelvin, whose lag is not known, add to the white noise.
         return bool(square <= (1.7 * noise) ** 2)
 
 

@@ -269,7 +269,7 @@ def select(
         trials.append(first)
     parts = None
     if PART in growth.free:
-        # Curves over the temperatures of parts take the place of the curve over that of the board.
+        # Curves over the temperatures of parts replace the curve over the board temperature.
         parts = better_start([growth.extended(fit, (PART,)) for fit in fits])
     chosen, tried = _grown(growth, first, parts, progress)
     trials += tried

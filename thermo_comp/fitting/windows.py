@@ -250,8 +250,8 @@ def thermal_windows(
 
 def _turn_ons(bags: Sequence[ReducedBag]) -> Ints:
     """
-    Return the number of each bag's turn-on, shape (n_bags,): a bag that begins where another one
-    ends, as the parts of a split recording, continues its turn-on.
+    Return the number of each bag's turn-on, shape (n_bags,): a bag that begins where another bag
+    ends, as in a split recording, continues the turn-on of that bag.
     """
     result = np.arange(len(bags))
     for number in sorted(range(len(bags)), key=lambda number: bags[number].start_ns):

@@ -44,8 +44,8 @@ class StateResult(NamedTuple):
     """
     One axis in a soak or a ramp at one temperature of the board.
 
-    Each deviation is that of the preceding value from the straight line over temperature that
-    passes through the value in a soak at the reference temperature, with the slope of the soak.
+    A deviation is the preceding value less a straight line over temperature: the line through the
+    value in a soak at the reference temperature, with the fitted slope of soaks.
     """
 
     program: str

@@ -23,7 +23,8 @@ NEVER_NS: Final = 1 << 62
 
 class ReadingQueue:
     """
-    Waiting readings by stamp, the board's before others of its stamp, which decide the regime.
+    Waiting readings by stamp; at equal stamps the board's come first, as the others may decide the
+    regime.
     """
 
     def __init__(self) -> None:
