@@ -53,7 +53,7 @@ LABORATORY = calibration()
 
 
 def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, Floats]:
-    """Build rests in use without noise: rests, counts / K, board temperature [K], true forces."""
+    """Build noise-free rests in use: rests, counts / K, board temperature [K], true forces."""
     rng = np.random.default_rng(seed)
     force = G * np.array([attitude(kind, rng) for _ in range(N_PROBES)])
     warmth = rng.normal(0.0, 5.0, N_PROBES)

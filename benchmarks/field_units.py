@@ -129,7 +129,7 @@ def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
 
 
 def attitude(kind: str, rng: np.random.Generator) -> Floats:
-    """Draw the direction of f: within 10 deg of the vertical, any, up, up or down, a face."""
+    """Draw a direction of f by `kind`: up within 10 deg, any, up, up or down, or a face."""
     if kind == 'carried':
         u = rng.standard_normal(3)
         return np.asarray(u / np.linalg.norm(u))

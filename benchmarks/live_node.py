@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs the live node in this process, without loss of messages, and records what it publishes.
+Runs the live node in this process, without loss of messages, and records its output.
 
 The demonstration, tests and benchmarks use this module. As in a bag written by `replay`, the log
 time of an Imu is its stamp, and the log time of any other output the newest Imu stamp before it.
@@ -143,7 +143,7 @@ def through_the_node(
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[PlayReport, dict[str, int]]:
     """
-    Play a bag into the node and record what it publishes, without loss.
+    Play a bag into the node and record the output of the node, without loss.
 
     Returns the player's report and the number of recorded messages by topic. Differences to a
     robot: the QoS is reliable with unlimited depth, and the player waits for the node.

@@ -65,7 +65,7 @@ def test_gradient_even_about_rest_is_even_about_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
-    # Gradients: the value at rest (-0.5 K), and 1.5 K above and below it.
+    # Gradients: the value at rest, -0.5 K, and values 1.5 K above and below.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections with all columns: same bits in blocks, axes independent, claimed sd = scatter."""
+"""Corrections with all columns: blocks give the same bits, and errors scatter as claimed."""
 
 import math
 from dataclasses import replace
@@ -332,7 +332,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # constant, y and y^2 of the element yy
+    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the element yy
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert excess.relative == pytest.approx(2.0)

@@ -143,7 +143,7 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
-    # In one attitude a shock and another gravity are the same.
+    # In one attitude a shock and another gravity cause the same residuals.
     assert [change.may_be_gravity for change in updated.changes] == [True]
     assert 'or another gravity' in ' '.join(change_texts(updated))
     # Upright rests determine the sum of bias and scale of z, 300 ug, to 15 ug (turn-ons of 20 ug).

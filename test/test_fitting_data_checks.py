@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refusals and advice of a fit, each with its number, on tables made to trigger them."""
+"""Refusals and advice of a fit, with the numbers in their texts, on tables made for each."""
 
 import re
 from dataclasses import replace

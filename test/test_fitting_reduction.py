@@ -79,7 +79,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     assert len(bag.intervals) >= 18
     for interval in bag.intervals:
         size = np.linalg.norm(interval.mean, axis=1)
-        # The noise is 5 ug per sample, in windows of ten samples and shorter ones at the end.
+        # The noise is 5 ug per sample, in windows of ten samples or, at the end, fewer samples.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
     # Without short rests the cells of slow samples stay half a minute long.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])

@@ -158,8 +158,7 @@ def test_white_noise_is_not_taken_for_slow_noise(calm):
 
 def test_prior_sds_are_those_of_the_weights(calm):
     # At the fixed point sd^2 = sum of squared weights / effective parameters (here 3 per column);
-    # the hyperprior (sd of a factor of ten) shifts log sd by 1 / (2 x 3 x 5.3) of its distance
-    # from the hyperprior's centre.
+    # a hyperprior (sd: factor of ten) shifts log sd by 1 / (2 x 3 x 5.3) of the way to its centre.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)

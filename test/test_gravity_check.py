@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The gravity check: a good calibration passes, an aged one is reported, motion is ignored."""
+"""The gravity check passes good calibrations, reports aged calibrations, ignores motion."""
 
 import math
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rests: none in a flight, with or without a gyroscope; each short rest of a hand-held unit."""
+"""No rest is found in a flight, but each short rest of a hand-held unit is found."""
 
 import numpy as np
 import pytest

@@ -115,7 +115,7 @@ def test_a_crossed_edge_locates_the_temperature():
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # The crossing locates the temperature to the noise, plus the change within one second.
+    # The error of the temperature at a crossing is the noise plus the change within one second.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
@@ -192,7 +192,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
     out, back = mix(*states, 0.25), mix(*states[::-1], 0.75)
     np.testing.assert_allclose(back, out, rtol=1e-12)
     mixed = np.concatenate(samples)
-    # 400 000 samples with an sd of a few determine the covariances to 1 %.
+    # 400 000 samples determine the covariances to 1 %.
     np.testing.assert_allclose(out[:3], mixed.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(out[3:], np.cov(mixed.T)[upper], atol=0.1)
 
@@ -210,7 +210,7 @@ def test_readings_not_finite_or_not_newer_change_nothing(stamp_s, reading):
 
 
 def test_a_small_jump_counts_less_than_a_reading():
-    # A jump of 15 sigma is below five times the limit of 6 sigma: it counts like one of 6 sigma.
+    # A jump of 15 sigma is below five times the limit of 6 sigma: it counts like 6 sigma.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004

@@ -43,7 +43,7 @@ def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
     corrected = []
     for second in range(3000):
         stamp = 10**12 + second * SECOND_NS
-        # Thermometers of a few mK, as constant readings are those of a faulty thermometer.
+        # Readings scatter by a few mK: constant readings are those of a faulty thermometer.
         compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
         if second < 2000:
             compensator.push('case', stamp, 19.0 + 2e-3 * (second % 5))

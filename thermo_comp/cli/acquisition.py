@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the progress of a test during recording: positions, resulting accuracy, what is missing.
+Owns the progress of a test during recording: positions, resulting accuracy, missing data.
 
 Blocks of samples are added as they arrive. A rest in another direction than the present position
 begins the next position; knocks and handling in between belong to the previous position.
@@ -59,7 +59,7 @@ class Position:
 @dataclass(frozen=True)
 class Account:
     """
-    State of a test, and what is missing.
+    State of a test, and the missing data.
 
     The last of `positions` is unfinished. `worst_sd_g` is the sd of the force in the worst
     attitude, `constants_sd` the sd of bias [g], relative scale and M [rad], as in `coverage`.
@@ -225,7 +225,7 @@ class Acquisition:
         return coverage.directions(means, self._centre)
 
     def account(self) -> Account:
-        """Return the state of the test, and what is missing."""
+        """Return the state of the test, and the missing data."""
         cells = self._cells()
         rests = [*self._rests, self._rest(cells, -_FIRST_NS)]
         means = np.array([rest.mean for rest in rests])

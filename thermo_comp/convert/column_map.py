@@ -351,7 +351,7 @@ def _stamp(
 
 
 def _no_time(column: Column | None, steps: Floats) -> str:
-    """Return what is wrong with the times of a column."""
+    """Return the fault of the times of a column."""
     if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
         shown = f'{(steps == 0.0).mean():.0%}'
         return (

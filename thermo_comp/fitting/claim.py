@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the published uncertainty: the covariance of the fit, widened by what the data do not
-determine, and the lack of fit, the excess of the left-out errors over this covariance.
+Owns the published uncertainty: the covariance of the fit, widened by the parameters that the data
+do not determine, and the lack of fit, the excess of the left-out errors over this covariance.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. A fit's weight in the mixture is the evidence

@@ -4,7 +4,7 @@
 Owns the choice of the model: groups of columns are added to the constants one at a time.
 
 The log evidence ranks the groups to be tried; the score on left-out data decides. The fit of each
-model begins from that of a smaller one.
+model begins from the fit of a smaller model.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ def better_start(fits: Sequence[Trial]) -> Trial:
 
 
 def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
-    """Return the model with the largest gain, or a smaller one that is not significantly worse."""
+    """Return the model of the largest gain, or a smaller model that is not significantly worse."""
     best = max(better, key=lambda trial: gain(before.score, trial.score))
     for trial in sorted(better, key=lambda trial: len(trial.groups)):
         if trial is best or not is_better(trial.score, best.score):

@@ -175,7 +175,7 @@ class ThermalWindows:
 
     @property
     def was_measured(self) -> bool:
-        """Whether the columns depend on a recorded temperature, even a constant one."""
+        """Whether the columns depend on a recorded temperature, which may be constant."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
 
     @property

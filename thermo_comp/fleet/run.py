@@ -141,7 +141,7 @@ def _in_prior(row: Row) -> bool:
 
 def lacks_data(row: Row) -> bool:
     """
-    Whether a unit's data are incomplete, so that the prior of the type replaces what is missing.
+    Whether a unit's data are incomplete, so that the prior of the type replaces missing data.
 
     Data that contradict themselves or the fit are not incomplete: a prior would hide the fault.
     """

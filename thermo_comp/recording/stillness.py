@@ -375,7 +375,7 @@ def is_under(cells: Cells, still_sd: float) -> Bools:
 
 
 def _is_turning(cells: Cells) -> Bools:
-    """Whether the gyroscope shows a cell to shake or turn, relative to its drifting level."""
+    """Whether the unit shakes or turns in a cell, by the angular rate less its drifting level."""
     shakes = (cells.rate_variance > _STILL_RATE_SD**2).any(axis=1)
     calm = np.flatnonzero(~shakes)
     if not len(calm) or not cells.rate.any():

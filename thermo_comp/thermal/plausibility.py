@@ -115,8 +115,8 @@ class SensorCheck:
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
         """
-        Judge the sensor's first reading by the two that follow; call with each reading. A sensor
-        may have a wrong reading after power-up, which no earlier reading contradicts.
+        Judge the sensor's first reading by the two readings that follow; call with each reading. A
+        sensor may have a wrong reading after power-up, which no earlier reading contradicts.
         """
         first = self._first
         if first is None or not isfinite(celsius):

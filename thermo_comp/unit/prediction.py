@@ -161,8 +161,8 @@ def in_a_soak(
     calibration: Calibration, temperature: float | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,), in a
-    soak at the reference temperature or at another one.
+    Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,), in a soak
+    at the reference or another temperature.
     """
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
     states = ramp_states(calibration, at)
