@@ -44,7 +44,7 @@ DAY_ZERO = 20454  # 2026-01-01 in days since 1970
 SLOPE, SCALE_SLOPE = 30 * UG, 1e-5
 #: Sd of the calibration's error: bias, its slope per K, scale, its slope per K, misalignment.
 PRIOR = np.repeat([10 * UG, 0.3 * UG, 10e-6, 0.3e-6, 5e-6], 3)
-#: Window: white noise 60 ug/sqrt(Hz) over 10 s.
+#: Length of a window [s], and density of its white noise [m/s^2/sqrt(Hz)].
 WINDOW_S, NOISE = 10.0, 60 * UG
 KINDS = ('level', 'carried', 'fixed', 'up and down', 'faces')
 

@@ -52,7 +52,8 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
     """
     Compare forecast and recalibration interval of units with their futures.
 
-    Each row has the share of futures in the 10 to 90 % interval, their median, and the quantiles.
+    Each row has the share of futures in the forecast's 10 to 90 % interval, the median of the
+    futures, and the forecast's quantiles.
     """
     rng, process = np.random.default_rng(3), Process()
     found: dict[str, list[tuple[float, ...]]] = {'forecast': [], 'interval': []}

@@ -261,7 +261,7 @@ def run(
     Parameters
     ----------
     case, unit, study : str, int, Study
-        What is fitted.
+        The fitted study.
     done : dict of str to Calibration Fits of this unit by study, for studies with a prior; the new
         fit is added.
     earlier : mapping of (str, int) to mapping of str to Score

@@ -180,7 +180,7 @@ def _as_a_process(cwd):
 
 @pytest.fixture(scope='session')
 def cli(program):
-    """Return a function that runs a command here, or with variables in a new process."""
+    """Return a function that runs a command in this process or, with variables, in another."""
     from thermo_comp.cli.app import run as run_command
 
     def run(*args, code=0, cwd=None, **env):

@@ -105,7 +105,7 @@ def assert_same(blocks, rows):
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    # The run leaves 5 .. 35 degC and the tangents (-2.5 .. 42.5 degC): the curves are constant.
+    # The run leaves 5 .. 35 degC, and -2.5 .. 42.5 degC, where the tangents end.
     events = run_of(rng, seconds=50, swing_k=90.0)
     rows = stream(Compensator(unit, UNCHECKED), events)[0]
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
@@ -185,7 +185,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
             claimed = np.zeros((3, 3))
             claimed[np.triu_indices(3)] = covariance_at(coefficients, *force.tolist())
             claimed += np.triu(claimed, 1).T
-            # A covariance from n draws has an sd of at most sqrt(2 / n) times both sds: 4 sd.
+            # A covariance from n draws has an sd of sqrt(2 / n) times both sds; tolerance: 4 sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
             # The variances agree along all directions, so the axes have the right correlations.

@@ -336,7 +336,7 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
     # Noise below a tenth of the quantum is invisible; a tenth is assumed.
     assert learned.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
-    # Means of a minute determine the onset through the lag to a third.
+    # From means of a minute the lag is estimated to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
     assert learned.fastest_ramp_k_min >= 1.0
 

@@ -150,7 +150,7 @@ def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A silent thermometer is missing after the time-out of 60 s, 5 intervals, and a window.
+    # A silent thermometer is missing after 60 s (time-out), 5 intervals and a window.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])

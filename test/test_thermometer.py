@@ -278,7 +278,7 @@ def test_extrapolation_is_linear_then_held():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # Held after 5 s: the sd is the change if the ramp of 0.01 K/s went on for another 55 s.
+    # After 5 s the value is held, with the change by a ramp of 0.01 K/s for another 55 s as sd.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 

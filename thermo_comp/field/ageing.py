@@ -40,8 +40,8 @@ _LEAST_TURN_ON = 5.0 * MICRO_G
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Relative sizes of a jump in the biases and in the scales times g, which a shock changes less.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
-#: Smallest log Bayes factor of a change (150:1), and of a jump of gravity against a jump of the
-#: levels (20:1), which is assumed if the attitudes do not distinguish the two.
+#: Smallest log Bayes factor of a change (150:1), and of a jump of gravity relative to a jump of
+#: the levels (20:1).
 _LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
@@ -411,7 +411,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     gravity = []
     for change in model.changes:
         columns = change.columns(rows)
-        if change.kind == 'gravity':  # the file has no parameter for it
+        if change.kind == 'gravity':  # the file has no parameter for gravity
             gain = change.sd**2 * solve_triangular(lower, columns[:, 0], lower=True)
             variance = max(float(change.sd**2 - gain @ gain), 0.0)
             gravity.append((change, float(gain @ innovations), float(np.sqrt(variance))))

@@ -162,7 +162,7 @@ class CellAccumulator:
     def finish(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # so that the next call does not join them again
+        self._sums = [sums]  # the joined array, for the next call
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)

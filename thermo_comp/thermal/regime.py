@@ -150,9 +150,7 @@ class RegimeDetector:
 
 
 class _Watch:
-    """
-    Change detection of a sensor; whether its rate is low, now and as predicted for half a lag.
-    """
+    """Change detection of a sensor, and whether its rate is low now and half a lag ahead."""
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
         self.change = ChangeDetector(
