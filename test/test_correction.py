@@ -420,7 +420,7 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
     # The correction must change by the regressors times the change of the parameters. The dynamic
-    # range has the lower upper end, the static range the higher lower end.
+    # range ends before the static range when warming, after it when cooling.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))

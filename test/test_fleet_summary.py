@@ -69,7 +69,7 @@ class TestOutliers:
     @pytest.mark.parametrize('n', [10, 40])
     def test_fleets_without_outliers_have_a_false_alarm_in_one_of_twenty(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
-        # At a false alarm rate of 0.05, 60 fleets give 3 alarms on average, 12 with p = 1 / 30000.
+        # At an alarm rate of 0.05, 60 fleets give 3 alarms on average, 12 or more with p < 1e-4.
         assert n_alarms < 12
 
     def test_a_small_fleet_has_no_outliers(self, rng):

@@ -69,7 +69,7 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # Only groups of lags and heat flows: half of the columns, half of the time.
+    # The groups of lags and heat flows have half of the columns, and take half of the time.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -77,7 +77,7 @@ def fitted(unit):
 @pytest.fixture(scope='module')
 def held_out(unit):
     stations = plan('held-out', 2)[:2]
-    # Two ramps up and two down with soaks; the last ramp does not return to the start.
+    # The program has two ramps up and two down, with soaks, and does not return to its start.
     whole = stations[0].program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
     stations = [replace(station, program=program) for station in stations]

@@ -31,8 +31,7 @@ def test_jump_along_gravity(rng, with_gyro):
     # The jump happens within one sample interval, which `find_jumps` locates.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # 250 samples (noise 3 mg) on each side determine a step to 2 * 3 mg * sqrt(2 / 250);
-    # tolerance: 4 sd.
+    # 250 samples with 3 mg on each side: sd of the step 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
     # 20 readings (noise 20 mK) on each side determine a jump to 2 * 0.02 * sqrt(2 / 20).

@@ -88,7 +88,7 @@ def test_a_part_between_board_and_case():
 
 
 def test_a_noisy_sensor_in_one_warm_up():
-    # WHY: with a spline of 60 nodes a time constant was twice the true one, the error 80 ug.
+    # WHY: with a spline of 60 nodes a time constant was twice the true value, the error 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)
     unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
@@ -159,7 +159,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
     bump = np.array([450.0, -400.0, 500.0])
     _, study = study_of('bump', bump=bump, bump_c=17.0)
-    # Only the groups that a fit of all groups chooses: a third of the time.
+    # The groups that a fit of all groups chooses take a third of its time.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The fit approximates a bell with an sd of 0.85 K by lines between knees every 0.5 K.

@@ -26,7 +26,7 @@ from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: Only the groups of the unit's physics: a third of the columns, half of the time.
+#: The groups of the unit's physics have a third of the columns, and take half of the time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
@@ -79,7 +79,7 @@ def test_population_is_the_mean_unit_and_its_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Prior variance: scatter of three units times 4/3, for their mean, plus their variance.
+    # The prior variance is 4/3 of the scatter of three units, plus their own variance.
     scatter = []
     for unit in siblings():
         variance = np.diag(unit.posterior.covariance())

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Other people's recordings through `fit`, with docs/real_data.md's figures; skipped if absent."""
+"""
+Fits of other people's recordings give the figures of docs/real_data.md.
+"""
 
 import re
 from contextlib import suppress
@@ -58,7 +60,7 @@ def test_handheld_units_agree_with_a_direct_solution(unit):
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = calibration.axes
-    # Fit and scipy weight positions slightly differently: less than the sd, 1 mg and 1e-3.
+    # Fit and scipy weight positions differently: results differ by less than 1 mg and 1e-3.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)

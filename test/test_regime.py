@@ -128,7 +128,7 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The slowest is 0.2 K/min in steps of 1 K behind a lag of 15 min: it needs two steps.
+        # The slowest ramp, 0.2 K/min behind a lag of 15 min, needs two steps of 1 K.
         assert each[-1][0] < 0.5 * end_s
 
 
@@ -255,7 +255,7 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The slower lag decides: the rate has halved a time of lag times ln 2 later.
+    # The slower lag decides: the rate halves in the time lag times ln 2.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures: legible without colour, with units, as the numbers behind them; pages in a browser."""
+"""Figures are legible without colour, with the right numbers; browsers show the pages."""
 
 import re
 import shutil

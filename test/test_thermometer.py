@@ -100,7 +100,7 @@ def test_claimed_variances_match_squared_errors(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min):
-    # Limits: 1.5 times the errors found (averaged noise); steps of 1 K give the rate to 10 %.
+    # The limits are 1.5 times measured errors; steps of 1 K give the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -278,7 +278,7 @@ def test_extrapolation_is_linear_then_held():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # After 5 s the value is held, with the change by a ramp of 0.01 K/s for another 55 s as sd.
+    # The value is held after 5 s; its sd is the change by 0.01 K/s in the other 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 

@@ -44,9 +44,7 @@ class OutputError(ThermoCompError):
 
 
 class FitError(ThermoCompError):
-    """
-    Data that do not suffice for the fit; the text names missing data and the advised recording.
-    """
+    """Data that do not suffice for the fit; the text names missing data and their recording."""
 
 
 class UndeterminedError(FitError):

@@ -116,8 +116,8 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the chosen model has two sets, or a similarly good model has: its left-out error is
-    within one standard error, its white noise below 80 % of the chosen model's on every axis.
+    Whether the chosen model, or one as good, has two sets: a model whose left-out error is within
+    one standard error, and its white noise below 80 % of the chosen model's on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

@@ -132,7 +132,7 @@ def informative_priors(
     # Candidates of an added uncorrelated variance, relative to each variance of the prior.
     tried = [(grown(*stated), share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Candidates of the sd of ageing: of the biases [g], its multiple for the scale factors.
+        # Candidates of ageing: sd of biases [g], and sd of scale factors / sd of biases.
         tried += [
             (grown(ageing * options.gravity, multiple * ageing), 0.0)
             for multiple in (0.3, 1.0)

@@ -239,7 +239,7 @@ def _table(
             whole['force'] = whole['mean']
         else:
             _correct(calibration, bag, whole)
-        # Drop partial sums with lost messages, or that the end of the bag has cut.
+        # Drop partial sums with lost messages, or cut by the end of the bag.
         few = _LEAST_FILLED * np.median(whole['count']) if len(whole) else 0.0
         whole['excess'][whole['count'] < few] = np.nan
         parts.append(_joined(whole.reshape(-1, per)))

@@ -22,10 +22,7 @@ NEVER_NS: Final = 1 << 62
 
 
 class ReadingQueue:
-    """
-    Waiting readings by stamp; at equal stamps the board's come first, as the others may decide the
-    regime.
-    """
+    """Waiting readings by stamp; at equal stamps the board's come before the deciding case's."""
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
