@@ -79,8 +79,8 @@ PARTS = {
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_claimed_variances_match_squared_errors(errors, sensor, part):
     # Ideally, the mean squared error equals the claimed variance. In soaks and ramps the claimed
-    # variance allows for changes that have not begun, and is a few times too large; at an onset or
-    # an end a change begins. The few errors of a coarse sensor scatter by a factor of 2.
+    # variance is a few times too large, as it allows for the onset or end of a ramp at any time.
+    # The few errors of a coarse sensor scatter by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]

@@ -173,7 +173,9 @@ class WaitLoop:
     def subscribe(
         self, message_type: Any, topic: str, qos: QoSProfile, *, wakes: bool = True
     ) -> RawSubscription:
-        """Subscribe in serialized form; the first that `wakes` ends a wait at once."""
+        """
+        Subscribe in serialized form; the first subscription that `wakes` ends a wait at once.
+        """
         # rclpy needs a callback for each subscription, but without an executor never calls it.
         create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)
         subscription = _opened(create, message_type, topic, qos)

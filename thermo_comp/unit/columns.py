@@ -55,7 +55,7 @@ BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
-# The names of groups and kinds, as the schema of the calibration file reads them.
+# Types of the names of groups and kinds: for type checkers, and for the file's schema.
 if TYPE_CHECKING:
     _Group: TypeAlias = str
     _Kind: TypeAlias = str
