@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .stillness import Cells
 
 # Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
-_TENTH, _EXTREME = -1.2816, 6.7
+_TENTH, _NEVER = -1.2816, 6.7
 # Ratio of the degrees of freedom to those of white noise, below which noise is coloured; smallest
 # number of degrees of freedom of a cell; number of iterations, and of values in a search.
 _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
@@ -39,7 +39,7 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
             white = min(rough[axis] / level[axis] * _quantile(n, _TENTH), 1.0)
             n = max(n_free * white / (2.0 - white), _FEWEST_FREE)
         if n < _COLOURED * n_free:
-            tails = [_quantile(k, _EXTREME) / _quantile(k, _TENTH) for k in (n, n_free)]
+            tails = [_quantile(k, _NEVER) / _quantile(k, _TENTH) for k in (n, n_free)]
             result[axis] = tails[0] / tails[1]
     return result
 
@@ -59,8 +59,8 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
         frees = np.geomspace(_FEWEST_FREE, n_free, _ITERATIONS) if n_free > _FEWEST_FREE else ()
         shares = [_quantile(n, _TENTH) / _quantile(n, 0.0) for n in frees]
         n = float(np.interp(tenth / max(median, 1e-300), shares, frees)) if shares else n_free
-        widest = _quantile(n, _EXTREME) / _quantile(n, 0.0)
-        usual = _quantile(n_free, _EXTREME) / _quantile(n_free, 0.0)
+        widest = _quantile(n, _NEVER) / _quantile(n, 0.0)
+        usual = _quantile(n_free, _NEVER) / _quantile(n_free, 0.0)
         floor = 0.25 * cells.quantum[axis] ** 2
         result[axis] = ratio * max(median * max(widest / usual, 1.0), floor)
     return result
