@@ -8,9 +8,9 @@ Measures verdict and forecasts of the drift watch against simulated units (`fiel
 Units of five kinds of attitudes age by random walks of known sd and write rests. The bound is a
 tolerance of 200 ug. For each unit 200 futures are drawn: its random walk goes on until the RMS of
 |f| - g over the attitudes of use, with the scatter of the starts, exceeds the bound. The figures
-are the share of futures within the printed 10 to 90 % interval, and the median time over the
-printed median. Then level and carried units, half of which do not age, are watched against their
-claim every five days; the figures are the share of the verdict "outside", by the true RMS.
+are the share of futures within the printed 10 to 90 % interval, and the median time divided by the
+printed median. Then the verdicts of level and carried units, half of which do not age, are taken
+every five days; the figures are the share of "outside", by classes of the true RMS.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
     """
     Compare forecast and recalibration interval of units with their futures.
 
-    Each row has the share of futures in the 10 to 90 % interval, their median, and the quantiles.
+    Each row has the share of futures in the forecast's 10 to 90 % interval, the median of the
+    futures, and the forecast's quantiles.
     """
     rng, process = np.random.default_rng(3), Process()
     found: dict[str, list[tuple[float, ...]]] = {'forecast': [], 'interval': []}
@@ -75,7 +76,7 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
 
 
 def verdicts(kind: str, n_units: int, days: int) -> None:
-    """Print how often the verdict is "outside", by the true RMS of |f| - g over the limit."""
+    """Print how often the verdict is "outside", by the true RMS of |f| - g / limit."""
     found = []
     for seed in range(2 * n_units):
         ageing = {'bias': 0.0, 'scale': 0.0} if seed % 2 else {}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the published uncertainty: the covariance of the fit, widened by what the data do not
-determine, and the lack of fit, the excess of the left-out errors over this covariance.
+Owns the published uncertainty: the covariance of the fit, widened by the parameters that the data
+do not determine, and the lack of fit, the excess of the left-out errors over this covariance.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. A fit's weight in the mixture is the evidence
@@ -47,8 +47,8 @@ _GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
 #: above, and falling to 0 below a hundredth of the scale, which few mountings reach.
 _LOG_DENSITY = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_GRID**2 / STUDENT_NU)
 _LOG_DENSITY += np.log(np.minimum(_GRID / 0.01, 1.0))
-#: Grid and log prior density about the sd of a prior calibration: a Student's density of the
-#: logarithm; its scale is a factor of 1.5, to which twelve positions determine an sd.
+#: Grid and log prior density relative to the sd of a prior calibration: a Student's density of the
+#: logarithm. Its scale is the factor of 1.5 to which twelve positions determine an sd.
 _KNOWN_GRID = 10.0 ** np.arange(-1.5, 1.51, 0.125)
 _KNOWN_LOG_DENSITY = (
     -0.5 * (STUDENT_NU + 1.0) * np.log1p(np.log(_KNOWN_GRID) ** 2 / np.log(1.5) ** 2 / STUDENT_NU)
@@ -86,8 +86,8 @@ def claim_of(
     `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
     `informative`: priors from one calibration, with different ageings since that calibration
     """
-    # The rests of one mounting have one offset, but the regression has one for each rest. The mean
-    # of k offsets with k times the variance has the variance of a single offset.
+    # All rests of a mounting share an offset, but the regression has an offset for each rest. The
+    # mean of k offsets with k times the variance has the variance of a single offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -122,7 +122,6 @@ def claim_of(
         layout, covariance = with_unseen.layout, with_unseen.covariance.copy()
         covariance[np.ix_(at, at)] += excess
     if gravity_sd and regression.gravity:
-        # An error of gravity is the same relative error of all three scale factors.
         along = np.zeros(len(covariance))
         along[layout.kappa] = posterior.state.kappa * gravity_sd / regression.gravity
         covariance = covariance + np.outer(along, along)
@@ -202,8 +201,8 @@ def _over_mountings(
         ]
 
     fits = solved(tried)
-    # A large mounting sd leaves the attitudes free to absorb errors of the model, so the drifts
-    # may increase the log evidence of an sd, over that of the mode, by at most `TRIAL_GAIN`.
+    # With a large mounting sd the attitudes absorb errors of the model: the log evidence relative
+    # to the mode may exceed that of the norms alone by at most `TRIAL_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -228,9 +227,9 @@ def _excess_over_priors(
     regression: Regression, posterior: Posterior, informative: Sequence[InformativePrior]
 ) -> Floats:
     """
-    Return by how much the covariance of the mixture of fits over the ageing since the prior
-    calibration exceeds that of the most probable ageing: a few rests do not show which constants
-    have aged.
+    Return the excess of two covariances: that of the mixture of fits over the ageing since the
+    prior calibration, less that of the fit of the most probable ageing. A few rests do not show
+    which constants have aged.
     """
     n = posterior.layout.n_unit
     if not informative:
@@ -257,8 +256,8 @@ def _turn_on_sd(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> float:
     """
-    Return the sd of the bias offset of a turn-on beside that of a mounting [m/s^2]; 0 if each
-    mounting has a turn-on of its own, whose offset that of the mounting contains.
+    Return the sd of the bias offset of a turn-on [m/s^2], in addition to the sd of a mounting; 0
+    if each mounting has a separate turn-on, whose offset is part of the mounting's offset.
 
     The norms show how well turn-ons repeat only if there are several; for a single turn-on the sd
     is that of the prior; `tried` and `log_density` as in `_over_mountings`.
@@ -304,8 +303,8 @@ def _norm_evidence(
     of_turn_ons: bool = False,
 ) -> Floats:
     """
-    Return the log evidence of the mean norms of the mountings, for each sd of the offsets of
-    mountings, or with `of_turn_ons` of the offsets that the mountings of a turn-on share, (k,).
+    Return the log evidence of the mean norms of the mountings for each of k values of `offset_sd`,
+    the sd of the offsets of mountings or, with `of_turn_ons`, of turn-ons.
 
     `by_drifts`: root of the covariance without the norms, for the thermal weights
     """
@@ -383,7 +382,7 @@ def drift_variance(
 def _points(
     temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
 ) -> tuple[LackOfFit, ...]:
-    """Average the excess of some windows in at most 5 bins of temperature, 10 windows or more."""
+    """Average the excess in at most 5 bins of temperature, each of 10 windows or more."""
     n_bins = min(5, int(rows.sum()) // 10)
     if not n_bins:
         return ()

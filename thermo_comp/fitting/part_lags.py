@@ -105,7 +105,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         if (square <= (shape.most_noise * noise) ** 2).all():
             if shape.has_stress:
                 return parts
-            # Curves alone explain the drift; in left-out sections they are extrapolated.
+            # Curves alone explain the drift, but extrapolate to left-out sections.
             return replace(parts, most_drift=10.0 * float(noise.mean()))
         # A larger residual has another cause, for example slow noise: the lags are then accepted
         # only if they reduce the RMS residual of each axis to an eighth or less of the residual
@@ -190,9 +190,8 @@ class _PartCurves:
         if self._square(best, axis) > enough:
             starts = [best]
             if self._has_case:
-                # The residual has a valley of several minima, along which this difference is
-                # constant: the time constant less the time by which the temperature between board
-                # and case leads the board.
+                # The residual has several minima in a valley, in which the time constant grows
+                # with the time by which the temperature between board and case leads the board.
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in starts):
