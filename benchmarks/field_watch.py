@@ -37,10 +37,10 @@ def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generat
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
     # The norm of `root @ (1, levels)` is the RMS over the probes.
     joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
-    root = np.linalg.qr(joined, mode='r')
+    root = np.asarray(np.linalg.qr(joined, mode='r'))
     for step in range(3 * 3650):
-        miss = root[:, 0] + levels @ root[:, 1:].T
-        is_out = (miss**2).sum(axis=1) + process.turn_on**2 > bound**2
+        residual = root[:, 0] + levels @ root[:, 1:].T
+        is_out = (residual**2).sum(axis=1) + process.turn_on**2 > bound**2
         error[is_out] = np.minimum(error[is_out], step / 3.0)
         if np.isfinite(error).all():
             break
