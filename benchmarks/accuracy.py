@@ -245,7 +245,9 @@ def part_kinds(options: argparse.Namespace) -> None:
 
 
 def part_plans(options: argparse.Namespace) -> None:
-    """Print the errors of short chamber tests, without a prior, and with one of ten siblings."""
+    """
+    Print the errors of short chamber tests, without a prior and with the prior of ten siblings.
+    """
     print('| test | unit | seed | floor | alone | with siblings | error / claimed sd, both |')
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):

@@ -5,8 +5,8 @@ Owns the measurement of reading: bag to columns, by this package, rosbags and mc
 
 All readers get the same counts and temperatures (400 Hz and 2 x 10 Hz) from the same files.
 `rosbags` reads and deserializes each message; `mcap` reads each message and does not decode it at
-all. Rates are counts messages per second of wall time, best of the repeats; only their ratios hold
-on other machines.
+all. Rates are messages with counts per second of wall time, the best of the repeats; only their
+ratios hold on other machines.
 
     python benchmarks/bag_read.py --samples 1000000
 """

@@ -16,7 +16,7 @@ import zstandard
 def damaged(
     make: Callable[[Path], Path], pattern: str, damage: Callable[[Path], object]
 ) -> Callable[[Path], Path]:
-    """Damage the one file of a bag."""
+    """Damage the only file of a bag."""
 
     def made(folder: Path) -> Path:
         bag = make(folder)

@@ -34,7 +34,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 # Groups of the fits by column heading: one curve for both regimes; two curves; all groups that the
-# evidence supports, as the node runs.
+# evidence supports, which is the fit for the node.
 MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 

@@ -29,7 +29,7 @@ def exact_unit(seed: int) -> UnitModel:
     Make a unit whose drift is only a quadratic of the board's temperature.
 
     The unit has no self-heating, so that its bags contain the reference state, in which no heat
-    flows. A bound on the constants at a state that was not visited would not be meaningful.
+    flows. A bound on constants at a state outside the bags would not be meaningful.
     """
     rng = np.random.default_rng(seed)
 
@@ -88,8 +88,7 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
     columns = []
     for j in range(len(start)):
-        # Steps of the derivatives: 1e-6 for direction and M, 1e-3 for bias and scale, less per
-        # power.
+        # Steps: 1e-6 for direction and M; 1e-3 for bias and scale, smaller for their powers of t.
         step = np.zeros(len(start))
         step[j] = 1e-6 if j >= 9 else 1e-3
         step[j] *= 1e-3 if j < 18 and j % 3 == 2 else 1e-1 if j < 18 and j % 3 == 1 else 1.0

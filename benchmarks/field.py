@@ -53,7 +53,7 @@ LABORATORY = calibration()
 
 
 def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, Floats]:
-    """Build rests in use without noise: rests, counts / K, board temperature [K], true forces."""
+    """Build noise-free rests in use: rests, counts / K, board temperature [K], true forces."""
     rng = np.random.default_rng(seed)
     force = G * np.array([attitude(kind, rng) for _ in range(N_PROBES)])
     warmth = rng.normal(0.0, 5.0, N_PROBES)
@@ -102,7 +102,7 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
 
 
 def filtered(history: History, process: Process, days: int) -> Floats:
-    """Return the state of the best filter by the first days, without the last turn-on."""
+    """Return the state of the best filter after the first days, without the last turn-on."""
     state = best(history, process, days).state.copy()
     state[21:] = 0.0
     return state
@@ -148,7 +148,7 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
     kalman = filtered(history, process, days)
     f = corrected(counts, warmth, kalman)
     of_best = np.column_stack((np.linalg.norm(f, axis=1) - G, f - force))
-    # The claimed sd is that of a window of another start a day later, so add turn-on, noise and a
+    # The claimed sd is that of a window a day later, after another start: add turn-on, noise and a
     # day's walk to the error.
     rng = np.random.default_rng([seed, 9])
     of_bias = np.hypot(process.turn_on, process.bias)

@@ -5,7 +5,7 @@ Owns updates on real recordings, for the benchmark `field.py`.
 
 None of the recordings spans days, so each is cut into sections: a fit of the first section
 replaces the calibration of a laboratory, and each further section counts as one start of the node.
-On each section, an update by all previous sections is compared with the fit of the first.
+On each section, an update by all previous sections is compared with the fit of the first section.
 """
 
 from __future__ import annotations

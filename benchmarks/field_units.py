@@ -44,7 +44,7 @@ DAY_ZERO = 20454  # 2026-01-01 in days since 1970
 SLOPE, SCALE_SLOPE = 30 * UG, 1e-5
 #: Sd of the calibration's error: bias, its slope per K, scale, its slope per K, misalignment.
 PRIOR = np.repeat([10 * UG, 0.3 * UG, 10e-6, 0.3e-6, 5e-6], 3)
-#: Window: white noise 60 ug/sqrt(Hz) over 10 s.
+#: Length of a window [s], and density of its white noise [m/s^2/sqrt(Hz)].
 WINDOW_S, NOISE = 10.0, 60 * UG
 KINDS = ('level', 'carried', 'fixed', 'up and down', 'faces')
 
@@ -117,19 +117,19 @@ def _parts(state: Floats, warmth: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def measured(force: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Return the counts [K] of a unit with deviations `state` under forces (n, 3)."""
+    """Return the samples [counts / `K`] of a unit with deviations `state` under forces (n, 3)."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray(np.linalg.solve(M, force.T).T * scale + bias)
 
 
 def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Correct counts [K] with a calibration file of deviations `state`."""
+    """Correct samples [counts / `K`] with a calibration file of deviations `state`."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray((counts - bias) / scale @ M.T)
 
 
 def attitude(kind: str, rng: np.random.Generator) -> Floats:
-    """Draw the direction of f: within 10 deg of the vertical, any, up, up or down, a face."""
+    """Draw a direction of f by `kind`: up within 10 deg, any, up, up or down, or a face."""
     if kind == 'carried':
         u = rng.standard_normal(3)
         return np.asarray(u / np.linalg.norm(u))
@@ -199,7 +199,7 @@ class BestFilter:
         self._now, self._is_shocked, self._start = 0.0, False, -1
 
     def take(self, now: float, start: int, counts: Floats, warmth: float, variance: float) -> None:
-        """Take the mean of a rest [K], `now` in days, the variance of its norm."""
+        """Take the mean [counts / `K`] of a rest, `now` in days, the variance of its norm."""
         process = self.process
         if start != self._start:
             elapsed, self._now, self._start = now - self._now, now, start

@@ -8,9 +8,9 @@ Measures verdict and forecasts of the drift watch against simulated units (`fiel
 Units of five kinds of attitudes age by random walks of known sd and write rests. The bound is a
 tolerance of 200 ug. For each unit 200 futures are drawn: its random walk goes on until the RMS of
 |f| - g over the attitudes of use, with the scatter of the starts, exceeds the bound. The figures
-are the share of futures within the printed 10 to 90 % interval, and the median time over the
-printed median. Then level and carried units, half of which do not age, are watched against their
-claim every five days; the figures are the share of the verdict "outside", by the true RMS.
+are the share of futures within the printed 10 to 90 % interval, and the median time divided by the
+printed median. Then the verdicts of level and carried units, half of which do not age, are taken
+every five days; the figures are the share of "outside", by classes of the true RMS.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generat
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
     # The norm of `root @ (1, levels)` is the RMS over the probes.
     joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
-    root = np.linalg.qr(joined, mode='r')
+    root = np.asarray(np.linalg.qr(joined, mode='r'))
     for step in range(3 * 3650):
-        miss = root[:, 0] + levels @ root[:, 1:].T
-        is_out = (miss**2).sum(axis=1) + process.turn_on**2 > bound**2
+        residual = root[:, 0] + levels @ root[:, 1:].T
+        is_out = (residual**2).sum(axis=1) + process.turn_on**2 > bound**2
         error[is_out] = np.minimum(error[is_out], step / 3.0)
         if np.isfinite(error).all():
             break
@@ -52,7 +52,8 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
     """
     Compare forecast and recalibration interval of units with their futures.
 
-    Each row has the share of futures in the 10 to 90 % interval, their median, and the quantiles.
+    Each row has the share of futures in the forecast's 10 to 90 % interval, the median of the
+    futures, and the forecast's quantiles.
     """
     rng, process = np.random.default_rng(3), Process()
     found: dict[str, list[tuple[float, ...]]] = {'forecast': [], 'interval': []}
@@ -75,7 +76,7 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
 
 
 def verdicts(kind: str, n_units: int, days: int) -> None:
-    """Print how often the verdict is "outside", by the true RMS of |f| - g over the limit."""
+    """Print how often the verdict is "outside", by the true RMS of |f| - g / limit."""
     found = []
     for seed in range(2 * n_units):
         ageing = {'bias': 0.0, 'scale': 0.0} if seed % 2 else {}

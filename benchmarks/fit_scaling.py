@@ -55,7 +55,7 @@ def measure(task: str, paths: list[Path]) -> dict[str, float]:
         [sys.executable, __file__, '--task', task, *map(str, paths)],
         check=False,
         capture_output=True,
-        lines=True,
+        text=True,
     )
     if done.returncode:
         # A process that the system has killed, e.g. for lack of memory, prints nothing.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Runs the live node in this process, without loss of messages, and records what it publishes.
+Runs the live node in this process, without loss of messages, and records its output.
 
 The demonstration, tests and benchmarks use this module. As in a bag written by `replay`, the log
 time of an Imu is its stamp, and the log time of any other output the newest Imu stamp before it.
@@ -74,7 +74,7 @@ class Recorder:
 
     def __init__(self, path: Path, ros_args: Sequence[str]) -> None:
         self._writer, self._ros_args = BagWriter(path, overwrite=path.exists()), ros_args
-        self._came: list[tuple[str, list[bytes]]] = []
+        self._received: list[tuple[str, list[bytes]]] = []
 
     def __enter__(self) -> Recorder:
         with ExitStack() as stack:
@@ -98,11 +98,11 @@ class Recorder:
             self._writer.abort()
             return
         with self._writer as writer:
-            imus = (_stamps(some) for name, some in self._came if name == IMU_OUT.name)
+            imus = (_stamps(some) for name, some in self._received if name == IMU_OUT.name)
             first_ns = next(imus, np.zeros(1, np.int64))[:1]
             for topic in OUTPUTS:
                 newest, times, messages = first_ns, [], []
-                for name, some in self._came:
+                for name, some in self._received:
                     newest = _stamps(some) if name == IMU_OUT.name else newest[-1:]
                     if name == topic.name:
                         times.append(newest if topic == IMU_OUT else newest.repeat(len(some)))
@@ -114,13 +114,13 @@ class Recorder:
         for name, subscription in self._heard.items():
             messages, *_ = subscription.drain()
             if messages:
-                self._came.append((name, messages))
+                self._received.append((name, messages))
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of messages received so far, by relative topic name."""
         counts = dict.fromkeys((topic.name for topic in OUTPUTS), 0)
-        for name, messages in self._came:
+        for name, messages in self._received:
             counts[name] += len(messages)
         return counts
 
@@ -143,7 +143,7 @@ def through_the_node(
     progress: Callable[[float], None] = lambda _: None,
 ) -> tuple[PlayReport, dict[str, int]]:
     """
-    Play a bag into the node and record what it publishes, without loss.
+    Play a bag into the node and record the output of the node, without loss.
 
     Returns the player's report and the number of recorded messages by topic. Differences to a
     robot: the QoS is reliable with unlimited depth, and the player waits for the node.

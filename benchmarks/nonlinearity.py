@@ -72,7 +72,7 @@ class Unit:
         )
 
     def read(self, force: Floats, board: Floats) -> Floats:
-        """Return what the axes read without noise, shape (n, 3) [m/s^2]."""
+        """Return the readings of the axes without noise, shape (n, 3) [m/s^2]."""
         t = (board - 20.0)[:, None]
         f = force @ np.linalg.inv(self.M).T / G
         bent = f + (1.0 + self.share * t) * (self.k2 * f**2 + self.k3 * f**3)

@@ -168,7 +168,7 @@ def _naive(arguments: argparse.Namespace) -> None:
 
 
 def _floor(arguments: argparse.Namespace) -> None:
-    """Copy the bytes of one subscription to a publisher around one wait set."""
+    """Copy the bytes of one subscription to a publisher, in a loop over a bare wait set."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.impl.implementation_singleton import rclpy_implementation

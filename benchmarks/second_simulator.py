@@ -153,7 +153,7 @@ def program_of(program: Program) -> tuple[Floats, Floats]:
 
 
 def states_of(unit: SimpleNamespace, air_c: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Integrate: case and board, shape (n, bags), pendulums and plays' sum, (n, bags, 3)."""
+    """Integrate case and board, (n, bags), pendulums and the sum of plays, (n, bags, 3)."""
     n, n_bags = air_c.shape
     air, heat = air_c[0].copy(), unit.own_heat_k
     case = air + 0.3 * heat
@@ -194,7 +194,7 @@ def runs_of(
     soaked_s: float = 5400.0,
     soaked_c: float | None = None,
 ) -> list[Any]:
-    """Record one program in some attitudes, shape (n, 3), a bag each, as `SimulatedRun` does."""
+    """Record a program in n attitudes, shape (n, 3), each as a run like `SimulatedRun`."""
     draw, n_bags = np.random.default_rng(seed), len(up)
     seconds, celsius = program_of(program)
     lasts_s = lasts_s or float(seconds[-1])
@@ -270,7 +270,7 @@ def plan_of(kind: str, seed: int, plan: str) -> tuple[list[Any], list[Any]]:
 
 
 def floor_of(tests: Sequence[Any]) -> tuple[float, float]:
-    """Return the noise in means of a minute, of |f| and of the vector [ug]."""
+    """Return the noise of one-minute means: of |f|, and of the vector [ug]."""
     means = [test.noise[: len(test.noise) // 60 * 60].reshape(-1, 60, 3).mean(1) for test in tests]
     norms = [
         mean @ test.truth.specific_force / STANDARD_GRAVITY

@@ -59,7 +59,7 @@ class Temperatures:
         dt = 1.0 / READINGS_HZ
         self.case += dt / CASE_LAG_S * (20.0 + RAMP_K_S * up - self.case)
         self.board += dt / BOARD_LAG_S * (self.case - self.board)
-        # Noise of a few mK, as constant thermometers are rejected.
+        # Noise of a few mK, as constant readings are rejected.
         ripple = 0.003 * ((int(seconds * READINGS_HZ) * 7) % 11 - 5) / 5.0
         return self.board + ripple, self.case - ripple
 

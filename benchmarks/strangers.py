@@ -12,7 +12,7 @@ Units and recordings come from `strangers_units.py` and `strangers_cases.py`, wh
 with the package; the package is used only through its fit and its correction of arrays. Every row
 is measured on recordings that were not fitted, unless the row states otherwise. Errors are RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
-is the RMS of error over claimed sd. Figures are RMS over the units. MISS marks a limit of
+is the RMS of error / claimed sd. Figures are RMS over the units. MISS marks a limit of
 `strangers_limits.py` that a row exceeds; the exit code is then 1. The baselines fitted by the
 package take most of the time; ``--baselines strangers.json`` reads them from an earlier run.
 """
@@ -140,8 +140,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # The offset of a new mounting is constant in a pose and cancels in its drift: subtract the
-        # smallest variance, that at the reference, where the curve over temperature adds nothing.
+        # The offset of a new mounting cancels in the drift of one pose: subtract the smallest
+        # variance, that at the reference temperature.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]
@@ -181,7 +181,7 @@ def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
     bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
-        # One pose does not determine the scale factors: take the norm of the samples over gravity.
+        # One pose does not determine the scale factors: take the norm of the samples / gravity.
         scale = rms(np.linalg.norm(bags[0].samples, axis=1)) / GRAVITY
         return {name: by_drift(bags, scale, order=order) for name, order in orders.items()}
     return {name: by_norm(bags, study.gravity, order=order) for name, order in orders.items()}
@@ -261,9 +261,9 @@ def run(
     Parameters
     ----------
     case, unit, study : str, int, Study
-        What is fitted.
-    done : dict of str to Calibration
-        Fits of this unit by study, for those that take one as a prior; the fit is added.
+        The fitted study.
+    done : dict of str to Calibration Fits of this unit by study, for studies with a prior; the new
+        fit is added.
     earlier : mapping of (str, int) to mapping of str to Score
         Scores of the baselines by title and unit, from an earlier run; others are computed.
 

@@ -84,7 +84,7 @@ def by_norm(
     """Fit constants, with curves of an order above 0, to ``|f| - g``; returns the correction."""
     samples = np.concatenate([bag.samples for bag in bags])
     board = np.concatenate([bag.board for bag in bags])
-    # Counts per g: the RMS length of the samples, refined by the scale factors below.
+    # Start with the RMS length of the samples as counts per g; the scale factors refine it.
     size = np.sqrt(np.mean(np.sum(samples**2, axis=1)))
 
     def missed(p: Floats, order: int) -> Floats:

@@ -24,11 +24,11 @@ class Score:
     norm, vector : float
         Error of ``|f| - g``, and length of the error vector (in one pose: drift per axis) [ug].
     norm_ratio, ratio : float
-        Error over claimed sd along the norm, and over the three axes.
+        Error / claimed sd along the norm, and of the three axes together.
     claim : float
         Claimed sd, of the same length as `vector` [ug].
     bound_ratio : float
-        Error of the bias over its Cramer-Rao bound.
+        Error of the bias / its Cramer-Rao bound.
 
     """
 
@@ -81,17 +81,17 @@ class Limit:
     norm, vector : float
         Largest errors [ug].
     best : float
-        Largest error over the smallest error of the baselines, both for norm and for vector.
+        Largest error / smallest error of the baselines, both for norm and for vector.
     low, high : float
         Smallest and largest ratio over all units.
     unit : float
         Largest ratio of one unit.
     claim : float
-        Largest claimed sd over error.
+        Largest claimed sd / error.
     than, times : str, float
         A row of the same case, and the largest error as a multiple of that row's error.
     bound_ratio : float
-        Largest error of the bias over its Cramer-Rao bound.
+        Largest error of the bias / its Cramer-Rao bound.
 
     """
 
@@ -183,7 +183,7 @@ def rms(values: Floats | Sequence[float]) -> float:
 
 
 def judged_ratio(score: Score) -> float:
-    """Return the limited ratio: that over three axes or, if no truth is known, of the norm."""
+    """Return the limited ratio: of three axes or, without a known truth, of the norm."""
     return score.norm_ratio if np.isnan(score.ratio) else score.ratio
 
 

@@ -82,7 +82,8 @@ response:                            # columns of both sets
 
 The parameters of the posterior are, for each axis x, y, z: first the bias in input units (level of
 the static set, free coefficients of its Fs, level of the dynamic set, free coefficients of its Fs,
-weights of the response in the order of the file); then the relative scale in the same order. The
+weights of the response in the order of the file); then the relative scale in the same order. A
+`nonlinearity` adds, for each axis, the coefficients of its terms, then their changes per kelvin. The
 last three parameters are `M[1][0]`, `M[2][0]` and `M[2][1]`. The covariance is
 `factor @ factor.T + diag(rest)`. The posterior of a `gyroscope` has the bias only, in rad/s and in the
 same order; the `gyroscope` uses the ranges, the reference temperature and the thermometers of the unit.
@@ -269,7 +270,10 @@ def calibration_page() -> str:
         'RateSet',
         'RateCurve',
         'RateTerm',
+        'Nonlinearity',
+        'NonlinearTerm',
         'Posterior',
+        'LackOfFit',
         'GroupEvidence',
         'DetectorSettings',
         'ThermometerSettings',

@@ -5,9 +5,9 @@ Runs the fuzz targets, guided by coverage, for a time or a number of inputs.
 
     python fuzz/run.py [calibration|mcap|cdr|parameters|db3|zstd|csv|parquet|all] [--seconds 60]
 
-Needs the extra `fuzz` (atheris). A target fails on an exception, on an input that takes 10 s, and
-beyond 1 GiB of memory; the input is then left as `crash-*` in the working folder. Inputs that
-reach new code are kept in `fuzz/corpus/`, which is not under version control.
+The targets need the extra `fuzz` (atheris). A target fails on an exception, on an input that takes
+10 s, and beyond 1 GiB of memory; the input is then left as `crash-*` in the working folder. Inputs
+that reach new code are kept in `fuzz/corpus/`, which is not under version control.
 """
 
 from __future__ import annotations

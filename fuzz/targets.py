@@ -83,7 +83,7 @@ def check_calibration(data: bytes) -> None:
     assert row is None or not value.needs_temperature
 
 
-#: Functions with the required keys only, as short inputs are tried more often.
+#: Functions have the required keys only, because the fuzzer tries short inputs more often.
 _FUNCTIONS = (
     '{bias_function: {kind: polynomial, coefficients: [0]}, '
     'scale_function: {kind: polynomial, coefficients: [1]}}'
@@ -104,10 +104,7 @@ noise_density_m_s2_sqrt_hz: [1, 1, 1]
 
 
 def check_mcap(data: bytes) -> None:
-    """
-    Read any bytes as a bag: an error is one line, the output not larger than the input can
-    contain.
-    """
+    """Read any bytes as a bag: an error is one line, the output is limited by the input's size."""
     with suppress(RecordingError):
         try:
             BAG.write_bytes(data)

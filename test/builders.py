@@ -157,7 +157,7 @@ def columns_from_events(events):
 
 
 def stream(compensator, events):
-    """Run events one by one (rates: sample / 1000); return rows and published indices."""
+    """Run events one by one, angular rates being 1/1000 of samples; return rows and indices."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:

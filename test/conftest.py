@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns what all tests share: a DDS domain per process, seeds, the command line's fixtures."""
+"""Owns the common parts of all tests: a DDS domain per process, seeds, fixtures of commands."""
 
 import fcntl
 import gc
@@ -25,7 +25,7 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# One BLAS thread: several wait for each other on a busy machine. numpy reads this at import.
+# Use one BLAS thread: several wait for each other on a busy machine. Set before numpy's import.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
@@ -72,7 +72,7 @@ def pytest_collection_finish():
 
 
 def ran(*command, check=False, **keys):
-    """Run a program in the folder of the project; return what it printed."""
+    """Run a program in the folder of the project; return its output."""
     words = [*map(str, command)]
     return subprocess.run(words, cwd=ROOT, check=check, capture_output=True, text=True, **keys)
 
@@ -180,7 +180,7 @@ def _as_a_process(cwd):
 
 @pytest.fixture(scope='session')
 def cli(program):
-    """Return a function that runs a command here, or with variables in a new process."""
+    """Return a function that runs a command in this process or, with variables, in another."""
     from thermo_comp.cli.app import run as run_command
 
     def run(*args, code=0, cwd=None, **env):
@@ -251,7 +251,7 @@ def once(tmp_path_factory):
         with (shared / f'.{name}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                # Remove what a failed attempt has left.
+                # Remove the files of a failed attempt.
                 shutil.rmtree(partial, ignore_errors=True)
                 partial.mkdir()
                 make(partial)

@@ -43,7 +43,7 @@ class Rest:
     warm: float = 35.0
     fall: float = 20.0
     pace_s: float = 200.0
-    quantum: float = 0.0  # of the board's readings [K]
+    quantum: float = 0.0  # step of the board's readings [K]
 
     def __post_init__(self):
         n = round(self.duration_s * self.rate_hz)

@@ -31,7 +31,7 @@ def rates_k_min(program):
 
 def rippled(program, seed=1, amplitude=0.1, period=300.0):
     """Return a program with the ripple of a chamber's control: a sine with a random-walk phase."""
-    # Twelve lines per period; sd of the phase after one period: half a radian.
+    # A period has twelve points, and changes the phase by an sd of half a radian.
     time = np.arange(0.0, program.duration_s, period / 12.0)
     rng = np.random.default_rng(seed)
     phase = rng.uniform(0.0, 2.0 * np.pi) + np.cumsum(

@@ -130,14 +130,14 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
     ('spoil', 'name', 'text'),
     [
         (late_by(120.0), 'unmeasured', '^2[0-9] % .* has no temperatures .* use the same clock'),
-        # WHY: readings that overlap the samples were asked whether they use the same clock.
+        # WHY: the message asked about the same clock, although readings overlapped the samples.
         (
             dropping_out,
             'unmeasured',
             r'^2\d % .* has no temperatures .* stick, or drop out\? bag\d: temperature/board '
             'reads nothing new for 20[01] s$',
         ),
-        # WHY: a soak before the first whole degree ended in `no temperatures ... the same clock?`.
+        # WHY: a soak before the first change of whole degrees ended in `... the same clock?`.
         (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
         (in_kelvins, 'kelvins', r'^temperature/board reads 2\d+\S* .. \d+\S* degC: that looks'),

@@ -41,7 +41,7 @@ def test_a_clock_topic_that_goes_back_or_pauses_changes_no_sample(peer, tmp_path
         driver = drive(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
-        # /clock starts, goes back an hour, stands for five checks, jumps ahead a year, and ends.
+        # /clock starts, goes back by an hour, is constant for five checks, jumps by a year, ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
         for n, now_ns in enumerate(times):

@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope='session')
 def bag(tmp_path_factory, cli):
-    # 15 minutes at 10 Hz, minus the 4 samples before the board's first reading at 0.5 s: 8996.
+    # 15 minutes at 10 Hz, less the 4 samples before the first board reading: 8996.
     path = tmp_path_factory.mktemp('cli') / 'bag'
     cli('simulate', '--profile', '20 4min, 30@2 6min', '--rate-hz', '10', '-o', path)
     return path

@@ -29,7 +29,7 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv('COLUMNS', '80')
     assert demo.main() == 0
     printed = capsys.readouterr().out
-    # As a program it finds what it imports.
+    # Run as a program, the demo finds its imports.
     script = ROOT / 'benchmarks' / 'demo.py'
     assert '--bags' in ran(sys.executable, script, '--help', check=True).stdout
     assert 'messages in 15407, messages out 15407' in printed
@@ -50,7 +50,7 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # One set leaves the regimes' difference, two sets leave lags; noise is below 10 ug.
+        # One set has errors by regimes, two sets errors by lags; noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

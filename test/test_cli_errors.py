@@ -176,7 +176,7 @@ class TestEvaluations:
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
         assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # A calibration without covariance: delta of +10 mg, constant biases of -10 mg.
+        # The calibration has no covariance, a delta of +10 mg and constant biases of -10 mg.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = Axes(*[AxisReference(300.0, -30.0)] * 3)

@@ -65,7 +65,7 @@ def test_gradient_even_about_rest_is_even_about_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
-    # Gradients: the value at rest (-0.5 K), and 1.5 K above and below it.
+    # Gradients: the value at rest, -0.5 K, and values 1.5 K above and below.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -134,7 +134,7 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     state = np.zeros((Layout(spec).width, 1))
     lag = Layout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # Each bend has derivatives by its quantity of the state and by the board temperature.
+    # A bend depends on its quantity of the thermal state and on the board temperature.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))

@@ -298,7 +298,7 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
 def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
-    # The compensator drops what is not finite even if the checks of the calibration missed it.
+    # The compensator drops output that is not finite, even if the calibration passed its checks.
     line = Correction.line
 
     def broken(self, start, end, slow, excess):

@@ -72,12 +72,12 @@ def test_a_table_is_unchanged_by_a_round_trip_through_a_bag(tmp_path):
     # The Imu marks the missing orientation by -1, and the unknown covariance of the rate by 0.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
-    # A temperature becomes a message when it changes: 4 times in the case, 10 in the board.
+    # Only changed temperatures become messages: 4 of the case, 10 of the board.
     case, board = block.temperatures['case'], block.temperatures['board']
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
     assert len(board.celsius) == report.messages['board'] == 10
-    # A reading comes before the sample of the same stamp, so that a node has it in time.
+    # A reading precedes the sample of the same stamp, so that the node applies it.
     assert case.after.tolist() == [0, 100, 200, 300]
     assert (report.rows, report.messages['accel']) == (400, 400)
     assert report.rate_hz == pytest.approx(100.0)
@@ -157,7 +157,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
 
 
 def test_readings_that_are_no_temperatures_are_left_out(tmp_path):
-    # WHY: with 46 readings of -127 degC (DS18B20 without contact) a fit left 0.68, not 0.02 mg.
+    # WHY: 46 readings of -127 degC (DS18B20 without contact) raised an error from 0.02 to 0.68 mg.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in (50, 51, 300):
@@ -192,7 +192,7 @@ def test_every_odd_row_is_accounted_for(tmp_path):
     # A clipped row and rows in wrong order stay in the bag, because the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
-    # The log time keeps the order of the file where stamps do not.
+    # Log times keep the order of the file, in which some stamps fall.
     assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 

@@ -211,19 +211,19 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
         # WHY: for other dates the message was that no row holds numbers in the stamp column.
         *(('date', [cell] * 900, f"column 'date' is a date of ISO 8601.*'{cell}'")
           for cell in ('29/03/2026 01:30:00', '01:30:00.5')),
-        # WHY: the message `column 'temp' is given twice` read as a mistake of the command line.
+        # WHY: the message `column 'temp' is given twice` suggested a wrong command line.
         ('t,temp', [f'{k / 10},20' for k in range(900)], r"log\.csv: 2 columns are called 'temp'"),
     ],
 )  # fmt: skip
 def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
-    # WHY: minutes were read as seconds, and the message about other times named a wrong cause.
+    # WHY: minutes were taken for seconds, and other times were refused with a wrong reason.
     path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
         table_log(path, guess_columns(path))
 
 
 def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
-    # WHY: blank last cells of most rows were not counted: the headings had a cell too many.
+    # WHY: with blank last cells in most rows the headings had a cell too many.
     path = slow_table(tmp_path / 'log.csv', 'time', [k / 100 for k in range(N)], last=31.99)
     head, *rows = path.read_text().splitlines()
     rows = [row if k % 100 == 0 else f'{row.rpartition(",")[0]},' for k, row in enumerate(rows)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections with all columns: same bits in blocks, axes independent, claimed sd = scatter."""
+"""Corrections with all columns: blocks give the same bits, and errors scatter as claimed."""
 
 import math
 from dataclasses import replace
@@ -105,7 +105,7 @@ def assert_same(blocks, rows):
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    # The run leaves 5 .. 35 degC and the tangents (-2.5 .. 42.5 degC): the curves are constant.
+    # The run leaves 5 .. 35 degC, and -2.5 .. 42.5 degC, where the tangents end.
     events = run_of(rng, seconds=50, swing_k=90.0)
     rows = stream(Compensator(unit, UNCHECKED), events)[0]
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
@@ -185,7 +185,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
             claimed = np.zeros((3, 3))
             claimed[np.triu_indices(3)] = covariance_at(coefficients, *force.tolist())
             claimed += np.triu(claimed, 1).T
-            # A covariance from n draws has an sd of at most sqrt(2 / n) times both sds: 4 sd.
+            # A covariance from n draws has an sd of sqrt(2 / n) times both sds; tolerance: 4 sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
             # The variances agree along all directions, so the axes have the right correlations.
@@ -275,7 +275,7 @@ def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within 10 s only the thermometer's part of the variance changes: 30 counts/K, some mK.
+        # Within 10 s only the variance by the thermometer changes: 30 counts/K times some mK.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0
@@ -332,7 +332,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # constant, y and y^2 of the element yy
+    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the element yy
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert excess.relative == pytest.approx(2.0)
@@ -353,7 +353,7 @@ def sd_at(unit, board, behind=0.0, force=0.0):
 
 
 def test_beyond_the_range_lagging_parts_do_not_lower_the_claimed_sd():
-    # Slopes of curve and lag cancel for an error of the thermometer, but not outside the range.
+    # For an error of the thermometer the slopes of curve and lag cancel inside the range only.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),
@@ -369,7 +369,7 @@ def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
     # The slope of the bias is 0.8 counts/K at the upper edge; a force of 10 m/s^2 cancels it.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # RMS change of the slope over 30 K: 0.02 * 30 / sqrt(12), slightly more with few temperatures.
+    # The RMS change of the slope over 30 K is 0.02 * 30 / sqrt(12), larger on a coarse grid.
     bends = 0.6 / math.sqrt(12.0)
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
@@ -409,7 +409,7 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside both ranges the sets differ as at the last temperature within both ranges.
+    # Outside both ranges the sets differ as at the last common temperature.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -419,8 +419,8 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
 
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # The correction must change by the regressors times the change of the parameters. The range of
-    # the dynamic set is the first to end above, the range of the static set the first below.
+    # The correction must change by the regressors times the change of the parameters. The dynamic
+    # range ends before the static range when warming, after it when cooling.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -463,7 +463,7 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
             line = correction.line(state, state, slow.at(state, nobody), 0.0)
             variances.append(line[list(VARIANCES), 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
-        # The claimed sd is at least the error of a curve that is constant from the edge on.
+        # The claimed sd covers the case that the true curve is constant beyond the edge.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The value of further directions, against closed forms and the scatter of estimates."""
+"""The benefit of further directions, against closed forms and the scatter of estimates."""
 
 import numpy as np
 import pytest
@@ -98,7 +98,7 @@ def test_the_proposed_directions_make_a_good_test():
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
         up = np.vstack([up, next_direction(covariance, SD, up)])
-    # Faces are proposed first, beginning with upright, then directions for the misalignment.
+    # Faces are proposed first, +z before all others, then directions for the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))

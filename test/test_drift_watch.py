@@ -56,23 +56,23 @@ def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
         for rows in field_watch.forecasts(kind, 4, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The interval is stated as 80 %; 32 rows, whose variances are uncertain, leave 5 % of error.
+    # The printed interval is 80 %; the estimate from 32 rows has an error of 5 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
-    # The median time of a single unit is uncertain by a factor of 1.5, so that of four by 1.3.
+    # The median time of a unit is uncertain by a factor of 1.5, the mean of four by 1.3.
     assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6
     assert 0.45 < min(ratios) < max(ratios) < 2.2
 
 
 @pytest.mark.parametrize('attitudes', [upright, in_any_attitude])
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
-    # The unit has 1.5 of the limit along gravity (RMS) from day 20 to 34, else 0.6 of the limit,
-    # with a turn-on of 5 ug, and is disturbed on day 12. The logs end on different days.
+    # The RMS error along gravity is 1.5 times the limit from day 20 to 34 and 0.6 times on other
+    # days, with turn-ons of 5 ug and a disturbance on day 12. The logs end on different days.
     unit = known()
     limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
 
     def error(day):
         size = 1.5 if 20.0 <= day < 34.0 else 0.6
-        # Each component has this size: so has the RMS along the vertical, and along any direction.
+        # Each component has the size of the RMS error along any direction.
         return np.full(3, limit * (20.0 if 12.0 <= day < 13.0 else size))
 
     series = series_of(rests(unit, attitudes, error, 40, turn_on=5.0 * MICRO_G), unit)
@@ -84,7 +84,7 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
             (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
         )
         assert ('outside its claim since' in str(result)) == (since is not None)
-        # In an attitude along the error a single day has 1.04 of the limit.
+        # A day in an attitude along the error has 1.04 times the limit.
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.back in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.back is not None)

@@ -163,7 +163,7 @@ def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
     if path.stem in FITTED | LACKS:
         finished = cli('fit', bag, *topics, '-o', fitted, '--gravity', str(GRAVITY))
         assert ('the bags have no thermometer' in finished.stdout) == (not has_board)
-        # The noise of a minute's mean is 4 ug; constants alone would leave 23 K of 1 mm/s^2 per K.
+        # Means of a minute have a noise of 4 ug; the raw drift is 23 K times 1 mm/s^2 per K.
         judged = parsed(cli('evaluate', bag, '-c', fitted, *topics, '--json', code=None).stdout)
         left = judged['sections_m_s2']['all']['rms'] / MICRO_G
         assert left < 10.0 if has_board else 500.0 < left < 2500.0

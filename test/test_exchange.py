@@ -189,7 +189,7 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic):
     assert any(
         re.search(r'scale over temperature is lost: up to 2[45]\d\d ppm', n) for n in plain.notes
     )
-    # A drift of the scale by 100 ppm/K changes the offset of z by 100 ppm/K of 9.81 m/s^2.
+    # With +g on z, a scale drift of 100 ppm/K is an offset drift of 100 ppm/K times 9.81 m/s^2.
     slope = [numbers(export.text, '\t')['TC_A0_X1_2'] for export in (plain, level)]
     assert slope[1] - slope[0] == pytest.approx(9.81e-4, rel=1e-5)
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
@@ -317,7 +317,7 @@ def test_the_formula_of_imu_tk_gives_the_same_correction(tumbled):
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # The note of the export gives the angles with six digits: errors of 1e-6 of 90 m/s^2.
+    # The printed angles have six digits: errors of 1e-6 times 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
@@ -388,7 +388,7 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
 
 
 def test_px4_rates_of_different_degree_keep_their_own_reference(cubic):
-    # WHY: an axis without a third power had fewer coefficients, and no array could be built.
+    # WHY: an axis without a third power had fewer coefficients than the others: a traceback.
     rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
     lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
     lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']

@@ -196,7 +196,7 @@ def test_the_assumed_repeatability_of_the_bias_is_said(rng):
         parts = np.array_split(positions(n, 3), n_bags)
         return {finding.name for finding in fit([turned(rng, p) for p in parts], options).findings}
 
-    # Nine norms are explained by nine constants, whatever the offsets of the mountings.
+    # Nine constants explain nine norms, for any offsets of the mountings.
     assert 'mountings' in names(9, OPTIONS)
     assert 'mountings' not in names(9, replace(OPTIONS, mounting_sd=1e-3))
     # Twelve positions show how well mountings repeat, but one recording has one turn-on.
@@ -205,7 +205,7 @@ def test_the_assumed_repeatability_of_the_bias_is_said(rng):
 
 
 def test_counts_of_32_bits_are_fitted(rng):
-    # WHY: a full scale above 1e7 counts was refused after the fit, as that of a scale factor of 1.
+    # WHY: a full scale above 1e7 counts was refused after the fit: the limits assumed K = 1.
     source = turned(rng, positions(9, 3))
     K = 2.0**31 / (12.0 * GRAVITY)
     options = FitOptions(gravity=GRAVITY, input='counts', full_scale=2.0**31)
@@ -215,7 +215,7 @@ def test_counts_of_32_bits_are_fitted(rng):
 
 
 def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
-    # WHY: the positions of one recording agree: the claimed sd of the bias was 1/6 of the error.
+    # WHY: positions of one recording have the same turn-on: the claimed sd was 1/6 of the error.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(18, 3)
     # The prior of a MEMS with a noise of 0.02 m/s^2 in a sample at 100 Hz, and a stated sd.
@@ -230,8 +230,29 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
     assert 2.5e-3 < fit(bags, OPTIONS).calibration.static.x.residual_sd_m_s2 < 1e-2
 
 
+def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
+    # WHY: each of three recordings has a temperature of its own; their turn-ons were claimed as an
+    # error of their mean alone, and those of mountings as independent: 1.6, 1.8 and 1.9 variances.
+    turn_on, ups, dwell = 5e-3, positions(9, 3), 600
+    bags = []
+    for celsius in (-15.0, 20.0, 55.0):
+        force = GRAVITY * np.repeat(ups, dwell, axis=0)
+        noise = 1e-3 * rng.standard_normal(force.shape)
+        samples = force + SLOPE * 1e-4 * celsius + turn_on * rng.standard_normal(3) + noise
+        time_s = 0.1 * np.arange(len(force))
+        board = celsius + 0.01 * rng.standard_normal(len(force))
+        bags.append(tc.Columns(time_s, samples, {'board': (time_s, board)}, name=str(celsius)))
+    unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
+    for bag in (bags[0], bags[2]):
+        out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
+        # The leverage of a line through three equidistant points is 5/6 at its ends; the next
+        # turn-on adds its variance.
+        variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
+        assert variance == pytest.approx((1.0 + 5.0 / 6.0) * turn_on**2, rel=0.05)
+
+
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: positions cut into rests, which agree, had 1/20 of the true sd of the offset.
+    # WHY: with positions cut into several rests, the sd of the offset was 1/20 of the true sd.
     whole, cut = (
         fit([turned(rng, np.repeat(positions(9, 3), n, axis=0))], OPTIONS) for n in (1, 5)
     )
@@ -278,7 +299,7 @@ def test_a_calibration_has_the_date_of_its_test(rng):
 
 
 def test_a_prior_tells_how_well_turn_ons_repeat(rng):
-    # WHY: six positions with a prior that states 8 ug claimed the 43 ug of a unit without prior.
+    # WHY: with a prior of 8 ug, the sd of mountings was 43 ug, as for a unit without a prior.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=2e-4)).calibration
     assert known.static.x.residual_sd_m_s2 == pytest.approx(2e-4)
     six = [turned(rng, positions(6, 4))]
@@ -292,7 +313,7 @@ def test_a_prior_tells_how_well_turn_ons_repeat(rng):
 
 
 def test_three_positions_do_not_show_which_constants_have_aged(rng):
-    # WHY: the change of a scale factor was taken for one of the bias: error / claimed sd was 2.4.
+    # WHY: a change of scale was attributed to the bias: error / claimed sd was 2.4.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=1e-5)).calibration
     scale, bias = 1.0 + 2e-3 * rng.standard_normal(3), 1e-2 * rng.standard_normal(3)
     corners = positions(60, 5)
@@ -307,12 +328,12 @@ def test_three_positions_do_not_show_which_constants_have_aged(rng):
         out = aged.correct(np.arange(1.0, len(reading) + 1.0), reading)
         variance = np.diagonal(out.covariance, axis1=1, axis2=2) - 0.02**2
         ratios.append((out.specific_force - GRAVITY * corners) ** 2 / variance)
-    # The six ages are common to all fits: their mean square has a relative sd of 60 %.
+    # All fits share six random changes, whose mean square has a relative sd of 60 %.
     assert np.mean(ratios) < 3.0
 
 
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng):
-    # WHY: misalignments of 20 mrad explained recordings of six faces whose biases differ by 1 mg.
+    # WHY: misalignments of 20 mrad explained a bias that differs by 1 mg between six faces.
     faces = np.vstack((np.eye(3), -np.eye(3)))
     bags = []
     for _ in range(3):
@@ -366,7 +387,7 @@ def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
     assert 'dropped' not in findings
     (block,) = source.blocks()
     stamps = block.accel_stamp_ns
-    # The clock is set back by a quarter of the recording after a half of the recording.
+    # After half of the recording the clock is set back by a quarter of the recording.
     n = len(stamps)
     stamps[n // 2 :] -= stamps[n // 4] - stamps[0]
     blocks = (replace(block, accel_stamp_ns=stamps),)
@@ -376,7 +397,7 @@ def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
 
 
 def test_short_rests_have_windows_enough_to_learn_the_noise_from(rng):
-    # WHY: one window per rest is fitted exactly by its attitude, and the estimated noise was 0.
+    # WHY: an attitude fits a rest of one window exactly, so the estimated noise was 0.
     calibration = fit([turned(rng, positions(12, 3), rest_s=5.0)], OPTIONS).calibration
     # The noise is 0.02 m/s^2 per sample at 100 Hz.
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)

@@ -39,7 +39,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Test every second parameter: as blocks have odd lengths, each kind is tested on some axis.
+    # Testing every second parameter tests each kind on some axis, as blocks have odd lengths.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
@@ -93,7 +93,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # The series sums the rests of a start at one time, which costs under a fifth of the sd.
+        # Merging the rests of a start causes an error below a fifth of the sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -143,10 +143,10 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
-    # In one attitude a shock and another gravity are the same.
+    # In one attitude a shock and another gravity cause the same residuals.
     assert [change.may_be_gravity for change in updated.changes] == [True]
     assert 'or another gravity' in ' '.join(change_texts(updated))
-    # Upright rests show a change of 300 ug in bias plus scale of z; turn-ons of 20 ug leave 15 ug.
+    # Upright rests determine the sum of bias and scale of z, 300 ug, to 15 ug (turn-ons of 20 ug).
     assert updated.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
     old_sd, new_sd = (
@@ -171,19 +171,19 @@ def test_a_jump_is_distinguished_from_ageing(rng):
 
 
 def test_the_present_sd_of_the_old_calibration_contains_its_ageing(rng):
-    # The bias walks by 60 ug per root day for 30 days: the sd of a bias grows to 329 ug.
+    # Random walk: 60 ug per root day times the root of 30 days is 329 ug.
     unit = known()
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).moved
-    # The sd of the biases is 10 ug, and that of the readings of z is that of bias plus scale.
+    # The sd of a bias is 10 ug; a reading of z also has the sd of the scale.
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
     # One attitude does not separate bias from scale, so up to half the variance goes to the scale.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The rests show the error of z, up to its turn-on of 20 ug.
+    # The rests determine the error of z to the turn-on of 20 ug.
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -197,14 +197,14 @@ def stepped(history, size, day):
 
 @pytest.mark.parametrize('day', [15, 0])
 def test_another_gravity_is_not_taken_for_three_scales(day):
-    # The unit walks by 15 ug and 10 ppm; gravity differs by 300 ug from day 15 or the first rest.
+    # Walks are 15 ug and 10 ppm; gravity differs by 300 ug from day 15, or from the first rest on.
     unit, size = field_units.calibration(), 300.0 * MICRO_G
     history = field_units.live('carried', 2, 30, field_units.Process())
     aged = update(series_of(history.rests, unit), unit)
     result = update(series_of(stepped(history, size, day), unit), unit)
     ((change, found, sd),) = result.solution.gravity
     assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
-    # From the first rest on, another gravity equals a common walk before it within 10 ppm.
+    # A step before the first rest cannot be distinguished from a walk of 10 ppm of all scales.
     assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
     for before, after in zip(aged.moved, result.moved, strict=True):
         assert after.scale == pytest.approx(before.scale, abs=30e-6)
@@ -232,7 +232,7 @@ def test_ageing_is_not_taken_for_another_gravity_or_unit(kind):
 
 @pytest.mark.parametrize('first', [0, 10])
 def test_samples_of_another_unit_are_refused(first):
-    # The other unit differs by percents in scale and milli-g in bias: in all rests, or in half.
+    # All rests, or half of them, are of a unit with other scale (percents) and bias (milli-g).
     unit = field_units.calibration()
     history = field_units.live('carried', 3, 20, field_units.Process())
     mixed = [
@@ -264,7 +264,7 @@ def test_a_changed_curve_is_detected_and_corrected():
 
 
 def test_the_slopes_over_temperature_age_by_a_fixed_walk():
-    # Level rests do not determine x: the sd of its curve is that of 1 ug/K per root year.
+    # Level rests do not determine x, so the sd of its curve grows by 1 ug/K per root year.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
@@ -349,7 +349,7 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     # The date of the new file is that of its last rest, not that of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # The new file removes the residual of the old file, and the history shows both residuals.
+    # The new file has no residual, the old file has one; the history shows both.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'
@@ -440,8 +440,8 @@ def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
 
 @pytest.mark.parametrize('lags', [0.0, 1.0])
 def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
-    # Three rests per start, from the first second on: walks of 15 and 10 ug per root day, 20 ug at
-    # a start, 3 ug of scatter, and lags of none or all of the assumed sd, which is 40 to 100 ug.
+    # Three rests per start, the first at once. Walks are 15 and 10 ug per root day, turn-ons 20
+    # ug, the scatter 3 ug; lags have none or all of the assumed sd, 40 to 100 ug.
     unit = rich_calibration()
     each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
     n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]

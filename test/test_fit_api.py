@@ -46,7 +46,7 @@ def left_by(groups):
 def test_a_knee_of_the_bias_is_found():
     unit, left = left_by(('curve', 'bend'))
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
-    # Trial knees are a kelvin apart: the fit uses the trial knees on either side of the true knee.
+    # Trial knees are 1 K apart: the fit uses the two around the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
     # The mean slope between two knees is wrong by at most 20 ug/K * 0.25 K in 1 of 22 kelvins.
     assert left < 1.5
@@ -104,7 +104,7 @@ def test_a_bag_of_another_environment_is_excluded_and_widens_the_claimed_sd():
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'took no part' in note
-        # In bag r4 the slope above the knee is 5 times 20 ug/K, over 11 K; half as much on z.
+        # In bag r4 the slope is 100 ug/K over 11 K above the knee, and half of this on z.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
     # One more bag of the same environment contradicts no other bag.

@@ -202,7 +202,7 @@ def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng)
         return fit(sources, FitOptions(**options))
 
     def force(counts):
-        # Like a compensator's output: in m/s^2, with noise that hides the steps of the counts.
+        # As in a compensator's output, noise in m/s^2 hides the steps of the counts.
         return ((counts - bias) / scale) @ M.T + 5e-4 * rng.standard_normal(counts.shape)
 
     raw = fit_of(lambda counts: counts)
@@ -307,7 +307,7 @@ def test_saturated_samples_are_refused(rng):
 
 
 def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
-    # Misalignments of some mrad explain the norms of nine positions, as would mountings of 5 mg.
+    # Misalignments of some mrad or mounting offsets of 5 mg explain the norms of nine positions.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     # The groups of the unit's physics, which halve the time.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refusals and advice of a fit, each with its number, on tables made to trigger them."""
+"""Refusals and advice of a fit, with the numbers in their texts, on tables made for each."""
 
 import re
 from dataclasses import replace
@@ -79,7 +79,7 @@ def test_a_complete_thermal_test_has_only_good_findings(good):
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'only heating was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
-        # WHY: soaks at one temperature left 800 ug at others, with a claimed sd of 100 ug.
+        # WHY: with soaks at one temperature alone the error was 800 ug, the claimed sd 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},
          r'% of the windows are static, over [56]\.\d of \d\d\.\d K'),
         ('swapped', lambda w: {'gradient': -w.gradient}, r'exchanged, or is the case thermometer'),
@@ -121,7 +121,7 @@ def test_rests_on_a_desk_with_a_prior_of_the_unit_need_no_chamber(good):
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
-    # The other units of a type do not show the effects of this unit.
+    # A prior of the type has no information about effects of this unit alone.
     of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
     assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}
 
@@ -192,7 +192,7 @@ def test_the_residual_of_the_fit_is_reported():
         # The temperatures are stamped an hour late, by another clock.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
-        # WHY: false advice for a span of 0.3 K, for noise, and for different turn-ons.
+        # WHY: noise, a span of 0.3 K, and different turn-ons each gave false advice.
         ((1.1, 1.0, 0.1, 1.0, 0.3), 'residual', '1.1 ug RMS raw'),
         ((85.0, 2.6, 50.0, 14.6, 8.6, 2.6, 2.6), 'residual', '2.6 ug in sample'),
         ((3689.0, 980.0, 1500.0, 1793.0, 30.0, 60.0, 40.0), 'misfit', 'mounted or switched on'),

@@ -101,7 +101,7 @@ def test_derivatives_of_nonlinear_terms_equal_differences(rng):
                 )
                 expected = (below - above) / 2e-6
                 derived = derivatives[p, axis, :, column]
-                # Rounding of 1e-14 divided by the step 1e-6, for forces up to 95 m/s^2.
+                # Tolerance: rounding of 1e-14 / step of 1e-6, times forces up to 95 m/s^2.
                 scale = np.abs(expected).max()
                 np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 

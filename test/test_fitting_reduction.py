@@ -71,7 +71,7 @@ def test_the_reduction_does_not_depend_on_the_blocks(rng):
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz a cell took half a minute and averaged several attitudes to 0.07 m/s^2.
+    # WHY: at 1 Hz a cell of half a minute averaged several attitudes: |f| was 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -79,7 +79,7 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     assert len(bag.intervals) >= 18
     for interval in bag.intervals:
         size = np.linalg.norm(interval.mean, axis=1)
-        # The noise is 5 ug per sample, in windows of ten samples and shorter ones at the end.
+        # The noise is 5 ug per sample, in windows of ten samples or, at the end, fewer samples.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
     # Without short rests the cells of slow samples stay half a minute long.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
@@ -159,7 +159,7 @@ def test_bad_samples_are_counted_and_left_out(rng):
 
 
 def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
-    # WHY: one reading of -127 degC in 60 counted as a noise of 14 K, and left 25 times the error.
+    # WHY: with one reading in 60 of -127 degC the noise was 14 K, the error 25 times as large.
     whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
@@ -228,7 +228,7 @@ def test_stamps_that_do_not_rise_are_left_out(rng):
 
 @pytest.mark.parametrize('n', [0, 1, 70])
 def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
-    # WHY: below 1 % of the samples, fit was silent about a clock that was set back; info was not.
+    # WHY: `fit` did not report a clock set back by less than 1 % of the samples; `info` did.
     whole = block(still(rng, 300.0, (0.0, 0.0, 3000.0)))
     cycle_ns = int(np.median(np.diff(whole.accel_stamp_ns)))
     # The first sample after the clock is set back by n cycles has the stamp of an earlier sample.
@@ -336,7 +336,7 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
     # Noise below a tenth of the quantum is invisible; a tenth is assumed.
     assert learned.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
-    # Means of a minute determine the onset through the lag to a third.
+    # From means of a minute the lag is estimated to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
     assert learned.fastest_ramp_k_min >= 1.0
 
@@ -360,7 +360,7 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
     readings = Readings(stamps(n, 1.0), celsius)
     bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
-    # The detector expects seven tenths of the ramp of 0.15 K/min.
+    # The smallest ramp of the detector is 0.7 times the ramp of 0.15 K/min.
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5
 

@@ -140,7 +140,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # Correlations of 0.999 lose three of the eight digits of the derivatives.
+        # With correlations of 0.999, three of the eight digits of the derivatives are lost.
         np.testing.assert_allclose(
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
@@ -175,8 +175,8 @@ def test_without_noise_the_regression_gives_the_truth(rng):
 
 
 def test_the_claimed_sd_of_the_regression_is_the_scatter_of_errors():
-    # With true priors (the inverse Hessian is the Cramer-Rao bound) errors / sd have an RMS of 1,
-    # determined by 36 units with 33 partly correlated numbers to 13 % or better.
+    # With true priors the inverse Hessian is the Cramer-Rao bound, and errors / sd have an RMS of
+    # 1. The RMS of 36 units with 33 correlated numbers scatters by at most 13 %.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []
@@ -340,7 +340,7 @@ def test_published_huygens_coefficients_come_back(rng):
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
-        # The fit's bias in counts, over the counts per g, is the published offset [g].
+        # The fitted bias / counts per g is the published offset [g].
         bias = K0 * polynomial.polyval(
             t[:40], np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         )
@@ -377,7 +377,6 @@ def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
     gain = max(gains) - posterior.log_evidence
     assert gain > 100.0
     assert inactive.gain(wide, asked) == pytest.approx(gain, rel=0.01)
-    # Exactly the columns that the data contain are chosen, one after the other.
     chosen = inactive.chosen(wide, asked, 4.0, 9)
     assert np.array(GROUPS)[chosen].tolist() == ['board'] * (np.array(GROUPS) == 'board').sum()
     assert inactive.chosen(wide, asked, 4.0, 1).sum() == 1

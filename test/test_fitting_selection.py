@@ -88,7 +88,7 @@ def test_columns_that_explain_nothing_are_not_chosen(calm):
 def test_tried_models_show_their_left_out_errors(calm):
     _, selected, truth = calm
     rms = {trial.groups: trial.score.rms for trial in selected.trials}
-    # Constants are tried before the curve; their error is the size of the missing effect.
+    # The first trial has constants alone; its error is the effect of temperature.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
@@ -158,7 +158,7 @@ def test_white_noise_is_not_taken_for_slow_noise(calm):
 
 def test_prior_sds_are_those_of_the_weights(calm):
     # At the fixed point sd^2 = sum of squared weights / effective parameters (here 3 per column);
-    # the hyperprior (sd of a factor of ten) shifts log sd by 1 / (2 x 3 x 5.3) of the distance.
+    # a hyperprior (sd: factor of ten) shifts log sd by 1 / (2 x 3 x 5.3) of the way to its centre.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -308,7 +308,7 @@ def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, up
 
 @pytest.mark.parametrize('offset', [0.0, 30.0])
 def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, offset):
-    # Siblings may differ by less or more than their sd: the evidence selects the true prior.
+    # The units may differ by less or more than their sd: the evidence selects the true prior.
     _, one, truth = calm
     state = one.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -378,7 +378,7 @@ def test_the_claimed_sd_is_larger_if_positions_do_not_determine_the_mounting():
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))
-    # Nine positions leave no degree of freedom: mounting offsets of tens of ug cannot be excluded.
+    # Nine positions have no redundancy: mounting offsets of tens of ug cannot be excluded.
     assert ratios[0] > 3.0 * ratios[1]
     assert 0.8 < ratios[1] < 1.5
 

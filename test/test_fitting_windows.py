@@ -108,7 +108,7 @@ def test_columns_of_the_fit_are_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # Lags follow estimates in the tracker, readings in the fit: plays reverse at other times.
+    # Plays reverse at other times: lags in the fit follow readings, not estimates.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -122,7 +122,7 @@ def test_columns_of_sets_and_start_states_by_hand(bags):
     np.testing.assert_allclose(data.columns[:, 1], t * t, atol=0.3)
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # The uncertainty of a lag's start decays with its time constant; in products t multiplies it.
+    # An initial lag state decays with the time constant of the lag; products multiply it by t.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
@@ -150,7 +150,7 @@ def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A silent thermometer is missing after the time-out of 60 s, 5 intervals, and a window.
+    # A silent thermometer is missing after 60 s (time-out), 5 intervals and a window.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -293,7 +293,7 @@ def test_sections_and_column_scales_in_kelvins_by_hand(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins` of a column is its RMS over its largest slope: 1 for t, 2 t for t^2.
+    # `kelvins` of a column: its RMS divided by its largest slope, 1 for t and 2 t for t^2.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

@@ -348,7 +348,7 @@ def with_stuck_bit(bit):
 
 
 def test_a_prior_does_not_repair_units_that_contradict_themselves(client, tmp_path):
-    # WHY: by the uncertainty of the prior, the errors of a stuck bit had become valid.
+    # WHY: with the larger uncertainty of a prior, a unit with a stuck bit was judged valid.
     kind = unit_preset('mems', 1)
     faults = {0: with_stuck_bit(7), 4: with_stuck_bit(10)}
     for number in range(5):
@@ -375,7 +375,7 @@ def test_a_prior_does_not_repair_units_that_contradict_themselves(client, tmp_pa
         ('no better than raw', 0, False),
         ('thermometers exchanged or loose: not judged', 1, False),
         ('thermometers exchanged or loose: not judged', 0, False),
-        # A refusal of contradictory data, and one for missing data.
+        # Refusals of contradictory data, and of missing data.
         ('refused', None, False),
         ('refused', 0, True),
         ('failed', None, False),

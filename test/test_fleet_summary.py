@@ -69,7 +69,7 @@ class TestOutliers:
     @pytest.mark.parametrize('n', [10, 40])
     def test_fleets_without_outliers_have_a_false_alarm_in_one_of_twenty(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
-        # 60 fleets with a false alarm rate of 0.05 give 3 alarms on average, and 12 once in 30000.
+        # At an alarm rate of 0.05, 60 fleets give 3 alarms on average, 12 or more with p < 1e-4.
         assert n_alarms < 12
 
     def test_a_small_fleet_has_no_outliers(self, rng):
@@ -83,7 +83,7 @@ class TestOutliers:
         assert (spread.sd, set(spread.z.tolist())) == (0.0, {0.0})
 
     def test_a_lag_of_the_board_is_compared(self, rng):
-        # WHY: a case thermometer off the case reads air: the board seemed to lead, unnoticed.
+        # WHY: a loose case thermometer reads the air, so that the board seemed to lead.
         rows = fleet_of(20, rng)
         rows[4] = {**rows[4], 'board_lag_s': -800.0}
         (outlier,) = summarise(rows).outliers
@@ -99,8 +99,8 @@ def spread_of(name, rows):
 
 class TestUndetermined:
     """
-    Units whose data do not determine a parameter state its prior with a large sd: such values say
-    nothing of the unit. WHY: M = -3950 urad with an sd of 9100 urad was ranked as -32 sd.
+    Values that a unit's data do not determine are those of the prior, with a large sd. WHY: M =
+    -3950 urad with an sd of 9100 urad was ranked as -32 sd.
     """
 
     @staticmethod

@@ -78,7 +78,6 @@ class TestRow:
         assert (row['problem'], row['left_out'], row['chosen']) == ('', '', '')
         assert (row['n_bags'], row['n_left_out'], row['n_positions']) == (6, 0, 6)
         calibration = parse_calibration(outcome.calibration.encode())
-        # The row's bias of x must equal the bias computed from the calibration file.
         x = calibration.axes.x
         bias = (x.bias + calibration.static.x.delta) / x.scale_factor
         assert row['bias_x_ug'] == pytest.approx(bias / 9.80665e-6)
@@ -136,14 +135,14 @@ class TestRow:
         assert row['chosen'] == '/imu/raw, its only Vector3Stamped, is taken for counts'
 
     def test_a_slope_that_the_positions_do_not_determine_has_no_sd(self, tmp_path):
-        # WHY: one position gives bias and scale together; the fit called all of it bias, +-0.06.
+        # WHY: a fit of one position gave bias plus scale as the bias, with an sd of 0.06.
         write_unit(tmp_path / 'u', 1, 1)
         row = processed(tmp_path).row
         assert [row[f'bias_slope_sd_{axis}_ug_k'] for axis in 'xyz'] == [None] * 3
         assert [row[f'scale_slope_sd_{axis}_ppm_k'] for axis in 'xyz'] == [None] * 3
 
     def test_the_lag_of_a_board_that_leads_is_negative(self, tmp_path):
-        # WHY: the file states the usual 900 s instead, which is no measurement of the unit.
+        # WHY: without a measured lag the file has the usual 900 s, not the unit's lag.
         write_unit(tmp_path / 'u', 1, 6, is_exchanged=True)
         allowed = replace(OPTIONS.fit, allow=('swapped',))
         outcome = processed(tmp_path, fit=allowed)

@@ -156,7 +156,7 @@ def test_the_predicted_sd_by_hand():
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     bias, scale = sd_of_states(unit, states)
-    # sqrt(4e-4 + 100 * 1e-6) counts at 300 counts per m/s^2, and a residual of 30 um/s^2.
+    # The variance is 4e-4 + 100 * 1e-6 counts^2, at 300 counts per m/s^2, plus (30 um/s^2)^2.
     expected = np.sqrt([4e-4, 5e-4]) / 300.0
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
@@ -175,7 +175,7 @@ def test_parameters_without_variance_give_no_sd():
 
 
 def test_in_a_soak_the_gradient_is_that_of_the_unit_s_own_heat():
-    # WHY: the certificate gave the bias without a gradient; with 3 K and 16 ug/K it was 50 ug off.
+    # WHY: the certificate omitted the gradient of a soak: with 3 K and 16 ug/K an error of 50 ug.
     unit = calibration(
         response=(
             term('gradient', (30.0, 0.0, 0.0), scale=(0.0, 2e-5, 0.0)),
@@ -185,8 +185,8 @@ def test_in_a_soak_the_gradient_is_that_of_the_unit_s_own_heat():
         soak_gradient_k=(-3.0, 0.2),
     )
     bias, bias_sd, scale, scale_sd = in_a_soak(unit)
-    # In a soak the lag of the gradient equals the gradient; the part with half the gradient lags
-    # the board by minus half the gradient.
+    # In a soak the lag of the gradient equals the gradient. A part halfway between board and case
+    # lags the board by minus half the gradient.
     by_kelvin = np.array([30.0, 60.0, -45.0]) / 300.0
     assert bias == pytest.approx(-3.0 * by_kelvin)
     assert bias_sd == pytest.approx(0.2 * np.abs(by_kelvin))
@@ -213,7 +213,7 @@ def test_ramp_states_equal_those_of_the_stepped_memory(rate):
         if isinstance(quantity, Gradient):
             assert state[place] == pytest.approx(100.0 * rate)
         elif isinstance(quantity, Lag):
-            # In the memory the gradient rises within the first of 900 s, in `ramp_states` at once.
+            # In the memory the gradient rises within the first second, in `ramp_states` at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
             # A play on the lag would reach its end only after half an hour.

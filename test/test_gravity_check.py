@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The gravity check: a good calibration passes, an aged one is reported, motion is ignored."""
+"""The gravity check passes good calibrations, reports aged calibrations, ignores motion."""
 
 import math
 
@@ -72,7 +72,7 @@ def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
 @pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
 @pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
 def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, offset):
-    # WHY: the refusal took five seconds, and the message averaged over the time before the change.
+    # WHY: the refusal took five seconds, and the printed mean included the time before the change.
     after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
     assert after_s < 1.0
     # A refusal needs at least two samples.
@@ -80,7 +80,7 @@ def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, of
 
 
 def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
-    # Not refused at once: a lift, accelerating over 0.8 s, and a car that starts and shakes.
+    # A lift that accelerates over 0.8 s, and a shaking car, are not refused at once.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 

@@ -69,7 +69,7 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # Only groups of lags and heat flows: half of the columns, half of the time.
+    # The groups of lags and heat flows have half of the columns, and take half of the time.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -77,7 +77,7 @@ def fitted(unit):
 @pytest.fixture(scope='module')
 def held_out(unit):
     stations = plan('held-out', 2)[:2]
-    # Two ramps up and two down with soaks; the last ramp does not return to the start.
+    # The program has two ramps up and two down, with soaks, and does not return to its start.
     whole = stations[0].program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
     stations = [replace(station, program=program) for station in stations]
@@ -99,7 +99,7 @@ def test_the_residual_of_a_mems_gyroscope_is_its_noise(unit, fitted, held_out):
         assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
         assert rms(changes) < 1.15 * FLOOR
         assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-        # The mean rate (turn-on, Earth's rate) is within 3 sd of claim and Earth's rate together.
+        # The mean rate is within 3 sd, with the variances of the claim and of the Earth's rate.
         message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
         claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
         assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
@@ -172,7 +172,7 @@ def test_the_round_trip_of_a_gyroscope_is_exact():
     np.testing.assert_array_equal(scale, 1.0)
     sd_bias, sd_scale = sd_of_states(triad, states[1:2])
     np.testing.assert_array_equal(sd_scale, 0.0)
-    # At the reference temperature the bias is the level, its variance that of level plus turn-on.
+    # At the reference temperature the bias is the level, with the variance of level and turn-on.
     np.testing.assert_allclose(bias[1], (0.02 + 1e-5, -0.03, 0.01 + 1e-5))
     np.testing.assert_allclose(
         sd_bias[0], np.hypot((1e-5, 2e-5, 1e-5), np.sqrt(1.01e-10)), rtol=1e-5

@@ -101,7 +101,7 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 class TestWindows:
     @pytest.mark.parametrize('reading_s', [30, 50])
     def test_a_slow_thermometer_leaves_all_windows(self, tmp_path, reading_s):
-        # WHY: at 2 Hz, sums of 20 s without a temperature in 15 s were dropped as leaps of time.
+        # WHY: at 2 Hz, partial sums of 20 s between slow readings were dropped as leaps of time.
         bag = resting(tmp_path / 'bag', 30.0, minutes=30.0, rate_hz=2.0, reading_s=reading_s)
         windows = judged(bag, corrected_by(SLOPE)).windows
         assert len(windows) >= 28
@@ -133,13 +133,13 @@ class TestWindows:
         for start_ns, mean in zip(windows.start_ns, windows.force, strict=True):
             inside = (stamps >= start_ns) & (stamps < start_ns + 60 * 10**9)
             assert inside.sum() == 600
-            # A window is corrected along lines of 10 s, accurate to a thousandth of a micro-g.
+            # Corrections linear in time over 10 s are accurate to a thousandth of a micro-g.
             np.testing.assert_allclose(mean, force[inside].mean(axis=0), atol=1e-8)
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
     def test_windows_at_rest_have_the_stated_length(self, tmp_path, rate_hz, window_s):
-        # WHY: cells of 32 samples at 4 Hz are 8 s long, so windows of "ten seconds" had sixteen.
+        # WHY: at 4 Hz cells of 32 samples last 8 s, so windows of ten seconds lasted 16 s.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
@@ -254,7 +254,7 @@ class TestVerdict:
         assert '100 ug tolerated' in judgement.reason
 
     def test_the_headline_for_bags_of_the_fit_is_the_left_out_error(self):
-        # WHY: a fit left 59 ug in sample, 61 ug held out in its attitudes, 1091 ug in a new one.
+        # WHY: the error was 61 ug in the attitudes of the fit, 1091 ug in a new attitude.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -265,7 +265,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # Claims refer to the error in sample, tolerances to the error of left-out positions.
+        # A claim refers to the error in sample, a tolerance to that of left-out positions.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -328,7 +328,7 @@ class TestVerdict:
         _, upper = CLAIMING.static.temperature_range_c
         judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert judgement.kind is Verdict.OUTSIDE
-        # WHY: for windows outside the calibrated rates the message named only temperatures.
+        # WHY: the message named only temperatures for windows outside the calibrated rates.
         assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
         # A soak 0.01 K beyond the range counts as inside: the thermometer's noise may cause this.

@@ -107,7 +107,7 @@ def folder(tmp_path_factory):
 @pytest.mark.usefixtures('no_figures')
 @pytest.mark.parametrize('options', [(), ('--tolerance', '1ug', '--window', '120')])
 def test_evaluate_and_report_give_equal_verdicts(cli, folder, options):
-    # WHY: for one bag and calibration one command said "re-calibrate", another "holds".
+    # WHY: two commands printed contradictory verdicts on one bag and calibration.
     page = folder / f'page{len(options)}.html'
     given = (folder / 'held_out.mcap', '-c', folder / 'unit.yaml', *options, '--json')
     printed = cli('evaluate', *given, code=None)

@@ -31,7 +31,7 @@ def test_jump_along_gravity(rng, with_gyro):
     # The jump happens within one sample interval, which `find_jumps` locates.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # 250 samples (noise 3 mg) on each side determine a step to 2 * 3 mg * sqrt(2 / 250); 4 sd.
+    # 250 samples with 3 mg on each side: sd of the step 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
     # 20 readings (noise 20 mK) on each side determine a jump to 2 * 0.02 * sqrt(2 / 20).
@@ -41,7 +41,7 @@ def test_jump_along_gravity(rng, with_gyro):
 
 @pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
 def test_jump_in_a_slow_log(rng, rate_hz):
-    # WHY: the gap between the rests beside a jump is some 200 samples long, 80 s at 2 Hz.
+    # WHY: at 2 Hz the gap between the rests around a jump, some 200 samples, is 80 s.
     rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
     source = rest.source()
@@ -114,7 +114,7 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
 def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
-    # WHY: filtered samples of phones counted as independent: a rest was cut into 8 .. 37 rests.
+    # WHY: low-pass filtered samples counted as independent: one rest became 8 to 37 rests.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
     bag = reduce_source(rest.source(), full_scale=None)
@@ -126,7 +126,7 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
 def test_a_jump_in_noise_behind_a_low_pass_is_found(rng, tau_s, sd):
-    # WHY: coloured noise of 3 mg remains in means over 10 s: jumps of 20 mg were missed.
+    # WHY: means over 10 s keep coloured noise of 3 mg, so jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)

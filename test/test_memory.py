@@ -126,10 +126,10 @@ def test_the_lag_of_a_part_between_board_and_sensor(rng):
     np.testing.assert_allclose(board - streamed[:, 0], part, atol=1e-5)
     on_grid = memory_on_grid(spec, 30.0, board, [case - board])
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
-    # An error of the case's lag moves the part in the opposite direction.
+    # The lag of the case has a negative share in the lag of the part.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # The unknown initial state of a part of two inputs begins with the later first value.
+    # A lag of two inputs starts at the later of their first values.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)

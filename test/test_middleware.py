@@ -115,13 +115,13 @@ def wakes_per_sample(peer, drivers, node_arguments):
 
 
 def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, monkeypatch):
-    # By the user's profile Fast DDS has a timed event with each sample, or group of samples.
+    # With the user's profile each sample or group of samples causes a timed event.
     other = tmp_path / 'other.xml'
     other.write_text(OTHER)
     monkeypatch.setenv(VARIABLE, str(other))
     drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's profile events are due 50 times a second, samples 700 times.
+    # With the node's profile there are 50 timed events per second, for 700 samples.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 

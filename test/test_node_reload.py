@@ -250,7 +250,7 @@ def test_a_calibration_that_cannot_be_applied_changes_nothing(peer, tmp_path):
 
 
 def test_a_calibration_of_another_unit_is_named(peer, tmp_path, capfd):
-    # WHY: it was used without a word, with errors of 890 claimed sd.
+    # WHY: a file of another unit was used without a warning, with errors of 890 claimed sd.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
     one = of_bias(1.0).unit

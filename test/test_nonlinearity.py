@@ -155,7 +155,6 @@ def test_a_file_keeps_nonlinear_terms_and_refuses_impossible_terms():
 
 
 def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
-    # The expected derivatives are differences of two evaluations.
     unit = with_covariance(calibration(nonlinearity=BENT), np.random.default_rng(1))
     logged = rests(unit, in_any_attitude, lambda _days: np.zeros(3), days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)

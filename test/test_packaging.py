@@ -108,7 +108,7 @@ def test_hosted_ci_installs_as_the_readme_describes():
 
 
 def test_the_installed_share_folder_holds_the_files_of_ros(tmp_path):
-    # As by colcon: setup.py's install command into a prefix; only data files are tested.
+    # Run setup.py's install command into a prefix, as colcon does; only data files are tested.
     words = (*('build', '--build-base', tmp_path / 'build'), 'install_data', '--install-dir')
     environment = {**os.environ, 'PYTHONWARNINGS': 'ignore'}
     command = (sys.executable, 'setup.py', '-q', *words, tmp_path / 'prefix')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A part of a bag gives the same as a bag of that part, in every test."""
+"""A part of a bag gives the same results as a bag of that part, in every test."""
 
 import re
 from dataclasses import replace

@@ -68,7 +68,7 @@ def judged(calibration, study):
 
 def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
     unit, study, calibration = parts
-    # 1 % of a time constant is 1 ug (10 ug/K, lag of 10 K), twice the noise of a minute.
+    # An error of 1 % of a time constant is 1 ug (10 ug/K, lag of 10 K).
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # 0.65 ug is the noise of a mean of a minute.
     assert judged(calibration, study).norm < 2.0
@@ -88,7 +88,7 @@ def test_a_part_between_board_and_case():
 
 
 def test_a_noisy_sensor_in_one_warm_up():
-    # WHY: a spline of 60 nodes gave twice the time constant of an axis, and left 80 ug.
+    # WHY: with a spline of 60 nodes a time constant was twice the true value, the error 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)
     unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
@@ -100,7 +100,7 @@ def test_a_noisy_sensor_in_one_warm_up():
 
 
 def test_bags_of_one_warm_up_predict_another():
-    # In the thaw of all bags the lags are a function of the board's temperature.
+    # All bags have the same thaw, so the lags are functions of the board temperature.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
     rng = rng_of('thaw')
     unit = navigation(rng, part_s=PARTS_S / 4.0)
@@ -147,8 +147,8 @@ def test_a_unit_without_lags_gets_none():
 
 
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
-    # WHY: a time constant absorbed a part of the effect of the gradient (223 s instead of 163 s),
-    # and the columns that balanced this failed in a soak: error 167 ug, claimed sd 15 ug.
+    # WHY: a time constant of 223 s instead of 163 s absorbed an effect of the gradient, which
+    # failed in a soak: the error was 167 ug, the claimed sd 15 ug.
     (study,) = gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
@@ -159,7 +159,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
     bump = np.array([450.0, -400.0, 500.0])
     _, study = study_of('bump', bump=bump, bump_c=17.0)
-    # The groups that the fit chooses from all groups, which takes three times as long.
+    # The groups that a fit of all groups chooses take a third of its time.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The fit approximates a bell with an sd of 0.85 K by lines between knees every 0.5 K.
@@ -206,7 +206,7 @@ def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
     score = judged(strangers.fitted(study), study)
     means = [minutes(bag) for bag in held]
     forces = [strangers.scipy_baselines(study)['constants'](mean) for mean in means]
-    # A part of the error remains, because soaks do not show the lags of the held-out ramps.
+    # A part of the error remains, because soaks do not determine the lags in held-out ramps.
     assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
@@ -221,7 +221,7 @@ def test_six_faces_in_three_soaks(given):
     bags = positions(unit, SOAKS, faces, rng, rate_hz=10.0)
     held = positions(unit, program(19.0, 90.0), spread(2, rng), rng, rate_hz=10.0)
     study = Study('', bags, one_test(held), {'full_scale': 32767.0, **given})
-    # The noise of a mean of 25 min is 4 ug, and quanta of 0.5 mg leave some ten times as much.
+    # Means of 25 min have a noise of 4 ug; quanta of 0.5 mg add errors of some 40 ug.
     assert judged(strangers.fitted(study), study).vector < 100.0
 
 
@@ -236,7 +236,7 @@ def test_a_curve_between_two_soaks_is_claimed():
 
 
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
-    # WHY: if each axis was vertical at a different temperature, the error was 15 claimed sd.
+    # WHY: with each axis vertical at a different temperature the error was 15 claimed sd.
     rng = rng_of('confounded soaks')
     unit = navigation(rng)
     faces = np.vstack((np.eye(3), -np.eye(3), np.eye(3)))
@@ -247,7 +247,7 @@ def test_a_curve_that_the_soaks_do_not_show_is_claimed():
 
 
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
-    # WHY: the score of left-out soaks, which show no lags, rejected the columns of the ramps.
+    # WHY: left-out soaks do not contain lags, so their score rejected the columns of lags.
     rng = rng_of('soaks and a ramp')
     unit = navigation(rng)
     ramps = positions(unit, HALF, spread(1, rng), rng)
@@ -262,7 +262,7 @@ def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
 
 @pytest.mark.parametrize('case', [soaks, third_node])
 def test_without_parts_or_ramps_the_fit_has_a_bank_of_lags(case):
-    # Soaks do not determine a time constant; with a third node no axis is a curve of one part.
+    # Soaks determine no time constant; a hidden node makes no axis a curve of one part.
     study = next(case(0))
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]))
     assert {term.tau_s for term in calibration.response if term.kind == 'board'} <= {*FINE_TAUS}
@@ -282,7 +282,7 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     (bags,) = study.tests.values()
     for bag in bags:
         off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
-        # The units' lags, 10 K at 20 ug/K, differ by up to 7 % from their mean.
+        # Lags of 10 K at 20 ug/K, 200 ug, differ by up to 7 % between the units.
         assert np.sqrt(np.mean(off**2)) < 5.0 * UG
 
 

@@ -56,7 +56,7 @@ def test_the_first_reading_of_a_sensor_may_be_wrong():
 @pytest.mark.parametrize('wrong', [85.0, 24.2, -40.0])
 @pytest.mark.parametrize('sensor', ['board', 'case'])
 def test_a_wrong_first_reading_leaves_no_trace(sensor, wrong):
-    # WHY: one reading of 85 degC after power-up cost 1 mg for 20 min.
+    # WHY: one reading of 85 degC after power-up caused errors of 1 mg for 20 min.
     memory = MemorySpec(lags=(('board', 900.0), ('case', 600.0)))
     tracker, without = tracker_of(memory=memory), tracker_of(memory=memory)
     for second in range(0, 900, 5):
@@ -77,7 +77,7 @@ def test_a_wrong_first_reading_leaves_no_trace(sensor, wrong):
 def test_a_ramp_or_a_step_of_the_air_at_the_start_is_no_wrong_reading(lag_s):
     tracker = tracker_of(memory=LAG)
     for second in range(0, 60, 5):
-        # A ramp of 12 K/min, and the answer to a step of 40 K with a lag of 300 s.
+        # A ramp of 12 K/min, or the response to a step of 40 K behind a lag of 300 s.
         changed = 40.0 * (1.0 - math.exp(-second / lag_s)) if lag_s else 0.2 * second
         tracker.read('board', second * SECOND_NS, 20.0 + changed)
     assert tracker.memory.board.start_ns == 0
@@ -111,7 +111,7 @@ def test_a_frozen_sensor_is_found_by_changes_of_the_second_sensor(sensor, frozen
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # A frozen board is wrong by some quanta + 1 K, a frozen case by the board's lag of 10 K.
+    # A frozen board is wrong by some quanta and 1 K, a frozen case by up to 10 K.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
@@ -126,7 +126,6 @@ def test_a_ramp_does_not_end_because_a_sensor_stands_still():
     tracker = tracker_of()
     soak(tracker, seconds=1500)
     for second in range(1500, 2500):
-        # Both readings freeze in the middle of a ramp.
         flicker = 0.004 * (-1) ** second
         ramp = min(second, 1900) - 1500
         tracker.read('board', second * SECOND_NS, 20.0 + ramp / 90.0 + flicker * (ramp < 400))
@@ -200,7 +199,7 @@ def test_swapped_topics_are_reported(preset, sensor):
 def test_a_unit_that_was_switched_on_heats_itself_and_is_not_swapped():
     # WHY: every start in the field looks like a ramp in which the board leads; it was taken for
     # exchanged topics, with a claimed sd twenty times too large for the whole run. WHAT: a warm-up
-    # by 4 K in 20 min, a third of it in the case, and then a ramp in which the case leads.
+    # by 4 K, by a third of this in the case, then a ramp with the case in the lead.
     tracker = tracker_of(memory=LAG)
     for second in range(3 * 3600):
         warm = 4.0 * (1.0 - math.exp(-second / 500.0))

@@ -112,7 +112,7 @@ print(digest.hexdigest())
 
 
 def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng):
-    # More messages than the middleware holds (5000), faster than an rclpy callback takes them.
+    # The bag has more messages than the middleware holds (5000), too fast for rclpy's callback.
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')
@@ -124,7 +124,7 @@ def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng
             report = play(tmp_path / 'bag.mcap', rate=0.0, wait_s=TIMEOUT)
             printed, _ = listener.communicate(timeout=2 * TIMEOUT)
         finally:
-            # Without this, a listener that waits for messages would block the end of the test.
+            # A listener that still waits for messages would block the end of the test.
             listener.kill()
     assert report.n_messages == {'/accel/counts': 7000}
     expected = hashlib.sha256(b''.join(messages_of(tmp_path / 'bag.mcap'))).hexdigest()

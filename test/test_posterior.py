@@ -100,7 +100,7 @@ def test_the_order_of_parameters_by_hand():
         response=(term('gradient'), term('board', tau_s=60.0)),
     )
     layout = parameter_layout(value)
-    # The bias of x has a level, t and t^2, then a level and three knots, then two weights.
+    # Parameters of the bias of x: level, t, t^2; level, three knots; two weights.
     assert layout.bias[0] == Block(0, 3, 7, 9)
     assert layout.scale[0] == Block(9, 10, 11, 13)
     assert layout.bias[1] == Block(13, 14, 15, 17)
@@ -156,14 +156,13 @@ def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     # The variance is flat near a corner, so the attitude may be the grid point beside the corner.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # Three angles of 1 % (a MEMS prior) change |f| by g (xy, xz, yz); noise adds a little.
+    # Three angles of 1 % (prior of a MEMS) change |f| by g times (xy, xz, yz), and noise adds.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
 
 
 def test_the_attitude_of_a_side_that_was_never_up_is_named(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
-    # The attitude may be the grid point beside -z.
     np.testing.assert_allclose(result.least_known.up, (0.0, 0.0, -1.0), atol=0.06)
     assert '-z up' in said(result)
     assert said(result) in ' '.join(result.calibration.provenance.notes)

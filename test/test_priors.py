@@ -26,7 +26,7 @@ from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: Only the groups of the unit's physics, a third of all columns, which halves the time.
+#: The groups of the unit's physics have a third of the columns, and take half of the time.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
@@ -79,7 +79,7 @@ def test_population_is_the_mean_unit_and_its_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # Variance of the prior: scatter of three units times 4/3 (their mean), plus their variance.
+    # The prior variance is 4/3 of the scatter of three units, plus their own variance.
     scatter = []
     for unit in siblings():
         variance = np.diag(unit.posterior.covariance())
@@ -90,7 +90,7 @@ def test_population_is_the_mean_unit_and_its_scatter():
 
 
 def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(rng):
-    # WHY: one position and the prior of twelve units claimed 0.9 mg at an error of 4.7 mg.
+    # WHY: with one position and a prior of twelve units the error was 4.7 mg, its sd 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 
@@ -113,9 +113,9 @@ def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(
 
 
 def test_a_fit_starts_with_the_widest_prior(monkeypatch):
-    # WHY: a fit started with the narrow prior of three units attributed 190 ug of their
-    # differences to the mounting offset and stayed there: 271 ug held out instead of 0.9. WHAT: in
-    # no direction is another prior wider than the prior of the start.
+    # WHY: begun with the narrow prior of three units, a fit explained 190 ug by mounting offsets
+    # and stayed in this minimum: the held-out error was 271 ug instead of 0.9 ug. WHAT: the prior
+    # of the start is the widest in all directions.
     seen = []
 
     def fitted_with(*given):
@@ -168,7 +168,7 @@ def test_new_rests_improve_an_old_calibration():
 
 
 def test_rests_at_one_temperature_correct_ageing_and_keep_the_response():
-    # An hour at one temperature shows a change of the biases by 200 ug, without a data sheet.
+    # An hour at one temperature determines a bias change of 200 ug without --ageing-bias.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
     old = fitted(9).calibration
 

@@ -159,7 +159,7 @@ def whole_range(of):
     now_ns = START_NS
     for k, (celsius, step_s) in enumerate(zip(temperatures, steps_s, strict=True)):
         for m in range(6):
-            # Six readings of each temperature, so that it does not count as a wrong reading.
+            # Each temperature is read six times, so that it does not count as a wrong reading.
             now_ns += round(step_s / 6.0 * 1e9)
             sent.append(('board', now_ns, celsius))
             sent += [(name, now_ns, celsius + 0.1 * m) for name in of.sensors]

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Other people's recordings through `fit`, with docs/real_data.md's figures; skipped if absent."""
+"""
+Fits of other people's recordings give the figures of docs/real_data.md.
+"""
 
 import re
 from contextlib import suppress
@@ -58,7 +60,7 @@ def test_handheld_units_agree_with_a_direct_solution(unit):
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = calibration.axes
-    # Fit and scipy weight positions slightly differently: less than the sd, 1 mg and 1e-3.
+    # Fit and scipy weight positions differently: results differ by less than 1 mg and 1e-3.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)
@@ -114,7 +116,7 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
 def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # Each set of parts of the 1420 s after the last jump is corrected by a fit of the other parts.
+    # The 1420 s after the last jump are cut into parts; each is corrected by a fit of the others.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [Part(start, start + length) for start in starts]
@@ -135,7 +137,7 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     assert len(raw) >= 17 * len(sets) // n_sets
     # Compare drifts about their mean, because one attitude does not determine the constants.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # 1.5 mg/sqrt(Hz) leaves 0.19 mg in a minute; the first of five parts is extrapolated.
+    # Means of a minute have a noise of 0.19 mg; the first of five parts is extrapolated.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 

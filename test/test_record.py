@@ -95,7 +95,7 @@ def check_fit(result, cli, folder):
     scale = np.array([axis.scale_factor for axis in axes])
     bias = np.array([axis.bias for axis in axes]) / scale
     sd = np.array([place['sd_g'] for place in result['positions']]).max() * 9.80665
-    # `record` computes the sd from the noise of the positions alone, for constants at 20 degC.
+    # The sd of `record` follows from the noise of the positions, for constants at 20 degC.
     assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
     true_bias = np.array(UNIT.bias_at_reference) / UNIT.scale_factor
     assert bias == pytest.approx(true_bias, abs=5.0 * max(9.80665 * max(result['bias_sd_g']), sd))
@@ -186,7 +186,7 @@ class TestGrowing:
 
 
 def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path):
-    # WHY: the hours that a killed run had recorded were left in a hidden file without any message.
+    # WHY: the recording of a killed run was left in a hidden file without a message.
     bags = tmp_path / 'bags'
     killed = subprocess.run(
         [sys.executable, '-c', CRASH, session, bags, str(START_NS + 200 * 10**9)], check=False

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A clock that jumps: the shortened jump, the unchanged rest, and a clock that is refused."""
+"""A clock that jumps: the jump is shortened, other stamps stay, an invalid clock is refused."""
 
 from contextlib import suppress
 

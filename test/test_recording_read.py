@@ -334,7 +334,7 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # A board topic is not chosen by type if one is named, among two topics, or from a case topic.
+    # No board topic is chosen by type if a name is given, two fit, or it is the case's.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):

@@ -67,7 +67,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
             '/accel/counts': 'c', '/temperature/board': 't', '/imu/data_raw': 'i',
             '/regime/dynamic': 'b', '/diagnostics': 'r',
         }  # fmt: skip
-        # Messages are in the file by flush, then log time, then order of the calls.
+        # Messages are ordered in the file by flush, then log time, then call.
         wanted = [
             (log_ns, name) for _, log_ns, name in sorted(written, key=lambda entry: entry[:2])
         ]

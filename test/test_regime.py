@@ -4,9 +4,8 @@
 The detector on short runs: early, few false alarms, no missed ramps; long runs are in
 benchmarks/regime.py.
 
-All runs are seeded. A limit on a median of n delays holds with the benchmark's spread: the median
-of 24 delays scatters by about 0.3 of their sd, 1 s at 1 mK; the median of 12 delays with coarse
-steps by 4 s.
+All runs are seeded. The limits allow for the scatter of medians: that of 24 delays at 1 mK
+scatters by 1 s, that of 12 delays with coarse steps by 4 s.
 """
 
 import math
@@ -78,7 +77,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # A coarse sensor must cross two edges of its quantum: median 146 s (94 mK), +-6 s.
+        # A coarse sensor must cross two edges, 94 mK on average: a median of 146 s, +-6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -102,7 +101,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # With a known onset the delay is a lower bound of the CUSUM's delay, within a second.
+        # A test with known onset is faster than CUSUM by at most a second.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -129,13 +128,13 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # Slowest: 0.2 K/min in steps of 1 K behind a lag of 15 min, as two steps are needed.
+        # The slowest ramp, 0.2 K/min behind a lag of 15 min, needs two steps of 1 K.
         assert each[-1][0] < 0.5 * end_s
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_have_no_false_switches(sensor):
-    # At the required 0.05 switches an hour (2 per opening) over 2 openings in 15 h have p < 0.01.
+    # At 0.05 switches an hour, two per opening, more than 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -182,7 +181,7 @@ def test_the_rate_of_false_alarms_is_that_of_the_setting():
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
     # Expected: filter gain by the Riccati equation, noise and correlation by the impulse response,
-    # alarms by Rice's formula. The detector's closed forms are first order in its pace: to 4 %.
+    # alarms by Rice's formula. Neglected terms of second order in the pace are up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -239,7 +238,7 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_the_dynamic_regime_ends_when_the_lag_has_died_away():
-    # The board relaxes to 0.05 K/min 50 min after the stop; dwell adds 60 s, noise 10 %.
+    # The rate of the board is 0.05 K/min 50 min after the ramp; dwell adds 60 s, noise 10 %.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)
@@ -256,7 +255,7 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The slower of two lags decides: half the rate is reached one lag times ln 2 later.
+    # The slower lag decides: the rate halves in the time lag times ln 2.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
@@ -283,7 +282,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # `closes: case` gives the bits of a run without a board; without a case the board decides.
+    # With `closes: case` the board has no effect; without a case the board decides.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -295,7 +294,7 @@ TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 @pytest.mark.parametrize('lost', [None, 'case', 'board'])
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
 def test_a_reversal_is_no_rest(lost, quantum):
-    # At the top of a triangle a coarse reading is constant for minutes, but the state is dynamic.
+    # Where a ramp reverses, coarse readings are constant for minutes; the state is dynamic.
     parts = {lost: gone} if lost else {}
     changes = run_once(TRIANGLE, quantum=quantum, end=16000.0, **parts)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -329,7 +328,7 @@ def test_direction_follows_a_reversal():
 
 
 def test_a_held_reading_does_not_turn_the_direction():
-    # WHY: the staircase of measurements every 30 s published every second looks like reversals.
+    # WHY: measurements every 30 s, published every second, gave false reversals.
     rng = np.random.default_rng(1)
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)

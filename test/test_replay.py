@@ -236,7 +236,7 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
         parts, held_bytes = zip(*held, strict=True)
         assert list(parts) == sorted(parts)
         assert parts[-1] == 1.0
-    # Three times the messages only add memory for the regime flags, one per case reading.
+    # With three times the messages, only the list of regime flags is larger.
     assert peaks[1] < 1.1 * peaks[0]
     third = len(parts) // 3
     assert max(held_bytes[-third:]) < 1.15 * max(held_bytes[:third])

@@ -228,7 +228,7 @@ def without_uncertainty(calibration):
 
 @pytest.mark.parametrize('is_known', [True, False])
 def test_values_and_deviations_have_one_place_where_u_is_withheld(is_known, tmp_path):
-    # WHY: a scale of -1777 ppm was printed beside its deviation of 23.12 ppm.
+    # WHY: a scale of -1777 ppm had fewer decimals than its deviation of 23.12 ppm.
     calibration = fitted().calibration
     if not is_known:
         calibration = without_uncertainty(calibration)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures: legible without colour, with units, as the numbers behind them; pages in a browser."""
+"""Figures are legible without colour, with the right numbers; browsers show the pages."""
 
 import re
 import shutil
@@ -103,7 +103,7 @@ def test_trace_without_a_case_sensor_follows_the_board():
 
 
 def look(line):
-    """Return what distinguishes lines without colour: dashes, marker, darkness."""
+    """Return the properties that distinguish lines without colour: dashes, marker, darkness."""
     dashes, colour = line._unscaled_dash_pattern, line.get_color()
     marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
     darkness = round(float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))), 1)

@@ -103,8 +103,8 @@ def test_windows_are_means_of_ten_seconds_at_rest():
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
-    # Two minutes of rest, in another attitude from the first minute on, with scattered stamps;
-    # noise of a sample as at `RATE_HZ`, and as of a white density above.
+    # Two minutes of rest in two attitudes, with scattered stamps. Up to `RATE_HZ` the noise of a
+    # sample is constant, at higher rates its density.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)
@@ -168,7 +168,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [one for _, one in decode(bytes(changed))[0]]
-    # A changed byte loses one rest, two by a lost newline, or all by a damaged start line.
+    # A changed byte loses one rest; a lost newline loses two rests, a damaged start all.
     assert all(one in [rest(k) for k in range(9)] for one in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 
@@ -206,7 +206,7 @@ def test_thinning_halves_the_rests_and_keeps_each_start():
 def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     monkeypatch.setattr(rest_log, 'DAY_BYTES', 2000)
     monkeypatch.setattr(rest_log, 'FOLDER_BYTES', 5000)
-    monkeypatch.setattr(rest_log, '_FLOOR', 500)
+    monkeypatch.setattr(rest_log, '_UNTHINNED_BYTES', 500)
     log = RestLog(str(tmp_path))
     for day in range(6):
         for k in range(40):

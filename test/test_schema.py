@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Plain values to dataclasses: each type hint accepts its values, refuses others by the key."""
+"""Each type hint accepts its plain values; an error names the key of any other value."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal

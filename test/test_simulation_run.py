@@ -178,7 +178,7 @@ def response_of(network, time, air):
 
 
 def test_two_parts_follow_a_ramp_as_solved_by_hand():
-    """Air - case - board with heat flow back: closed forms of eigenvalues, lags, amplitudes."""
+    """The chain air - case - board, with heat flowing back, equals its closed form."""
     c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
     network = ThermalNetwork(
         {'case': c0, 'board': c1}, (Link(AIR, 'case', g0), Link('case', 'board', g1))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rests: none in a flight, with or without a gyroscope; each short rest of a hand-held unit."""
+"""No rest is found in a flight, but each short rest of a hand-held unit is found."""
 
 import numpy as np
 import pytest
@@ -113,7 +113,7 @@ def test_each_short_rest_is_found(rng, rest_s, shaky):
     result = fit([source(accel)], OPTIONS)
     assert len(result.positions) == 10
     axes = result.calibration.axes
-    # The mean of a rest, 350 samples with 3 to 12 mg of noise, is good to 0.2 to 0.6 mg.
+    # The mean of a rest has an error of 0.2 to 0.6 mg: 350 samples, noise of 3 to 12 mg.
     np.testing.assert_allclose([axes.x.bias, axes.y.bias, axes.z.bias], (0.3, -0.2, 0.1),
                                atol=1.5 * MG)  # fmt: skip
     assert result.residuals[-1].fitted.rms < 2.0 * MG

@@ -80,7 +80,7 @@ def test_faults_of_a_recording_are_named(tmp_path, temperature, options, text):
     ],
 )
 def test_samples_after_a_clock_was_set_back_are_counted(tmp_path, back_s, text):
-    # WHY: if a clock was set back by 10 min, a fit left out 10 min; the survey named one stamp.
+    # WHY: with a clock set back by 10 min a fit lost 10 min, but the survey reported one stamp.
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=-back_s)
     assert any(text in finding for finding in result.findings)
 

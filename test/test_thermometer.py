@@ -78,9 +78,9 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_claimed_variances_match_squared_errors(errors, sensor, part):
-    # The mean squared error over the claimed variance is ideally 1. In soaks and ramps the claimed
-    # variance allows for changes that have not begun, and is a few times too large; at an onset or
-    # an end a change begins. The few errors of a coarse sensor scatter by a factor of 2.
+    # Ideally, the mean squared error equals the claimed variance. In soaks and ramps the claimed
+    # variance is a few times too large, as it allows for the onset or end of a ramp at any time.
+    # The few errors of a coarse sensor scatter by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -100,7 +100,7 @@ def test_claimed_variances_match_squared_errors(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min):
-    # Limits: 1.5 times the errors found (averaged noise); steps of 1 K give the rate to 10 %.
+    # The limits are 1.5 times measured errors; steps of 1 K give the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -115,7 +115,7 @@ def test_a_crossed_edge_locates_the_temperature():
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # The crossing locates the temperature to the noise, plus the change within one second.
+    # The error of the temperature at a crossing is the noise plus the change within one second.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
@@ -192,7 +192,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
     out, back = mix(*states, 0.25), mix(*states[::-1], 0.75)
     np.testing.assert_allclose(back, out, rtol=1e-12)
     mixed = np.concatenate(samples)
-    # 400 000 samples with an sd of a few determine the covariances to 1 %.
+    # 400 000 samples determine the covariances to 1 %.
     np.testing.assert_allclose(out[:3], mixed.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(out[3:], np.cov(mixed.T)[upper], atol=0.1)
 
@@ -210,7 +210,7 @@ def test_readings_not_finite_or_not_newer_change_nothing(stamp_s, reading):
 
 
 def test_a_small_jump_counts_less_than_a_reading():
-    # A jump of 15 sigma is below five times the limit of 6 sigma: it counts like one of 6 sigma.
+    # A jump of 15 sigma is below five times the limit of 6 sigma: it counts like 6 sigma.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
@@ -278,7 +278,7 @@ def test_extrapolation_is_linear_then_held():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # Held after 5 s: the sd is the change if the ramp of 0.01 K/s went on for another 55 s.
+    # The value is held after 5 s; its sd is the change by 0.01 K/s in the other 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 

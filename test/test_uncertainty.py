@@ -30,7 +30,7 @@ def test_a_start_in_a_ramp_is_claimed():
             compensator.push('case', stamp, 10.0 + risen - flicker)
             row = compensator.process(stamp, 0.0, 0.0, 1.0)
         sd[rate, end] = math.sqrt(row[3] - compensator.thermal.correction.noise[0])
-    # One time constant after the start a share of 1/e is left; 300 counts per m/s^2.
+    # The error of 30 counts, at 300 counts per m/s^2, has decayed for one time constant.
     left = 30.0 / 300.0 / math.e
     assert sd.pop((0.0, 60)) == pytest.approx(0.387 * left, rel=0.2)
     assert [*sd.values()] == pytest.approx([math.hypot(1.0, 0.387) * left] * 2, rel=0.2)
@@ -43,12 +43,12 @@ def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
     corrected = []
     for second in range(3000):
         stamp = 10**12 + second * SECOND_NS
-        # Thermometers of a few mK, as constant readings are those of a faulty thermometer.
+        # Readings scatter by a few mK: constant readings are those of a faulty thermometer.
         compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
         if second < 2000:
             compensator.push('case', stamp, 19.0 + 2e-3 * (second % 5))
         corrected.append(compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2))
-    # The gradient of 1 K is known to 0.1 K, 3 counts, at 300 counts per m/s^2.
+    # The gradient has an sd of 0.1 K, which is 3 counts, at 300 counts per m/s^2.
     assert corrected[-1][0] == pytest.approx(corrected[1999][0], abs=0.01)
 
 
@@ -60,7 +60,7 @@ def test_without_its_sensor_from_the_start_the_gradient_is_that_of_the_fit():
         stamp = 10**12 + second * SECOND_NS
         compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
         row = compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2)
-    # A gradient of -1 K: -30 counts of 300 per m/s^2, within some mK of the board's rate.
+    # A gradient of -1 K changes the counts by -30, at 300 counts per m/s^2.
     assert row[0] == pytest.approx(1.1, abs=0.01)
     assert not compensator.thermal.tracker.loose_k(-1.0)
 
@@ -82,7 +82,7 @@ def test_beyond_1_g_the_covariance_has_an_unknown_square():
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
 def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fault):
     # WHY: the bias follows a part that lags the board by 10 min, so a sudden error of the board
-    # temperature changes nothing, but a lasting error does; the sd had only the first.
+    # temperature changes nothing, but a lasting error does; the sd had the sudden error only.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
@@ -93,7 +93,7 @@ def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fa
     for second in range(3600):
         stamp = 10**12 + second * SECOND_NS
         ramp_s = max(second - 1200.0, 0.0)
-        # The case changes by 1 K/min; the board is 1 K behind.
+        # The case changes by 1 K/min; the board lags by 1 K.
         case, board = 20.0 + ramp_s / 60.0, 20.0 + max(ramp_s - 60.0, 0.0) / 60.0
         of_part += (board - of_part) / 600.0
         flicker = 2e-3 * (second % 3)

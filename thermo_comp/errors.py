@@ -44,7 +44,7 @@ class OutputError(ThermoCompError):
 
 
 class FitError(ThermoCompError):
-    """Data that do not suffice for the fit; the text says what is missing and what to record."""
+    """Data that do not suffice for the fit; the text names missing data and their recording."""
 
 
 class UndeterminedError(FitError):

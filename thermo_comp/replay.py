@@ -107,7 +107,7 @@ def replay(
     progress: Callable[[float], None] | None = None,
 ) -> ReplayResult:
     """
-    Correct a recording and write what the node would publish, as a bag or (by suffix) a table.
+    Correct a recording and write the output of the node, as a bag or (by suffix) a table.
 
     `keep_inputs` also copies the input messages, with their stamps as log times. `all_topics`
     copies in addition all other topics with their log times, except topics named like an output.

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the progress of a test during recording: positions, resulting accuracy, what is missing.
+Owns the progress of a test during recording: positions, resulting accuracy, missing data.
 
 Blocks of samples are added as they arrive. A rest in another direction than the present position
 begins the next position; knocks and handling in between belong to the previous position.
@@ -28,7 +28,7 @@ _REST_S = 10.0
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that are searched again for the start of a rest.
 _LOOKED_BACK = 200
-# Sd of a position's force by hysteresis, mounting and drift, however long the rest [g].
+# Sd of a position's force by hysteresis, mounting and drift, for any length of the rest [g].
 _FLOOR_SD = 2e-5
 # Ratio of a rest's noise to the median of all rests, above which the rest is 'restless'; ratio to
 # the noise of the previous rest, above which the unit is held by hand.
@@ -36,9 +36,8 @@ _RESTLESS, _LOUDEST = 3.0, 10.0
 # Backward step of the stamps from which on the driver has restarted [ns].
 _STEP_BACK_NS = 10**9
 # A stamp earlier than any other [ns].
-_EVER_NS = -(1 << 62)
+_FIRST_NS = -(1 << 62)
 
-#: Survey of each thermometer, by its name.
 Surveys = Mapping[str, ThermometerSurvey]
 
 
@@ -60,7 +59,7 @@ class Position:
 @dataclass(frozen=True)
 class Account:
     """
-    State of a test, and what is missing.
+    State of a test, and the missing data.
 
     The last of `positions` is unfinished. `worst_sd_g` is the sd of the force in the worst
     attitude, `constants_sd` the sd of bias [g], relative scale and M [rad], as in `coverage`.
@@ -113,7 +112,7 @@ class Acquisition:
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
         #: Stamp before which no later position begins.
-        self.settled_ns = self._newest_ns = self._begin_ns = _EVER_NS
+        self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
         # Mean of the position's first rest, which the search no longer finds after a quieter rest.
         self._first: Floats | None = None
@@ -141,7 +140,7 @@ class Acquisition:
             rates = samples[:, 3:] if samples.shape[1] > 3 else None
             self._accumulator.add(stamp_ns, samples[:, :3], rates)
         cells = self._cells()
-        while (begin_ns := self._turn(cells)) is not None:
+        while (begin_ns := self._next_position_ns(cells)) is not None:
             begins.append(max(begin_ns, self.settled_ns))
             self._close(begins[-1])
             self._accumulator.forget(begins[-1])
@@ -152,7 +151,7 @@ class Acquisition:
 
     def begin(self) -> None:
         """End the position; later blocks may have another clock."""
-        self._close(-_EVER_NS)
+        self._close(-_FIRST_NS)
         self._start()
 
     def _cells(self) -> Cells:
@@ -161,7 +160,7 @@ class Acquisition:
         begin_s = (self._begin_ns - cells.start_ns) * 1e-9
         return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 
-    def _turn(self, cells: Cells) -> int | None:
+    def _next_position_ns(self, cells: Cells) -> int | None:
         """Find the stamp at which the sensor first rests in another direction [ns]."""
         # Search only the new cells and the last `_LOOKED_BACK` earlier cells.
         n_looked, self._n_looked = self._n_looked, len(cells.count)
@@ -169,8 +168,7 @@ class Acquisition:
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest alone: a noisier rest is still relative to its own
-        # noise.
+        # Search the cells after the last rest again, relative to their own noise.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [
@@ -194,7 +192,7 @@ class Acquisition:
         self._rests.append(self._rest(self._cells(), end_ns))
         self._readings = {
             name: [
-                later for part in parts if len((later := _part(part, end_ns, -_EVER_NS)).stamp_ns)
+                later for part in parts if len((later := _part(part, end_ns, -_FIRST_NS)).stamp_ns)
             ]
             for name, parts in self._readings.items()
         }
@@ -205,7 +203,7 @@ class Acquisition:
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
         """Combine the rests of the position, up to the next position."""
         by_name = {
-            name: survey_thermometer([_part(part, _EVER_NS, end_ns) for part in parts])
+            name: survey_thermometer([_part(part, _FIRST_NS, end_ns) for part in parts])
             for name, parts in self._readings.items()
         }
         surveys = {name: survey for name, survey in by_name.items() if survey is not None}
@@ -227,9 +225,9 @@ class Acquisition:
         return coverage.directions(means, self._centre)
 
     def account(self) -> Account:
-        """Return the state of the test, and what is missing."""
+        """Return the state of the test, and the missing data."""
         cells = self._cells()
-        rests = [*self._rests, self._rest(cells, -_EVER_NS)]
+        rests = [*self._rests, self._rest(cells, -_FIRST_NS)]
         means = np.array([rest.mean for rest in rests])
         ups = self._directions(means)
         one_g = np.sum((means - self._centre) * ups, axis=1)
@@ -254,7 +252,7 @@ class Acquisition:
         now, is_still = self._now(cells)
         farthest_up, farthest_deg = coverage.farthest(ups)
         n_good = sum(not position.reason for position in positions)
-        thermometers = _together([rest.surveys for rest in rests])
+        thermometers = _combined_surveys([rest.surveys for rest in rests])
         missing = self._n_wanted - n_good
         findings = [f'{missing} of {self._n_wanted} positions are missing'] * (missing > 0)
         return Account(
@@ -318,7 +316,7 @@ def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
     return readings.take((readings.stamp_ns >= begin_ns) & (readings.stamp_ns < end_ns))
 
 
-def _together(surveys: Sequence[Surveys]) -> Surveys:
+def _combined_surveys(surveys: Sequence[Surveys]) -> Surveys:
     """Combine the surveys of each thermometer in several positions."""
     by_name: dict[str, list[ThermometerSurvey]] = {}
     for name, survey in (item for position in surveys for item in position.items()):

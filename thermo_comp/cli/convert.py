@@ -148,8 +148,8 @@ def flags_named() -> Iterator[None]:
 
 def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     """
-    Print a guessed column map, or name the log of `shown` whose printed map is the same; print the
-    columns of a table that are not used, unless they are those of a log of `shown`.
+    Print a guessed column map and the unused columns of a table. A map or a list of columns that
+    `shown` contains already is not printed again.
     """
     _print_map(out, log, shown)
     not_used = f'not used: {", ".join(log.not_used)}'

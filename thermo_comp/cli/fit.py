@@ -331,7 +331,7 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
 
 
 def _named(groups: tuple[str, ...]) -> str:
-    """Name a model by its groups beside the curve, which only the smallest model lacks."""
+    """Name a model by its groups other than the curve, which every model but the smallest has."""
     if len(groups) < 2 or groups[0] != 'curve':
         return '+'.join(groups) or 'constants'
     return ''.join(f'+{group}' for group in groups[1:])

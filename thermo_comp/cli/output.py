@@ -188,5 +188,5 @@ def _plainer(value: Any) -> Any:
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return dict(value)
-    # arrays and scalars of numpy, which need not be imported
+    # Arrays and scalars of numpy have `tolist`, so numpy need not be imported.
     return value.tolist() if hasattr(value, 'tolist') else str(value)

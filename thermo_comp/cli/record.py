@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``thermo_comp record``: records a test by positions, and reports what is missing."""
+"""Owns ``thermo_comp record``: records a test by positions, and reports missing data."""
 
 import re
 import shlex
@@ -261,7 +261,7 @@ def _accuracy(account: 'Account') -> str:
 
 
 def _lines(account: 'Account') -> list[str]:
-    """Return the lines below the positions: state, and what is missing."""
+    """Return the lines below the positions: state, and missing data."""
     from ..fitting.coverage import direction_text
 
     lines = [_accuracy(account)]

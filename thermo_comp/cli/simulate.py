@@ -131,7 +131,7 @@ def simulate(
 def _metadata(
     unit: 'UnitModel', station: 'Position', truth: dict[str, Any], gravity: float, is_known: bool
 ) -> dict[str, str]:
-    """Return the metadata of a bag: serial, truth, and how a fit learns |f| in a rotation."""
+    """Return the metadata of a bag: serial, truth, and for a rotation the source of |f|."""
     from .. import __version__
     from ..fitting import known_force
 

@@ -43,7 +43,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects drift; its changes; advice."""
+    """A parameter that is 1 while the autopilot corrects drift, with its changes, and advice."""
 
     parameter: str
     since_ns: Sequence[int]

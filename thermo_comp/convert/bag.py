@@ -4,8 +4,8 @@
 Owns the reading of bags with other topics and units, ROS 1 and 2.
 
 Drivers choose their topic names, and some drivers do not publish m/s^2. The Imu topic is found by
-its type; a thermometer by its namespace: that of the Imu makes it the board's, that of a barometer
-(sensor_msgs/FluidPressure) the case's. At rest the samples must read gravity in the stated unit.
+its type. The thermometer in the Imu's namespace is the board's, a thermometer in a barometer's
+namespace the case's. At rest the samples must read gravity in the stated unit.
 """
 
 from pathlib import Path, PurePosixPath

@@ -33,21 +33,21 @@ Triple = tuple[Column, Column, Column]
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible sample intervals [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: Times of a table in which the unit turns by `_TURN` rad between blocks of `_BLOCK` still samples
-#: (scatter below `_QUIET` g) cannot be in ms: then intervals up to `_SLOW_S` s are plausible.
+#: A turn by `_TURN` rad between successive blocks of `_BLOCK` still samples (scatter below
+#: `_QUIET` g) excludes times in ms; intervals are then plausible up to `_SLOW_S` s.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
 #: Range of stamps since 1970 [s], 2000 to 2038, and their largest interval; a count of us since
 #: power-up may be in this range, but its intervals are longer.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
-#: Range of temperatures per length of a log [K/s] that no log reaches: a hair dryer warms a board
-#: by some 0.1 K/s.
+#: Upper limit of the range of temperatures in a log divided by the log's length [K/s]: a hair
+#: dryer warms a board by some 0.1 K/s.
 _FASTEST_K_S = 0.5
-# Largest share of rows with a change of temperature in a column of whole numbers; the numbers of
-# boards or sensors whose rows alternate change more often.
+# Largest share of rows in which a temperature in whole degrees changes. A column of board or
+# sensor numbers, whose rows alternate, changes in more rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
-#: Last and first part of a counter's range; a step from the last to the first is an overflow.
+#: Share of a counter's range at each end: a step from the upper to the lower is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
 _GIVE_MAP = f'give {_A_MAP}'
@@ -288,8 +288,8 @@ def column_map_text(columns: ColumnMap) -> str:
 
 def _reads_temperature(values: Floats, unit: str) -> bool:
     """
-    Whether the values of a column can be temperatures: most of them are in the plausible range,
-    and whole numbers, which may be those of a board or of a test, change, but in few rows.
+    Whether the values of a column can be temperatures: most values are in the plausible range.
+    Whole numbers, which may number boards or tests, must change, but only in few rows.
     """
     slope, offset = _CELSIUS[unit]
     celsius = values[np.isfinite(values)] * slope + offset
@@ -351,7 +351,7 @@ def _stamp(
 
 
 def _no_time(column: Column | None, steps: Floats) -> str:
-    """Return what is wrong with the times of a column."""
+    """Return the fault of the times of a column."""
     if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
         shown = f'{(steps == 0.0).mean():.0%}'
         return (

@@ -42,8 +42,8 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write a calibration in a soak as the file of one of `TOOLS`: its `text`, and `notes` on the
-    lost parts.
+    Write the constants and curves of a soak as the file of one of `TOOLS`: its `text`, and `notes`
+    on the parts of the calibration that are lost.
 
     `number` is the number of the set or IMU, if the file numbers them; PX4 matches the sensor by
     `device_id`. With `up`, a unit vector, the scale's drift in this attitude is added to the
@@ -81,7 +81,7 @@ def export_calibration(
 
 
 class _Curves(NamedTuple):
-    """A soak: the level of each axis, and its changes at n calibrated temperatures."""
+    """In a soak: K and bias of each axis, and changes of bias and scale over n temperatures."""
 
     temperature: Floats
     K: Floats

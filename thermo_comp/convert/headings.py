@@ -44,8 +44,8 @@ _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
 # Unit of a temperature at the end of a heading, and words of columns that are not temperatures.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
-# Headings of thermometers if the values of the column are temperatures: a unit of one letter, and
-# the place of a thermometer alone.
+# Headings that are those of a thermometer only if the values of the column can be temperatures: a
+# heading that ends in a letter for the unit, or that is the place of a thermometer alone.
 _LETTER = re.compile('_[ck]$|^(board|case|imu|die|chip)_f$')
 _PLACE = re.compile('board|case|imu|die|chip')
 # Units as they stand in brackets or, in lower case with underscores, at the end of a heading.
@@ -91,7 +91,7 @@ def read_headings(
     """
     names = {_plain(heading): heading for heading in reversed(headings)}
     times = [text for name, text in names.items() if _TIME.search(name) and not _is_warm(text)]
-    # A heading like `T_magnet_C` is that of the times only if no other heading is.
+    # A heading like `T_magnet_C` names the times only if no other heading does.
     times.sort(key=lambda text: _LETTER.search(_plain(text)) is None)
     found = dict(_triads(names))
     triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
@@ -119,14 +119,14 @@ def _thermometers(
     headings: Sequence[str], names: Container[str], is_plausible: Callable[[str, str], bool]
 ) -> dict[str, tuple[str, str]]:
     """
-    Return column and unit by thermometer. A place alone, like `board`, is the heading of a
-    thermometer if no other column is that thermometer. `names`: all headings, see `_plain`
+    Return column and unit by thermometer. A place alone, like `board`, names a thermometer unless
+    another column is that thermometer. `names`: all headings, see `_plain`
     """
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
     warm, places = [], []
     for heading, unit in units.items():
         name = _plain(heading)
-        # One of three columns, such as `phase_a`, `phase_b`, `phase_c`, has no unit.
+        # The last letters of `phase_a`, `phase_b`, `phase_c` are not units.
         is_letter = _LETTER.search(name) is not None and f'{name[:-1]}b' not in names
         if _is_warm(heading) or (is_letter and is_plausible(heading, unit)):
             warm.append(heading)

@@ -222,9 +222,8 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
-    Return log times that never go back, as stamps may, and the shift after each restart of the
-    clock; the times of a thermometer get the `shifts` of the samples, so that the readings stay
-    among the samples.
+    Return log times that never decrease, and the shift added after each restart of the clock. For
+    a thermometer `shifts` are those of the samples, so that the readings stay among the samples.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

@@ -211,7 +211,9 @@ def _qr(matrix: Floats) -> tuple[Floats, Floats]:
 
 
 def turned(rotation: Floats) -> list[str]:
-    """Describe the rotation of our frame in the other tool's for tf; empty if there is none."""
+    """
+    Describe the rotation from the other tool's frame to ours, for tf; empty without rotation.
+    """
     if np.abs(rotation - np.eye(3)).max() < 1e-9:
         return []
     roll = np.arctan2(rotation[2, 1], rotation[2, 2])

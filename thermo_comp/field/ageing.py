@@ -29,7 +29,7 @@ from ..unit.gravity import MICRO_G
 from .series import Series
 
 #: Centres of the priors, relative to the turn-on offset: random walk per root day of bias, and of
-#: scale times g; scatter of a rest. Sd of the logarithm of all priors: a factor of 5 either way.
+#: scale times g; scatter of a rest. Sd of the logarithm of all priors: a factor of 5.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Centre of the prior of the sd of the lag states at a start, relative to the calibration's
 #: assumption: units that are at rest before their start have smaller lags.
@@ -40,12 +40,12 @@ _LEAST_TURN_ON = 5.0 * MICRO_G
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Relative sizes of a jump in the biases and in the scales times g, which a shock changes less.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
-#: Least log Bayes factor of a change against none (150:1), and of another gravity against a jump
-#: of the levels (20:1): where the attitudes do not distinguish them, a jump is the explanation.
+#: Smallest log Bayes factor of a change (150:1), and of a jump of gravity relative to a jump of
+#: the levels (20:1).
 _LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
-#: Random walk of the curves' slopes [m/s^2 per K per root day]: the smallest of these in a year.
+#: Random walk of the curves' slopes [m/s^2 per K per root day]: smallest `_BENDS` in a year.
 _SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
 #: Largest number of rows (equations) per start of the node in the solution, and in the search for
 #: the variances; largest number of all rows in the search, whose time grows with its cube.
@@ -373,7 +373,8 @@ class Solution:
     shift: change of the parameters
     prior, posterior: covariances before and after the rests
     future: covariance that is added during the time of use after the last rest
-    gains, innovations: factors of the shift; estimates by fewer rows are partial sums
+    gains, innovations: the shift is ``gains.T @ innovations``; the shift by the first rows alone
+        is the sum over these rows
     gravity: jumps of gravity, each with its size and the sd of the size [m/s^2]
     """
 
@@ -410,7 +411,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     gravity = []
     for change in model.changes:
         columns = change.columns(rows)
-        if change.kind == 'gravity':  # the file has no parameter for it
+        if change.kind == 'gravity':  # the file has no parameter for gravity
             gain = change.sd**2 * solve_triangular(lower, columns[:, 0], lower=True)
             variance = max(float(change.sd**2 - gain @ gain), 0.0)
             gravity.append((change, float(gain @ innovations), float(np.sqrt(variance))))

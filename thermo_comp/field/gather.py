@@ -3,9 +3,9 @@
 """
 Owns the detection of rests in a stream of samples: windows of 10 s without motion.
 
-Samples are summed by whole seconds of their stamps; a cell is as many seconds as have at least
-five samples, which is one second from 5 Hz on. A cell is still if its standard deviation is that
-of the noise and its mean agrees with the mean of the cell before (thresholds as in
+Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds that
+hold five samples: one second at 5 Hz or more. A cell is still if its standard deviation is that of
+the noise and its mean agrees with the mean of the cell before (thresholds as in
 `online.checks.GravityCheck`). Still cells in a row form a window once they span ten seconds. In a
 long rest all windows of the first ten minutes are kept, then one window per minute up to an hour,
 then one window per five minutes.
@@ -21,8 +21,8 @@ from ..typing import Floats, Stamps
 from .rest import Rest
 
 SECONDS = 10  # shortest length of a window of a rest [s]
-#: Largest difference of the numbers of two seconds with samples in a row: at 1 Hz, stamps that
-#: scatter leave a second empty at times.
+#: Largest step from one second with samples to the next within a window [s]: at 1 Hz, jitter of
+#: the stamps leaves some seconds without a sample.
 _LARGEST_STEP = 2
 _SECOND_NS = 1_000_000_000
 #: Pairs (k, n): from the window number k of a rest on, every n-th window is kept.

@@ -30,7 +30,7 @@ class Start:
     """
     A start of the node, or a later change of its calibration, with the `start_ns` of the start.
 
-    `start_ns` identifies a start, but dates nothing: many computers set their clock only later.
+    `start_ns` identifies a start and is not a date: many computers set their clock only later.
     """
 
     start_ns: int

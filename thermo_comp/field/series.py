@@ -156,7 +156,7 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Describe rests for the provenance of an update: the name holds their end and `ahead`."""
+    """Return an update's source, whose name holds the time of the last rest and `ahead`."""
     end = np.datetime64(max(rest.stamp_ns for _, rest in rests), 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
@@ -254,7 +254,7 @@ def series_of(
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
     """
-    Return the places in a log's state of the elements, and of the lag shares, of another state.
+    Return the indices in a log's state at which the elements, and the lag shares, of `wanted` are.
     """
     try:
         logged, target = Layout(memory).numbers, Layout(wanted).numbers
@@ -311,15 +311,15 @@ def _uncertainty(
     """
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
     bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
-    slow = _along(correction, states, np.zeros_like(shares), bare, u, x)
-    claim = _along(correction, states, shares, full, u, x)
+    slow = _variance_along(correction, states, np.zeros_like(shares), bare, u, x)
+    claim = _variance_along(correction, states, shares, full, u, x)
     of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
     slow, claim = slow - of_one_sample, claim - of_one_sample
     weight, unknown = states[:, WEIGHT], states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(states[:, BOARD])
-    # The model of ageing has its own scatter of starts and rests, so the file's is no noise. While
-    # the regime is unknown `_along` includes the residuals of both sets.
+    # The ageing model adds the residuals of the sets itself, so they are subtracted here: those of
+    # both sets while the regime is unknown.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -327,7 +327,7 @@ def _uncertainty(
     return slow, claim, np.sqrt((regimes[:, np.newaxis] * lack).sum(axis=0).T)
 
 
-def _along(
+def _variance_along(
     correction: Correction,
     states: Floats,
     shares: Floats,
@@ -335,7 +335,7 @@ def _along(
     u: Floats,
     x: Floats,
 ) -> Floats:
-    """Return the error variance along the force's directions u, with the noise of a sample."""
+    """Return the error variance of a sample, with its noise, along the force's directions u."""
     columns = states.T
     parts = slow.at(columns, shares.T)
     line = list(correction.line(columns, columns, parts, np.zeros(len(states))))

@@ -4,8 +4,8 @@
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
 A rest determines the error along gravity alone, so the attitudes decide which axes are determined.
-An axis is updated only if the rests reduce the sd of some reading of the axis to 0.6 of that
-reading's prior sd; the other axes keep their values, with an increased covariance.
+An axis is updated only if the rests reduce the sd of some combination of its bias and scale to 0.6
+of the prior sd; the other axes keep their values, with an increased covariance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,8 +30,8 @@ from .series import Series, last_rest, valid_since
 #: Names of the conclusions that a user can override: another gravity than stated at the rests, and
 #: samples of another unit.
 OVERRIDES = ('gravity', 'unit')
-#: Largest RMS of |f| - g of a start that ageing explains, relative to gravity (a shock of 1 mg),
-#: and in claimed sd; both must be exceeded, for a poor sensor has a claim of some milli-g.
+#: Limits of the RMS of |f| - g of a start, relative to gravity (a shock of 1 mg) and in claimed sd
+#: (some milli-g for a poor sensor); rests of another unit exceed both limits.
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
 #: Default time after the last rest for which the covariance is aged [days].
 AHEAD_DAYS = 1.0
@@ -143,7 +143,7 @@ def update(
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     to_file, bend = _levels(calibration), _slopes(calibration)
     solution = solve(model, ageing, to_file, bend, ahead)
-    determined, moved = _moved(used, calibration, model, solution, ageing)
+    determined, moved = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
     # For parameters that are not updated, the shift that is not applied is an additional error.
@@ -210,7 +210,7 @@ def _slopes(calibration: Calibration) -> Floats:
     return result
 
 
-def _moved(
+def _axis_changes(
     series: Series, calibration: Calibration, model: Model, solution: Solution, ageing: Ageing
 ) -> tuple[Bools, tuple[Moved, ...]]:
     """Find the parameters that the rests determine, and list the changes of each axis."""
@@ -256,7 +256,7 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
     rows, squares = model.rows, []
-    of_gravity = _of_gravity(series, solution)
+    of_gravity = _gravity_part(series, solution)
     for label in np.unique(labels)[1:]:
         at = labels == label
         earlier = int(np.searchsorted(rows.start, series.start[at].min()))
@@ -279,7 +279,7 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
     )
 
 
-def _of_gravity(series: Series, solution: Solution) -> Floats:
+def _gravity_part(series: Series, solution: Solution) -> Floats:
     """Return the part of ``|f| - g`` by jumps of gravity."""
     time = means_by(series.start, series.time)[series.start]
     result = np.zeros(len(series))
@@ -292,7 +292,7 @@ def _of_gravity(series: Series, solution: Solution) -> Floats:
 def refuse_another_unit(result: Update) -> None:
     """Raise FitError if the rests differ from gravity by more than ageing explains."""
     series = result.series
-    residual = series.residual - _of_gravity(series, result.solution)
+    residual = series.residual - _gravity_part(series, result.solution)
     rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))
     largest = np.maximum(_LARGEST_PART * series.gravity.mean(), _LARGEST_SIGMAS * claim)
     worst = int(np.argmax(rms / largest))
@@ -320,7 +320,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) -> RegimeSet:
-    """Set the slow error of determined axes to `turn_on`; raise that of other axes to it."""
+    """Set the residual sd of determined axes to `turn_on`, of other axes to at least `turn_on`."""
     axes: dict[str, Any] = {
         name: replace(
             axis,

@@ -24,8 +24,8 @@ from .update import Update, update
 
 #: Largest error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
-#: Days of a window that decides whether the unit is outside: the scatter of single starts is
-#: averaged, and the drift of half a window is small in comparison with that until the limit.
+#: Length of the window whose RMS decides the verdict [days]: long enough to average the scatter of
+#: single starts, and short against the time in which a unit drifts to its limit.
 _WINDOW_DAYS = 7
 #: Smallest number of starts whose attitudes the forecast uses, if the last window has fewer.
 _LEAST_STARTS = 10
@@ -136,8 +136,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week follows a change late. Two days within the claim end an excess, and the
-    # last day begins an excess, if the present error of the ageing model agrees.
+    # The RMS of a week follows a change late. If the ageing model's error at the last rest agrees,
+    # one day outside the claim begins an excess, and two days within the claim end an excess.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -149,7 +149,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # If the last week is outside, its last two days are within.
+        # Here the last two days are within the limit, even if the last week is outside.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -195,8 +195,9 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # Each start adds its offset to the error: the limit of the levels is smaller by this scatter.
-    # An earlier disturbance raises the scatter of the model, but not that of the recent rests.
+    # The offsets of the starts add to the error, so their variance reduces the limit: the smaller
+    # of the model's variance, which an earlier disturbance increases, and that of the recent
+    # rests.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     scatter = min(
         scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)
@@ -240,7 +241,7 @@ def passage(
     variance. The time is 0 if the norm exceeds the bound at the beginning, else at least 0.01.
     """
     rng = np.random.default_rng(1)
-    # Directions in which the error is below a thousandth of its size are left out.
+    # Directions with less than a thousandth of the largest error are left out.
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, walk, covariance = onto @ mean, onto @ walk, onto @ covariance @ onto.T

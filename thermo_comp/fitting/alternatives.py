@@ -73,8 +73,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves of the program are not compared: they limit the number of columns, and the
-    # models of the two detectors have the same columns.
+    # Left-out halves limit the number of columns, so they are not compared between two detectors
+    # with the same columns.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -116,8 +116,8 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the chosen model has two sets, or a similarly good model has: its left-out error is
-    within one standard error, its white noise below 80 % of the chosen model's on every axis.
+    Whether the chosen model, or one as good, has two sets: a model whose left-out error is within
+    one standard error, and its white noise below 80 % of the chosen model's on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -129,7 +129,7 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Name the case thermometer, then the other thermometers, but the board's, of every bag."""
+    """Name the thermometers that every bag has, except the board's, the case's first."""
     recorded = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

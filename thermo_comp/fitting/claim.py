@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the published uncertainty: the covariance of the fit, widened by what the data do not
-determine, and the lack of fit, the excess of the left-out errors over this covariance.
+Owns the published uncertainty: the covariance of the fit, widened by the parameters that the data
+do not determine, and the lack of fit, the excess of the left-out errors over this covariance.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. A fit's weight in the mixture is the evidence
@@ -47,8 +47,8 @@ _GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
 #: above, and falling to 0 below a hundredth of the scale, which few mountings reach.
 _LOG_DENSITY = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_GRID**2 / STUDENT_NU)
 _LOG_DENSITY += np.log(np.minimum(_GRID / 0.01, 1.0))
-#: Grid and log prior density about the sd of a prior calibration: a Student's density of the
-#: logarithm; its scale is a factor of 1.5, to which twelve positions determine an sd.
+#: Grid and log prior density relative to the sd of a prior calibration: a Student's density of the
+#: logarithm. Its scale is the factor of 1.5 to which twelve positions determine an sd.
 _KNOWN_GRID = 10.0 ** np.arange(-1.5, 1.51, 0.125)
 _KNOWN_LOG_DENSITY = (
     -0.5 * (STUDENT_NU + 1.0) * np.log1p(np.log(_KNOWN_GRID) ** 2 / np.log(1.5) ** 2 / STUDENT_NU)
@@ -86,8 +86,8 @@ def claim_of(
     `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
     `informative`: priors from one calibration, with different ageings since that calibration
     """
-    # The rests of one mounting have one offset, but the regression has one for each rest. The mean
-    # of k offsets with k times the variance has the variance of a single offset.
+    # All rests of a mounting share an offset, but the regression has an offset for each rest. The
+    # mean of k offsets with k times the variance has the variance of a single offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -95,20 +95,23 @@ def claim_of(
         prior = replace(prior, misalignment_sd=prior.unseen_misalignment_sd)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
-    # The mountings of a turn-on share its offset, so the mean over the turn-ons is an error of the
-    # bias.
-    n_turn_ons = regression.windows.n_turn_ons
-    shared = offset_sd**2 * (1.0 / n_turn_ons - 1.0 / (mounting[-1] + 1))
+    # The mountings of a turn-on share its offset: a stated sd is that of this offset, an estimated
+    # one that of the independent offsets of mountings, beside which there are turn-ons.
+    shared_sd, independent_sd = offset_sd, prior.offset_sd
     if prior.offset_scale > 0.0:
         tried = prior.offset_scale * _GRID, _LOG_DENSITY
         if known_offset_sd:
             tried = known_offset_sd * _KNOWN_GRID, _KNOWN_LOG_DENSITY
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
-        turn_on_sd = _turn_on_sd(regression, posterior, *tried)
-        offset_sd = float(np.hypot(offset_sd, turn_on_sd))
-        shared = turn_on_sd**2 / n_turn_ons
+        shared_sd, independent_sd = _turn_on_sd(regression, posterior, *tried), 0.0
+        offset_sd = float(np.hypot(offset_sd, shared_sd))
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
-    covariance[layout.bias, layout.bias] += shared
+    if shared_sd and _shares_turn_ons(regression):
+        turn_on = regression.windows.turn_on_of_position
+        covariance += shared_sd**2 * _of_offsets(regression, posterior, turn_on)
+        if independent_sd:
+            each = np.arange(len(turn_on))
+            covariance -= independent_sd**2 * _of_offsets(regression, posterior, each)
     if candidates is not None:
         widened = _with_unseen(regression, posterior, candidates)
         with_unseen = regression.solve(posterior.state, widened, n_steps=0)
@@ -119,7 +122,6 @@ def claim_of(
         layout, covariance = with_unseen.layout, with_unseen.covariance.copy()
         covariance[np.ix_(at, at)] += excess
     if gravity_sd and regression.gravity:
-        # An error of gravity is the same relative error of all three scale factors.
         along = np.zeros(len(covariance))
         along[layout.kappa] = posterior.state.kappa * gravity_sd / regression.gravity
         covariance = covariance + np.outer(along, along)
@@ -204,8 +206,8 @@ def _over_mountings(
         ]
 
     fits = solved(tried)
-    # A large mounting sd leaves the attitudes free to absorb errors of the model, so the drifts
-    # may increase the log evidence of an sd, over that of the mode, by at most `TRIAL_GAIN`.
+    # With a large mounting sd the attitudes absorb errors of the model: the log evidence relative
+    # to the mode may exceed that of the norms alone by at most `TRIAL_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -230,9 +232,9 @@ def _excess_over_priors(
     regression: Regression, posterior: Posterior, informative: Sequence[InformativePrior]
 ) -> Floats:
     """
-    Return by how much the covariance of the mixture of fits over the ageing since the prior
-    calibration exceeds that of the most probable ageing: a few rests do not show which constants
-    have aged.
+    Return the excess of two covariances: that of the mixture of fits over the ageing since the
+    prior calibration, less that of the fit of the most probable ageing. A few rests do not show
+    which constants have aged.
     """
     n = posterior.layout.n_unit
     if not informative:
@@ -259,16 +261,13 @@ def _turn_on_sd(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> float:
     """
-    Return the sd of the bias offset of a turn-on beside that of a mounting [m/s^2]; 0 if each
-    mounting has a turn-on of its own, whose offset that of the mounting contains.
+    Return the sd of the bias offset of a turn-on [m/s^2], in addition to the sd of a mounting; 0
+    if each mounting has a separate turn-on, whose offset is part of the mounting's offset.
 
     The norms show how well turn-ons repeat only if there are several; for a single turn-on the sd
     is that of the prior; `tried` and `log_density` as in `_over_mountings`.
     """
-    if (
-        regression.windows.n_turn_ons == regression.windows.mounting[-1] + 1
-        or not regression.gravity
-    ):
+    if not regression.gravity or not _shares_turn_ons(regression):
         return 0.0
     without_norms = replace(posterior.prior, offset_sd=float(tried[-1]))
     by_drifts = regression.solve(posterior.state, without_norms, n_steps=1).root
@@ -276,6 +275,28 @@ def _turn_on_sd(
     weight = evidence + log_density
     weight = np.exp(weight - weight.max())
     return float(np.sqrt(weight @ tried**2 / weight.sum()))
+
+
+def _shares_turn_ons(regression: Regression) -> bool:
+    """Whether a turn-on has several mountings."""
+    windows = regression.windows
+    return bool(windows.n_turn_ons < windows.mounting[-1] + 1)
+
+
+def _of_offsets(regression: Regression, posterior: Posterior, group: Ints) -> Floats:
+    """
+    Return the covariance of the unit's unknowns by bias offsets of unit variance, each common to
+    the positions of a group, shape (n_unit, n_unit); `group`: of each position.
+
+    Offsets of turn-ons at different temperatures change the curve; those of turn-ons with one
+    program change the bias by their mean.
+    """
+    point = regression.at(posterior.state, posterior.prior)
+    by_offsets = np.array([
+        point.by_offset(np.flatnonzero(group == number), axis)
+        for number in np.unique(group) for axis in range(3)
+    ])  # fmt: skip
+    return np.asarray(by_offsets.T @ by_offsets)
 
 
 def _norm_evidence(
@@ -287,8 +308,8 @@ def _norm_evidence(
     of_turn_ons: bool = False,
 ) -> Floats:
     """
-    Return the log evidence of the mean norms of the mountings, for each sd of the offsets of
-    mountings, or with `of_turn_ons` of the offsets that the mountings of a turn-on share, (k,).
+    Return the log evidence of the mean norms of the mountings for each of k values of `offset_sd`,
+    the sd of the offsets of mountings or, with `of_turn_ons`, of turn-ons.
 
     `by_drifts`: root of the covariance without the norms, for the thermal weights
     """
@@ -366,7 +387,7 @@ def drift_variance(
 def _points(
     temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
 ) -> tuple[LackOfFit, ...]:
-    """Average the excess of some windows in at most 5 bins of temperature, 10 windows or more."""
+    """Average the excess in at most 5 bins of temperature, each of 10 windows or more."""
     n_bins = min(5, int(rows.sum()) // 10)
     if not n_bins:
         return ()

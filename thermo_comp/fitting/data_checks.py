@@ -146,8 +146,8 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,); 0 where it is noise: the mean
-    temperature changes by less than half of it from one window to the next.
+    Return the rate of the board temperature [K/min], shape (n,); 0 where the rate is noise: the
+    mean temperature changes by less than half of the rate from one window to the next.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
@@ -212,7 +212,7 @@ def _judge_positions(up: Floats) -> Finding:
             f'{n} positions determine bias and scale; the misalignment keeps its prior: it needs '
             f'{POSITIONS_FOR_MISALIGNMENT} well spread positions',
         )
-    advised = 18  # two positions per constant of the triad
+    advised = 18  # two positions for each of the nine constants
     if n < advised:
         return advice('positions', f'{n} positions; {advised} would reduce the uncertainty')
     return Finding('positions', 'good', f'{n} positions')
@@ -321,7 +321,7 @@ def judge_result(
     others = f'{left_out:.1f} ug on data left out, ' if overall.left_out.n else ''
     text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
-    # Up to twice the white noise, noise explains a residual.
+    # Noise explains a residual of up to twice the white noise.
     if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:
         why = 'temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
         if drift <= max(2.0 * noise, 0.3 * overall.fitted.rms):

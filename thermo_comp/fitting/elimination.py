@@ -79,7 +79,8 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower: it does not know triangles.
+        # `numpy.linalg.inv` of all factors at once is slower: it does not use that they are
+        # triangular.
         root = np.stack([inverse_root(factor).T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
@@ -180,9 +181,9 @@ class Reduced:
         Eliminate positions and bags from the equations of further unknowns, m of each axis.
 
         `rows`: normal equations of the further unknowns with the unknowns of the fit and the
-        residual, shape (n_positions, 3, m, k + 1). Returns what the elimination subtracts from the
-        Hessian of the further unknowns, shape (3 m, 3 m), and, after the elimination, their cross
-        block with the unit and their gradient, shape (n + 1, 3 m).
+        residual, shape (n_positions, 3, m, k + 1). Returns the reduction of the Hessian of the
+        further unknowns by the elimination, shape (3 m, 3 m), and, after the elimination, their
+        cross block with the unit and their gradient, shape (n + 1, 3 m).
         """
         layout, turned = self.layout, self.positions.turned
         n_positions, n_own, _ = turned.shape
@@ -268,7 +269,7 @@ def _variance(derivatives: Floats, root: Floats) -> Floats:
 
 
 def _square(*turned: Floats) -> Floats:
-    """Return what the elimination of blocks subtracts from the remaining equations, (k, k)."""
+    """Return the reduction of the remaining equations by the elimination of blocks, (k, k)."""
     rows = np.concatenate([block.reshape(-1, block.shape[2]) for block in turned])
     return np.asarray(rows.T @ rows)
 

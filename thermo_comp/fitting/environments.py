@@ -126,7 +126,7 @@ def with_excluded_error(
 ) -> tuple[Calibration, Finding]:
     """
     Add the error of the correction of excluded bags to the lack of fit of both sets; `others`
-    names what the bags contradict.
+    names the bags or the prior that these bags contradict.
     """
     windows = thermal_windows(bags, prior_model(calibration))
     regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)

@@ -181,8 +181,8 @@ class Equations(Series):
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
-        Return the combinations of a tangent: 1 + S s, the derivatives by kappa, by the force along
-        the axis and by the initial lag states, and the residual.
+        Return the combinations of the base series that a tangent uses, in this order: 1 + S s; the
+        derivatives by kappa, by the force along the axis, by the initial lag states; the residual.
         """
         force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]

@@ -157,7 +157,7 @@ def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupE
     Return RMS contribution, effective parameters and log Bayes factor of each group in use.
 
     The factor compares with a fit without the group, or, with an informative prior, with a fit in
-    which the group keeps the prior's mean: the prior knows that the group is not 0.
+    which the group keeps the prior's mean: by the prior the group is not 0.
     """
     names = np.array(regression.windows.groups)
     prior, state, layout = posterior.prior, posterior.state, posterior.layout

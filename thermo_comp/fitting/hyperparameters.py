@@ -62,10 +62,10 @@ def settle(
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
-        posterior = regression.solve(posterior.state, prior, n_steps=1)
         if change < 0.05:
             break
-    return posterior
+        posterior = regression.step(posterior.state, prior)
+    return regression.solve(posterior.state, prior, n_steps=1)
 
 
 def _updated(
@@ -88,8 +88,8 @@ def _updated(
     changes.append(change)
     tilt_sd = prior.tilt_sd
     if state.tilt.size:
-        # Scale of the half-normal prior: 15 urad/K, aluminium of 23 ppm/K heated unevenly, times
-        # the RMS of the board temperature about the reference, at least 1 K.
+        # Scale of the half-normal prior of tilts: 15 urad/K, aluminium of 23 ppm/K heated
+        # unevenly, times the RMS of the board temperature about the reference, at least 1 K.
         bound = 1.5e-5 * max(float(regression.windows.kelvins[0]), 1.0)
         square = (tilt_sd / bound) ** 2
         effective, power = determined[layout.tilt].sum(), np.sum(state.tilt**2)
@@ -98,8 +98,8 @@ def _updated(
         changes.append(float(np.abs(step)) / 3.0)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
-        # Elements count only if the data determine more than one of them.
+        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth. The
+        # elements are used only if the data determine more than one of them.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
@@ -109,8 +109,8 @@ def _updated(
         misalignment_sd = min(new_sd, 0.03)
     start_share = prior.start_share
     if layout.start.size:
-        # The run-time prior counts as one further state; else the states of one bag could make
-        # `start_share` very small.
+        # The prior of the node (`start_share` of 1) counts as one further state, so that the
+        # states of a single bag cannot make `start_share` very small.
         gamma = float(determined[layout.start].sum())
         start_share = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
         changes.append(float(np.abs(np.log(start_share / prior.start_share))) / 4.0)
@@ -155,7 +155,7 @@ def _offset_sd(posterior: Posterior) -> tuple[float, float]:
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, prior.offset_sd, slope, bend + 0.1)
-    # Bounds [m/s^2]: a thousandth of the prior's scale; 5 mg, typical of the cheapest MEMS.
+    # Bounds of the sd [m/s^2]: 1/1000 of the prior's scale; 5 mg, as of the cheapest MEMS.
     new = float(np.clip(prior.offset_sd * np.exp(step), 1e-3 * prior.offset_scale, 0.05))
     return new, float(np.abs(np.log(new / prior.offset_sd))) if effective > 1.0 else 0.0
 
@@ -182,7 +182,7 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     least = np.full(3, 1e-8)
     if not regression.windows.has_drifts:
         # Without columns that change the slow noise describes the whole drift of a position, and
-        # the white noise would be estimated as zero. Second differences do not contain a drift.
+        # the white noise would be estimated as zero. A drift cancels in second differences.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 

@@ -113,8 +113,8 @@ def _has_soaks(windows: ThermalWindows) -> bool:
 
 def _at_rest(data: Windows) -> Windows:
     """Return the windows with columns that are constant in each position."""
-    # A lag of unknown size changes the readings of a soak by as much as the remaining drift of the
-    # temperature does: norms of positions determine the curve, drifts within soaks do not.
+    # In a soak a lag of unknown size and the remaining drift of the temperature change the
+    # readings by similar amounts, so only the norms of the positions determine the curve.
     columns = data.columns - within_positions(data.columns, data.position)
     square, of_means = (np.mean(values**2, axis=0) for values in (data.columns, columns))
     kelvins = data.kelvins * np.sqrt(of_means / np.where(square > 0.0, square, 1.0))
@@ -161,14 +161,14 @@ def _initial_prior(
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior for a noisy sensor near the six faces, which hardly show the misalignment:
-    misalignments of some degrees would explain its other errors, to second order, so the sd for
-    the estimate is smaller than that in the covariance.
+    Return the prior with a smaller misalignment sd for a noisy sensor in positions near the six
+    faces. Faces hardly determine the misalignment, and misalignments of some degrees would explain
+    other errors of the norms to second order. The covariance keeps the larger sd.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    # Sd for the estimate [rad]: the cross-axis sensitivity of good consumer MEMS.
+    # Sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
     of_faces, sd = 2.5e-3, prior.misalignment_scale
-    # The RMS of `by_element` is below 0.1 for faces set by hand, a few degrees off; 0.3 for edges.
+    # The RMS of `by_element` is below 0.1 for faces within a few degrees, and 0.3 for edges.
     if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= of_faces:
         return prior
     return replace(prior, misalignment_sd=of_faces, unseen_misalignment_sd=sd)
@@ -214,9 +214,9 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
-    # Bounds: 30 ug, typical of navigation grade, and 0.5 mg, typical of consumer MEMS; the tail
-    # of the Student prior allows for more. The lower bound is smaller for almost no noise, because
-    # an offset 1e6 times as large as the noise cannot be estimated in double precision.
+    # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer MEMS; the
+    # tail of the Student prior allows for more. The lower bound is smaller for almost no noise,
+    # because an offset 1e6 times as large as the noise cannot be estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-6), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 
@@ -241,7 +241,7 @@ def _candidates(
         fixed[1] = parts[1]
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
-        # The paper's sets are not selected: their prior, ten times the largest sd, is flat.
+        # All columns of the paper's sets are kept; ten times the largest sd is a flat prior.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (
         np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, STEEPEST)

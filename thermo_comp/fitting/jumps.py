@@ -138,7 +138,7 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # Differences of neighbouring samples do not depend on a drift.
+    # Differences of neighbouring samples contain no drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -161,7 +161,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the sd of a mean over that for white noise of `sd`, for each axis, at least 1."""
+    """Return the sd of a mean / that under white noise of `sd`, for each axis, at least 1."""
     # The variance of 40 pieces' means is multiplied by (1 + r) / (1 - r), r being their lag-1
     # correlation.
     size = max(len(residual) // 40, 1)

@@ -63,8 +63,8 @@ class KnownForce:
     The known |f| of a bag over time; outside the sections |f| is gravity.
 
     stamp_ns, rate: readings of the rotation rate [rad/s], about a vertical axis
-    radius, radius_sd: distance of the unit from the axis, and its sd [m]; the fit estimates the
-        distance if the sd is above 0
+    radius, radius_sd: distance of the unit from the axis, and its sd [m]; with an sd above 0 the
+        fit estimates the distance
     """
 
     name: str

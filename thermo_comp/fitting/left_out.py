@@ -77,9 +77,9 @@ class Folds:
         Return the log ratio of the mean square error to that of another model, and its standard
         error, over the folds that both have; None without such folds.
 
-        The more significant of two estimates is returned if their signs are equal, else 0: the
-        mean over folds of their log ratios, which is robust to a few large folds, and the log
-        ratio of the sums with its jackknife error, which is robust to small folds.
+        There are two estimates: the mean over folds of their log ratios, robust to a few large
+        folds, and the log ratio of the sums with its jackknife error, robust to small folds. The
+        more significant is returned if their signs are equal, else 0.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -100,11 +100,11 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains the errors in the folds that another model has as well."""
+        """Whether white noise explains the errors in the folds that the other model has, too."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
-        # Up to 1.7 times the noise: in a soak, changes of the temperature by hundredths of a
-        # kelvin, whose lag is not known, add to the white noise.
+        # Errors of up to 1.7 times the noise count as noise: in a soak, changes of the temperature
+        # by hundredths of a kelvin, whose lag is not known, add to the white noise.
         return bool(square <= (1.7 * noise) ** 2)
 
 
@@ -138,7 +138,7 @@ class Score:
 
     @property
     def rms(self) -> float:
-        """RMS of the left-out drift: the larger of those of positions and of sections."""
+        """RMS of the left-out drift, the larger of the RMS over positions and over sections."""
         known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
         return max(known, default=float('nan'))
 
@@ -146,7 +146,7 @@ class Score:
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
     """
     Whether the second model is better on left-out data by more than the standard error;
-    `by_halves`: false for models of the same columns, whose number the halves limit.
+    `by_halves`: whether left-out halves count, which limit the number of columns.
     """
     return gain(before, after, by_halves=by_halves) > 0.0
 

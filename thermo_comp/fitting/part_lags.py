@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline
+from scipy.linalg.lapack import dposv
 from scipy.optimize import minimize, minimize_scalar
 
 from ..thermal.lags import Lag
@@ -104,7 +105,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         if (square <= (shape.most_noise * noise) ** 2).all():
             if shape.has_stress:
                 return parts
-            # Curves alone explain the drift; in left-out sections they are extrapolated.
+            # Curves alone explain the drift, but extrapolate to left-out sections.
             return replace(parts, most_drift=10.0 * float(noise.mean()))
         # A larger residual has another cause, for example slow noise: the lags are then accepted
         # only if they reduce the RMS residual of each axis to an eighth or less of the residual
@@ -131,8 +132,11 @@ class _PartCurves:
         _, self._first, self._position = np.unique(
             data.position[rows], return_index=True, return_inverse=True
         )
-        self._bag, self._age = data.bag[rows], data.age[rows]
-        self._weight = data.weight[rows, None]
+        self._age = data.age[rows, None]
+        self._is_of_bag = data.bag[rows, None] == np.arange(data.bag[-1] + 1.0)
+        self._root_weight = np.sqrt(data.weight[rows])[:, None]
+        self._share = data.weight[rows, None]
+        self._share = self._share / np.add.reduceat(self._share, self._first)[self._position]
         self._case = windows.gradient[rows]
         self._t = windows.temperature[rows] - windows.model.reference_temperature
         self._taus = np.array([columns[k].tau_s for k in of_board])
@@ -186,9 +190,8 @@ class _PartCurves:
         if self._square(best, axis) > enough:
             starts = [best]
             if self._has_case:
-                # The residual has a valley of several minima, along which this difference is
-                # constant: the time constant less the time by which the temperature between board
-                # and case leads the board.
+                # The residual has several minima in a valley, in which the time constant grows
+                # with the time by which the temperature between board and case leads the board.
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in starts):
@@ -280,7 +283,7 @@ class _PartCurves:
 
     def residual(self, lag: Part, axis: int) -> Floats:
         """Return the residuals of one axis in all windows, shape (n,) [m/s^2]."""
-        return np.asarray(self._weighted(lag, axis) / np.sqrt(self._weight[:, 0]))
+        return np.asarray(self._weighted(lag, axis) / self._root_weight[:, 0])
 
     def _square(self, lag: Part, axis: int) -> float:
         """Return the weighted sum of squared residuals of an axis."""
@@ -305,26 +308,27 @@ class _PartCurves:
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
         # The spline of the bias has a node every 0.6 K or more.
-        n_nodes = int(np.clip(span / 0.6, 4, self._shape.n_nodes))
-        inner = np.linspace(low, low + span, n_nodes)
-        knots = np.pad(inner, 3, mode='edge')
-        bias = BSpline.design_matrix(np.clip(x, low, low + span), knots, 3).toarray()
+        n_nodes = min(max(int(span / 0.6), 4), self._shape.n_nodes)
+        nodes = np.linspace(low, low + span, n_nodes)
+        knots = np.concatenate((nodes[[0] * 3], nodes, nodes[[-1] * 3]))
+        spline = BSpline.construct_fast(knots, np.eye(n_nodes + 2), 3)
+        bias = [spline(np.minimum(x, nodes[-1]))]
         u = (x / span)[:, None]
-        stress = (self._t - x)[:, None] * u ** np.arange(2.0 * self._shape.has_stress)
+        scale = [u, u * u, u * u * u]
+        if self._shape.has_stress:
+            m = (self._t - x)[:, None]
+            bias, scale = [*bias, m, m * u], [*scale, m, m * u]
         if self._shape.has_gradient:
-            bias = np.hstack((bias, self._case[:, None]))
-        scale = self._force[:, [axis]] * np.hstack((u ** np.arange(1, 4), stress))
+            bias.append(self._case[:, None])
+        of_scale = self._force[:, [axis]] * np.hstack(scale)
         # The lag of the part at the start of each bag is unknown and decays.
-        is_of_bag = self._bag[:, None] == np.arange(self._bag[-1] + 1)
-        begin = is_of_bag * np.exp(-self._age / max(lag.tau_s, 1.0))[:, None]
-        return self._centred(np.hstack((bias, stress, scale, begin)))
+        begin = self._is_of_bag * np.exp(-self._age / max(lag.tau_s, 1.0))
+        return self._centred(np.hstack((*bias, of_scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
         """Subtract the weighted mean over each position; multiply by the weights' roots."""
-        weighted = np.hstack((values, np.ones_like(self._weight))) * self._weight
-        sums = np.add.reduceat(weighted, self._first, axis=0)
-        level = sums[:, :-1] / sums[:, -1:]
-        return np.asarray((values - level[self._position]) * np.sqrt(self._weight))
+        level = np.add.reduceat(values * self._share, self._first)
+        return np.asarray((values - level[self._position]) * self._root_weight)
 
 
 def _in_two_stages(lag: Part) -> Part:
@@ -351,4 +355,4 @@ def _solved(series: Floats, measured: Floats) -> Floats:
     size = np.sqrt(np.diag(normal)) + 1e-12
     normal = normal / np.outer(size, size)
     normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors
-    return np.asarray(np.linalg.solve(normal, right / size) / size)
+    return np.asarray(dposv(normal, right / size)[1] / size)

@@ -132,7 +132,7 @@ def informative_priors(
     # Candidates of an added uncorrelated variance, relative to each variance of the prior.
     tried = [(grown(*stated), share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Candidates of the sd of ageing: of the biases [g], its multiple for the scale factors.
+        # Candidates of ageing: sd of biases [g], and sd of scale factors / sd of biases.
         tried += [
             (grown(ageing * options.gravity, multiple * ageing), 0.0)
             for multiple in (0.3, 1.0)
@@ -221,9 +221,9 @@ def _scatter(deviations: Floats, layout: ParameterLayout) -> Floats:
     """
     Return the covariance of units from their distances to the mean / sqrt(n - 1), (n, p).
 
-    The constants of a unit are taken as independent of each other and of its curves: in the
-    scatter of a few units they have correlations by chance, by which one position would determine
-    all of them. The correlations of the curves are multiplied by 1 - share [1]_.
+    The constants of a unit are taken as independent of each other and of the curves. With the
+    correlations by chance between few units, one position would determine all constants. The
+    correlations of the curves are multiplied by 1 - share [1]_.
     """
     kind = np.zeros(deviations.shape[1], np.int64)
     levels = [[block.static, block.dynamic] for block in (*layout.bias, *layout.scale)]
@@ -302,7 +302,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 def _relative_to(
     calibration: Calibration, template: Calibration, mean_K: Floats
 ) -> tuple[Floats, Floats]:
-    """Return a unit's parameters and covariance in the layout of `like`, relative to `mean_K`."""
+    """Return a unit's parameters and covariance in `template`'s layout, relative to `mean_K`."""
     if calibration.posterior is None:
         raise FitError(
             f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '

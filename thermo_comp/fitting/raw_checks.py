@@ -139,7 +139,7 @@ class _DeadAxis(NamedTuple):
 
 
 def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
-    """Explain constant readings: clipped if several axes or signs have the largest, or dead."""
+    """Explain constant readings: an axis is clipped at the largest reading, or dead."""
     largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
     # The limits of a two's complement differ by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)

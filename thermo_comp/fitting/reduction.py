@@ -263,8 +263,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # A cell may hold a sample more or less than the next one. Cells with lost samples do not
-    # count, unless the counts of most cells differ, as those of samples in bursts.
+    # The numbers of samples of two cells may differ by one. Cells with lost samples are left out,
+    # unless the numbers of most cells differ, as for samples in bursts.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
@@ -305,8 +305,8 @@ def is_spike(value: Floats) -> Bools:
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
-        # The first and the last reading have neighbours on one side only, where the change of a
-        # ramp continues.
+        # The first and the last reading have neighbours on one side only: the step to the
+        # neighbour is that of a ramp if the next step is similar.
         for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
             step, after = np.abs(np.diff(nearest)).tolist()
             far[place] = step > 10.0 and after < CONTINUED_SHARE * step
@@ -353,8 +353,8 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
 def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:
     """
     Join rests that are separated by a vibration without motion, if this happens six times or more,
-    as with a compressor that cycles: a parabola describes the four cells on either side of the
-    vibration, with a mean squared residual below 4 variances.
+    as with a compressor that cycles. There is no motion if a parabola fits the four cells on
+    either side of the vibration with a mean squared residual below 4 variances.
     """
     is_calm = stillness.is_under(cells, still_sd)
     result = ranges[:1]

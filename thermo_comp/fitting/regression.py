@@ -141,7 +141,7 @@ class Point:
     @cached_property
     def reduced(self) -> Reduced:
         """The normal equations of the unit, with the unknowns of positions and bags eliminated."""
-        return self._reduced(self.normal)
+        return self._reduced(self.normal, self.deviation)
 
     @property
     def norm_by_axes(self) -> Floats:
@@ -161,9 +161,9 @@ class Point:
             result[:, places] += self.norm_by_axes[:, [axis]] * of_unit
         return result
 
-    def _reduced(self, normal: Normal) -> Reduced:
+    def _reduced(self, normal: Normal, deviation: Floats) -> Reduced:
         in_sigmas = normal.scaled(self.prior.sigma**-2.0)
-        reduced = eliminate(in_sigmas, self.layout, self.precision, self.deviation)
+        reduced = eliminate(in_sigmas, self.layout, self.precision, deviation)
         if self._has_common_start:
             total = self.state.start.sum(axis=0)
             reduced = reduced.with_prior_of_sum(total, self._common_variance)
@@ -181,6 +181,16 @@ class Point:
             places = np.flatnonzero(mounting == number)
             normal = self.tangent.at(places).normal(at_state[places])
             yield places, self.reduced.without(places, normal.scaled(self.prior.sigma**-2.0))
+
+    def by_offset(self, places: Ints, axis: int) -> Floats:
+        """
+        Return the derivatives of the unit's unknowns by the prior mean of a bias offset that some
+        positions share, shape (n_unit,).
+        """
+        deviation = self.deviation.copy()
+        deviation[self.layout.offset[places, axis]] -= 1.0
+        step, _ = self.unit_step(self._reduced(self.normal, deviation).whole)
+        return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
         """
@@ -217,7 +227,8 @@ class Point:
 
     def linear_step(self) -> Floats:
         """Return the step with the nonlinear unknowns held by a damping factor."""
-        return self._solution(self._reduced(_damped(self.normal, self.layout)))[0]
+        reduced = self._reduced(_damped(self.normal, self.layout), self.deviation)
+        return self._solution(reduced)[0]
 
     def moved(self, step: Floats) -> Point:
         """Add a step to the state of the regression."""
@@ -267,9 +278,9 @@ class Point:
         if reduced.common is not None:
             of_prior += layout.start.shape[1] * float(np.log(prior.start_share))
         log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
-        evidence = -0.5 * (self.misfit + end.prior_misfit + log_hessian - of_prior)
+        evidence = -0.5 * (end.misfit + end.prior_misfit + log_hessian - of_prior)
         return Posterior(
-            *(prior, end.state, layout, determined, unit_root, variance, self.square, evidence)
+            *(prior, end.state, layout, determined, unit_root, variance, end.square, evidence)
         )
 
 
@@ -304,6 +315,13 @@ class Regression(Equations):
                 return point.posterior(end)
             point = end
         return point.posterior(point)
+
+    def step(self, state: State, prior: Prior) -> Posterior:
+        """Take one step towards the mode; the covariance is that of the equations at `state`."""
+        self.whiten(prior.noise)
+        point = self.at(state, prior)
+        end = point.stepped()
+        return point.posterior(end if end.energy <= point.energy else point)
 
     def inactive(self, posterior: Posterior, wanted: Bools) -> Inactive:
         """Return sparsity and quality factors of inactive columns, (m,), at the mode."""

@@ -4,7 +4,7 @@
 Owns the choice of the model: groups of columns are added to the constants one at a time.
 
 The log evidence ranks the groups to be tried; the score on left-out data decides. The fit of each
-model begins from that of a smaller one.
+model begins from the fit of a smaller model.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Fit(NamedTuple):
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
-    """Compare the chosen model with each trial in turn; return the better one each time."""
+    """Compare the chosen model with each trial in turn, keep the better model, return the last."""
     for trial in trials:
         if is_better(chosen.score, trial.score):
             chosen = trial
@@ -160,8 +160,8 @@ class Growth:
 
     def lowest_degree(self, constants: Trial) -> Trial:
         """
-        Fit the curve with its first column, and add columns whose gain in log density exceeds
-        `TRIAL_GAIN`: many curves explain norms alone.
+        Fit the curve with its first column, and with more columns if they gain more than
+        `TRIAL_GAIN` in log density: norms alone are explained by many curves.
         """
         prior = constants.posterior.prior
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
@@ -186,8 +186,8 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # At most 60 of the many bend columns are tried, chosen by forward selection: 20 for
-            # each axis, as many as a bump of its curve needs.
+            # Forward selection chooses at most 60 bend columns: a bump in the curve of an axis
+            # needs 20.
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
@@ -207,8 +207,8 @@ class Growth:
 
     def _typical(self, chosen: Trial, groups: tuple[str, ...], most: Floats) -> Floats:
         """
-        Return the typical prior sd of a model with further groups: that of a new column
-        corresponds to the RMS residual of the chosen model, up to `most`.
+        Return the typical prior sd of a model with further groups. The sd of a new column is the
+        slope that explains the RMS residual of the chosen model, at most `most`.
         """
         regression, posterior = self.regression, chosen.posterior
         kelvins = regression.windows.kelvins
@@ -233,7 +233,7 @@ def better_start(fits: Sequence[Trial]) -> Trial:
 
 
 def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
-    """Return the model with the largest gain, or a smaller one that is not significantly worse."""
+    """Return the model of the largest gain, or a smaller model that is not significantly worse."""
     best = max(better, key=lambda trial: gain(before.score, trial.score))
     for trial in sorted(better, key=lambda trial: len(trial.groups)):
         if trial is best or not is_better(trial.score, best.score):
@@ -269,7 +269,7 @@ def select(
         trials.append(first)
     parts = None
     if PART in growth.free:
-        # Curves over the temperatures of parts take the place of the curve over that of the board.
+        # Curves over the temperatures of parts replace the curve over the board temperature.
         parts = better_start([growth.extended(fit, (PART,)) for fit in fits])
     chosen, tried = _grown(growth, first, parts, progress)
     trials += tried
@@ -330,7 +330,7 @@ def fit_all(
     candidates: Candidates,
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
-    """Fit all columns; of several informative priors take that of the largest log evidence."""
+    """Fit all columns; of several informative priors use that of the largest log evidence."""
     posterior = settle(regression, state, prior, candidates)
     downweigh(regression, posterior)
     posterior = settle(regression, posterior.state, posterior.prior, candidates)

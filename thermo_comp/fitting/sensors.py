@@ -138,7 +138,7 @@ def _rate_histories(
         n_bins = int(time[-1] / _BIN_S)
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a bin is the difference of the integral at its edges over its length.
+        # The mean over a bin is the difference of the integral at its edges / its length.
         integral = cumulative_trapezoid(readings.value, time, initial=0)
         edges = np.interp(np.arange(n_bins + 1) * _BIN_S, time, integral)
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side

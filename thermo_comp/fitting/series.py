@@ -149,9 +149,9 @@ def _vertex(values: Floats, at: int) -> float:
 @dataclass(frozen=True)
 class Base:
     """
-    The base series of some columns, in their order: 1, the columns, the derivatives of those with
-    a lag by its initial state, t, the temperatures of the support, the measured values of the
-    three axes less their mean in the position.
+    The base series of some columns, in this order: 1; the columns; for each column with a lag its
+    derivative by the lag's initial state; t; the temperatures of the support; the measured values
+    of the three axes less their mean in the position.
 
     columns: the active columns; moved: places in `columns` of the columns with a lag
     lag: number of the lag of each moved column
@@ -304,8 +304,8 @@ class Series:
 
     def at_starts(self, rows: Floats, state: State, base: Base) -> Floats:
         """
-        Replace the columns at the prior mean of the initial lag states by those at a state, in
-        linear functions of the base series, shape (n_positions, k, n_base).
+        Convert linear functions of the base series, shape (n_positions, k, n_base), from columns
+        at the prior mean of the initial lag states to columns at the lag states of `state`.
         """
         if not len(base.moved):
             return rows

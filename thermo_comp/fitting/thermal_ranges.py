@@ -55,7 +55,7 @@ def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range |
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
     rate = 60.0 * np.abs(windows.rate)
-    # The slowest tenth of the windows, if the rate is noisy.
+    # If the rate is noisy, take the slowest tenth of the windows.
     slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
     is_soak = rate <= slowest
     if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:

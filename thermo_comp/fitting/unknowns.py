@@ -28,8 +28,8 @@ MISALIGNMENT_SD = 1e-3
 def misalignment_scale(noise: float) -> float:
     """
     Return the built-in prior sd of an element of the misalignment [rad], by the noise in 1 Hz
-    [m/s^2]: 1 mrad up to 10 ug, typical of navigation grade sensors on machined faces, above
-    proportional to the noise, up to 1 %, the cross-axis sensitivity of consumer MEMS.
+    [m/s^2]. It is 1 mrad for a noise up to 10 ug (navigation grade, machined faces) and
+    proportional to a larger noise, up to 10 mrad (cross-axis sensitivity of consumer MEMS).
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))
 
@@ -42,7 +42,7 @@ class Windows:
     position, bag: numbers from 0; a position lies in one bag, shape (n,)
     section: number of the program section, from 0, rising with time in each bag, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
-    weight: samples of the window over those of a typical one, shape (n,)
+    weight: number of samples divided by that of a typical window, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
     columns: values of the columns in their physical units, with the initial lag states at their
         prior mean, shape (n, m)
@@ -53,7 +53,7 @@ class Windows:
     start: derivative of each column by the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: columns that the scale may have as well as the bias, shape (m,)
-    tilt: temperatures with which a support may tilt, over their RMS, shape (n, k)
+    tilt: temperatures with which a support may tilt, divided by their RMS, shape (n, k)
     forces: known |f| and nonlinear terms; None if |f| is gravity in all positions
     undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,); None if the fit
         estimates them
@@ -87,7 +87,7 @@ class Windows:
 
     @cached_property
     def share(self) -> Floats:
-        """Prior sd of each axis's weights over that of the column, 1e-6 if it has none, (3, m)."""
+        """Prior sd of each axis's weights / prior sd of the column; 1e-6 for no weight, (3, m)."""
         acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(acts.T, 1.0, 1e-6)
 
@@ -153,7 +153,7 @@ class Noise(NamedTuple):
     """
     Gauss-Markov part of the noise.
 
-    ratio: its stationary variance over the white variance of a typical window; 0 for none
+    ratio: its stationary variance / white variance of a typical window; 0 without this part
     time_s: its correlation time [s]
     """
 
@@ -162,7 +162,7 @@ class Noise(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Rate of the equivalent random walk at short times over the white sd [1/sqrt(s)]."""
+        """Rate of the equivalent random walk at short times / white sd [1/sqrt(s)]."""
         return math.sqrt(2.0 * self.ratio / self.time_s)
 
 
@@ -197,7 +197,7 @@ class Prior:
     unseen_misalignment_sd: sd of the elements of M in the covariance, if the positions do not show
         them; `misalignment_sd` is then constant and smaller [rad]; 0 else
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
-    start_share: variance of the initial lag states over that of the run-time prior
+    start_share: variance of the initial lag states / their variance in the node's prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive coefficient, shape (2 k,)
     informative: replaces all other sd of the unit's parameters; column_sd then only gives the
@@ -322,7 +322,7 @@ class Layout:
 
     @property
     def n_local(self) -> int:
-        """Number of unknowns of each axis that are not the unit's."""
+        """Number of unknowns of each axis that belong to positions and bags."""
         return len(self.of_axis[0]) + len(self.start[0])
 
     @cached_property

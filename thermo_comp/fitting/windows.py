@@ -175,7 +175,7 @@ class ThermalWindows:
 
     @property
     def was_measured(self) -> bool:
-        """Whether the columns depend on a recorded temperature, even a constant one."""
+        """Whether the columns depend on a recorded temperature, which may be constant."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
 
     @property
@@ -250,8 +250,8 @@ def thermal_windows(
 
 def _turn_ons(bags: Sequence[ReducedBag]) -> Ints:
     """
-    Return the number of each bag's turn-on, shape (n_bags,): a bag that begins where another one
-    ends, as the parts of a split recording, continues its turn-on.
+    Return the number of each bag's turn-on, shape (n_bags,): a bag that begins where another bag
+    ends, as in a split recording, continues the turn-on of that bag.
     """
     result = np.arange(len(bags))
     for number in sorted(range(len(bags)), key=lambda number: bags[number].start_ns):
@@ -283,7 +283,6 @@ def _rows(
     board, weight = states[BOARD], states[WEIGHT]
     raw, (factors, _) = table.raw(states), table.factors(board, weight)
     curves = model.sets.columns(board - model.reference_temperature, weight)
-    # Derivative of each column by the initial state of its lag.
     by_start = np.zeros_like(raw)
     slopes = table.slopes(states)[0] * factors
     for k, column in enumerate(table.columns):
@@ -360,7 +359,7 @@ def _sections(position: Ints, time: Floats) -> Ints:
 def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Floats) -> Floats:
     """
     Return the temperature change that corresponds to the RMS of each column [K], shape (m,): the
-    RMS over the largest slope of the column in these data; 0 for a column that is constant.
+    RMS divided by the largest slope of the column in these data; 0 for a constant column.
     """
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0

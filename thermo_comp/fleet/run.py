@@ -61,7 +61,7 @@ class FleetResult:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every unit has a calibration from all of its bags that is valid on them."""
+        """Whether every unit has a valid calibration, fitted to all of its bags."""
         return all(is_valid(row) and not (row['n_left_out'] or row['n_torn']) for row in self.rows)
 
 
@@ -141,9 +141,9 @@ def _in_prior(row: Row) -> bool:
 
 def lacks_data(row: Row) -> bool:
     """
-    Whether a unit's data are incomplete, so that the prior of the type replaces what is missing.
+    Whether a unit's data are incomplete, so that the prior of the type replaces missing data.
 
-    A test whose data contradict themselves or the fit lacks nothing: a prior would hide this.
+    Data that contradict themselves or the fit are not incomplete: a prior would hide the fault.
     """
     is_contradicted = str(row['verdict']) in _CONTRADICTIONS
     return row['is_whole'] == 0 and not is_contradicted

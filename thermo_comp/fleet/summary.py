@@ -154,8 +154,8 @@ def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
 
 def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
     """
-    Choose the units whose data determine a quantity: in order of their own sd, all units before
-    the first whose own sd is more than five times the spread of the units up to it.
+    Choose the units whose data determine a quantity: units are added in the order of their own sd,
+    until an own sd exceeds five times the spread of the units so far.
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)

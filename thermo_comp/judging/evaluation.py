@@ -30,7 +30,7 @@ from .windows import WINDOW_S, corrected_windows, sum_length
 # Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
 _NOISES = 4.0
 # Smallest significant change of a constant between calibrations, in standard deviations.
-_SURE_SDS = 3.0
+_SIGNIFICANT_SDS = 3.0
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class Drift:
         """
         Whether the change of a constant is significant given the uncertainty of both calibrations.
         """
-        return abs(self.change) > _SURE_SDS * self.sd
+        return abs(self.change) > _SIGNIFICANT_SDS * self.sd
 
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:

@@ -23,7 +23,7 @@ from .windows import Windows
 # Claimed sd above which a valid calibration is called wide [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
 # Smallest significant shift of bias or scale, in standard deviations.
-_SURE_SDS = 3.0
+_SIGNIFICANT_SDS = 3.0
 # Smallest sd assumed for a misalignment [rad], and for the relative error of a position's mean
 # |f|.
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_MISS = 1e-5, 1e-8
@@ -265,7 +265,7 @@ def change_texts(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
             ('bias', shift.bias / MICRO_G, shift.bias_sd / MICRO_G, 'ug'),
             ('scale', 1e6 * shift.scale, 1e6 * shift.scale_sd, 'ppm'),
         ):
-            if abs(value) > _SURE_SDS * sd:
+            if abs(value) > _SIGNIFICANT_SDS * sd:
                 # The sd is printed with two digits and without an exponent.
                 digits = max(0, 1 - int(np.floor(np.log10(sd)))) if sd > 0.0 else 3
                 collected.append(f'{axis} {name} {value:+.{digits}f} +- {sd:.{digits}f} {unit}')

@@ -101,7 +101,7 @@ def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats
 
 
 def by_force(windows: Windows, claimed: Floats) -> dict[float, Section]:
-    """Summarise the residuals by known |f| [m/s^2]; empty if it is gravity in all windows."""
+    """Summarise the residuals by known |f| [m/s^2]; empty if |f| is gravity in all windows."""
     if windows.is_usual.all():
         return {}
     order = np.argsort(windows.size, kind='stable')

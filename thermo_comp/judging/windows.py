@@ -239,7 +239,7 @@ def _table(
             whole['force'] = whole['mean']
         else:
             _correct(calibration, bag, whole)
-        # Drop partial sums with lost messages, or that the end of the bag has cut.
+        # Drop partial sums with lost messages, or cut by the end of the bag.
         few = _LEAST_FILLED * np.median(whole['count']) if len(whole) else 0.0
         whole['excess'][whole['count'] < few] = np.nan
         parts.append(_joined(whole.reshape(-1, per)))
@@ -264,8 +264,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    # A partial sum contains many samples, so its stamp is right even if it is more than 15 s later
-    # than the partial sum and the reading before it, as with a slow thermometer.
+    # Accept any forward step: the stamp of a partial sum is a mean of many samples.
     compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))

@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # A full queue of readings applies the oldest readings, as in the node; once a sample
-            # has been received, it applies only those before the next sample.
+            # A full queue applies its oldest readings, as in the node, but after the first sample
+            # only those before the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -229,8 +229,8 @@ def _corrected(
     correction: Correction | None = None,
 ) -> Floats:
     """
-    Return force and row-major covariance (12, n) of segments; without the correction of the force
-    angular rates and their variances, (6, n).
+    Return force and row-major covariance of segments, (12, n), or, without the correction of the
+    force, angular rates and their variances, (6, n).
     """
     each = [segment for segment, _ in segments]
     start_ns = np.array([segment.start_ns for segment in each], dtype=np.int64)

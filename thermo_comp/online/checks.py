@@ -30,7 +30,7 @@ LARGEST_RATE: Final = 1.5
 #: or duration [s].
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
-#: Largest relative deviation from the calibrated sample rate at which its noise applies.
+#: Largest relative deviation from the calibrated rate at which the calibrated noise applies.
 RATE_TOLERANCE: Final = 0.1
 _WINDOW_S: Final = 1.0  # time over which the rate of samples is measured [s]
 #: Duration of a window of the gravity check [ns]: shortest, and longest if samples are few.
@@ -154,10 +154,10 @@ class GravityCheck:
         self._tolerance = tolerance or math.inf
         # |f| of the last windows differed from gravity by more than the tolerance.
         self.is_refuted = False
-        self._n_alike = 0
+        self._n_agreeing = 0
         self._is_against = False
         self._forces: list[Sequence[float]] = []
-        #: Samples since |f| stepped from one rest to another, and the stamp of the first of them.
+        #: Samples since |f| stepped from one rest to another, and the stamp of the first sample.
         self._off: list[Sequence[float]] = []
         self._off_ns = 0
         self._is_resting = False  # whether the last sample agreed with the last still window
@@ -174,9 +174,7 @@ class GravityCheck:
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """
-        Take a sample, its covariance xx .. zz, and the part of the covariance's trace by noise.
-        """
+        """Take a sample, its covariance xx .. zz, and the noise part of the covariance's trace."""
         self._watch_step(stamp_ns, force, covariance, noise)
         if (
             not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
@@ -200,8 +198,7 @@ class GravityCheck:
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
-        # Two samples at rest differ by the largest change plus four sd of their difference at
-        # most, as do the means in `_close`.
+        # Limit of the difference of two samples at rest, with four sd of its noise.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = (
             self._is_resting,
@@ -219,7 +216,7 @@ class GravityCheck:
             self._off_ns = stamp_ns
         self._off.append(force)
         if stamp_ns - self._off_ns >= STEP_NS:
-            self._is_against, self._n_alike, self.is_refuted = True, REFUTING_WINDOWS, True
+            self._is_against, self._n_agreeing, self.is_refuted = True, REFUTING_WINDOWS, True
             mean = [math.fsum(values) / len(self._off) for values in zip(*self._off, strict=True)]
             residual = math.hypot(*mean) - self.gravity
             n = self.result.n_windows if self.result else 0
@@ -234,8 +231,7 @@ class GravityCheck:
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
         last, self._last_mean = self._last_mean, mean
-        # The means of two windows differ by noise, too: allow four standard deviations of this
-        # noise.
+        # Limit of the difference of two means at rest, with four sd of its noise.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         is_still = (
             scatter <= SCATTER_FACTOR**2 * noise_variance
@@ -246,8 +242,7 @@ class GravityCheck:
             self.result = self.result and self.result._replace(is_still=False)
             return
         size = math.hypot(*mean)
-        # The calibration's error is common to the samples of a window, the samples' noise averages
-        # out.
+        # The noise of the samples averages out in a window, the calibration's error does not.
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
         if self._judge(abs(size - self.gravity), math.sqrt(variance)):
@@ -267,8 +262,8 @@ class GravityCheck:
         """
         was_against = self._is_against
         is_against = residual > self._tolerance + REFUTING_SIGMAS * sd
-        self._n_alike = self._n_alike + 1 if is_against == self._is_against else 1
+        self._n_agreeing = self._n_agreeing + 1 if is_against == self._is_against else 1
         self._is_against = is_against
-        if self._n_alike >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
+        if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
             self.is_refuted = is_against
         return is_against != was_against

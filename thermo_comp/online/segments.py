@@ -41,8 +41,8 @@ UNMEASURED_SD_K: Final = 10.0
 
 class SlowState(NamedTuple):
     """
-    What determines the slow part of the variance: the thermal state, and of the lags' unknown
-    initial states the remaining shares and `ThermalMemory.start_rate`.
+    Arguments of the slow part of the variance: the thermal state, the remaining shares of the
+    lags' unknown initial states, `ThermalMemory.start_rate`.
     """
 
     state: tuple[float, ...]
@@ -117,7 +117,8 @@ class ThermalSide:
         self._slow = _NO_STATE
         self._slow_evaluated = _NO_STATE
         self._slow_rows: Floats = np.empty(0)
-        #: End and thermal state of the last segment, where the next one begins without a reading.
+        #: End and thermal state of the last segment: without a reading the next segment begins
+        #: there.
         self._last_end: tuple[int, int, tuple[float, ...]] | None = None
 
     def _new_tracker(self) -> ThermalTracker:
@@ -253,8 +254,8 @@ class ThermalSide:
         if key != self._slow_key:
             self._slow_key = key
             if self.is_unmeasured:
-                # Without a temperature reading, evaluate the variance one sd of the temperature
-                # from the reference temperature.
+                # Without a temperature reading, evaluate the variance at a temperature one sd from
+                # the reference temperature.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             memory = self.tracker.memory
             shares = memory.start_shares(start_ns + SEGMENT_NS)

@@ -60,7 +60,7 @@ class Counters(Dropped):
 
 
 class GravityResidual(NamedTuple):
-    """Mean |f| - g of still windows [m/s^2], its sd, their number; was the last window still?"""
+    """Mean |f| - g of still windows [m/s^2]; `is_still`: whether the last window was still."""
 
     residual: float
     residual_sd: float

@@ -10,10 +10,10 @@ from .stillness import Cells
 
 # Share of faulty samples below which the fault is a glitch, and above which all samples are taken
 # to be faulty.
-_SOME, _MOST = 0.01, 0.5
+_GLITCH_SHARE, _FAULT_SHARE = 0.01, 0.5
 # Ratio of |a| at rest to gravity: range if the samples contain gravity, upper limit if gravity is
 # subtracted from them.
-_ABOUT_ONE, _NONE = (0.8, 1.25), 0.3
+_WITH_GRAVITY, _WITHOUT_GRAVITY = (0.8, 1.25), 0.3
 
 
 class CauseCounter:
@@ -38,7 +38,7 @@ class CauseCounter:
 
     def cause(self, cells: Cells, still_sd: float) -> str:
         """Describe the fault of the samples; empty if they may be an accelerometer's."""
-        if self._n_absent > _MOST * self._n:
+        if self._n_absent > _FAULT_SHARE * self._n:
             return (
                 'its messages say that they hold no acceleration '
                 '(linear_acceleration_covariance[0] = -1): another topic of the driver has it'
@@ -47,7 +47,7 @@ class CauseCounter:
             return unstamped(next(iter(self._stamps_ns)))
         if self._n_zero == self._n and self._n:
             return 'all its samples are exactly zero: the sensor does not answer'
-        if self._n_zero > _SOME * self._n:
+        if self._n_zero > _GLITCH_SHARE * self._n:
             share = 100.0 * self._n_zero / self._n
             return (
                 f'{share:.0f} % of its samples are exactly zero, between others: two sources on '
@@ -64,12 +64,12 @@ class CauseCounter:
         norm = float(np.median(np.linalg.norm(cells.mean[quiet], axis=1)))
         sd = float(np.sqrt(np.median(scatter[quiet])))
         for unit, one_g in (('g', 1.0), ('mg', 1000.0)):
-            if _ABOUT_ONE[0] < norm / one_g < _ABOUT_ONE[1] and sd < still_sd * one_g:
+            if _WITH_GRAVITY[0] < norm / one_g < _WITH_GRAVITY[1] and sd < still_sd * one_g:
                 return (
                     f'it reads {norm:.4g} at rest, where m/s^2 would read {STANDARD_GRAVITY:.2f}: '
                     f'its samples are in {unit}, make them m/s^2 with thermo_comp convert'
                 )
-        if norm < _NONE * STANDARD_GRAVITY and sd < still_sd * STANDARD_GRAVITY:
+        if norm < _WITHOUT_GRAVITY * STANDARD_GRAVITY and sd < still_sd * STANDARD_GRAVITY:
             return (
                 f'it reads {norm:.2g} m/s^2 at rest: gravity is subtracted (a linear or free '
                 'acceleration), but the fit needs it: use another topic of the driver'

@@ -25,8 +25,9 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
     Return the spread of the variances of cells at rest relative to white noise, per axis.
 
     After a low pass a cell has few independent samples. With a correlation r of successive samples
-    their effective number is smaller by the factor (1 - r) / (1 + r), and the roughness is 1 - r
-    times the variance, which follows from its tenth percentile `level` and this number.
+    the effective number is (1 - r) / (1 + r) of the number of samples, and the roughness is 1 - r
+    of the mean variance. The mean variance follows from the tenth percentile `level` and the
+    effective number.
     """
     n_free = float(np.median(cells.count[plausible])) - 1.0
     quiet = plausible & (cells.variance <= level).any(axis=1)
@@ -35,10 +36,10 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
     for axis in range(3):
         n = n_free
         for _ in range(_ITERATIONS if level[axis] > 0.0 else 0):
-            white = min(rough[axis] / level[axis] * _part_of_mean(n, _TENTH), 1.0)
+            white = min(rough[axis] / level[axis] * _quantile(n, _TENTH), 1.0)
             n = max(n_free * white / (2.0 - white), _FEWEST_FREE)
         if n < _COLOURED * n_free:
-            tails = [_part_of_mean(k, _NEVER) / _part_of_mean(k, _TENTH) for k in (n, n_free)]
+            tails = [_quantile(k, _NEVER) / _quantile(k, _TENTH) for k in (n, n_free)]
             result[axis] = tails[0] / tails[1]
     return result
 
@@ -56,16 +57,16 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
         tenth, median = np.quantile(cells.roughness[quiet, axis], (0.1, 0.5))
         n_free = float(np.median(cells.count[quiet])) - 1.0
         frees = np.geomspace(_FEWEST_FREE, n_free, _ITERATIONS) if n_free > _FEWEST_FREE else ()
-        shares = [_part_of_mean(n, _TENTH) / _part_of_mean(n, 0.0) for n in frees]
+        shares = [_quantile(n, _TENTH) / _quantile(n, 0.0) for n in frees]
         n = float(np.interp(tenth / max(median, 1e-300), shares, frees)) if shares else n_free
-        widest = _part_of_mean(n, _NEVER) / _part_of_mean(n, 0.0)
-        usual = _part_of_mean(n_free, _NEVER) / _part_of_mean(n_free, 0.0)
+        widest = _quantile(n, _NEVER) / _quantile(n, 0.0)
+        usual = _quantile(n_free, _NEVER) / _quantile(n_free, 0.0)
         floor = 0.25 * cells.quantum[axis] ** 2
         result[axis] = ratio * max(median * max(widest / usual, 1.0), floor)
     return result
 
 
-def _part_of_mean(n_free: float, sigmas: float) -> float:
-    """Quantile of a chi-square variance in parts of its mean (Wilson and Hilferty)."""
+def _quantile(n_free: float, sigmas: float) -> float:
+    """Quantile of a chi-square variance / its mean (approximation of Wilson and Hilferty)."""
     width = 2.0 / (9.0 * n_free)
     return float((1.0 - width + sigmas * np.sqrt(width)) ** 3)

@@ -38,7 +38,7 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
         far[1:-1] = bend > limit
         if far.any():
             far[1:-1] &= np.abs(x[2:] - x[:-2]) < 0.5 * bend
-    # Beyond its two neighbours, which bend with it, a glitch has three calm samples on each side.
+    # Beyond its two neighbours, a glitch has three calm samples on each side.
     at = np.flatnonzero(is_far.any(axis=1))
     beside = np.array([-4, -3, -2, 2, 3, 4])
     around = np.clip(at[:, np.newaxis] + beside, 0, len(samples) - 1)

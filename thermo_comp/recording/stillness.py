@@ -44,7 +44,7 @@ _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a cell of slow samples may last
 _LONGEST_CELL_NS = 86400e9  # a longer cell is due to wrong stamps [ns]
 MIN_SAMPLES = 30  # smallest number of samples in a cell
-_LARGEST = 1e100  # largest valid sample: the square of a larger one may overflow
+_LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
 _WORD = 32768.0  # the middle of unsigned 16-bit words
 _LONGER = (23, 31)  # magnitude bits of 24- and 32-bit words
 _STUCK = 0.3  # ratio of noise to quantum below which a sensor mostly repeats one number
@@ -162,7 +162,7 @@ class CellAccumulator:
     def finish(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # joined once, for the next call
+        self._sums = [sums]  # the joined array, for the next call
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
@@ -195,9 +195,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # Samples that are stamped on their arrival come in bursts at a constant interval, of 5
-            # s at most, as of a buffer that is polled; the pauses of a tumble by hand differ. A
-            # cell contains two bursts.
+            # A polled buffer gives bursts of samples at a constant interval of 5 s at most, unlike
+            # the pauses of a tumble by hand. A cell contains two bursts.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -261,7 +260,7 @@ def _quantum_of(samples: Floats) -> Floats:
         changes = np.sort(changes[changes > 0.0])
         if not len(changes):
             continue
-        # Equal multiples of a step differ by rounding only.
+        # Changes by the same multiple of the step differ by rounding only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         # All changes must be whole multiples of the smallest change.
         steps = changes / changes[0]
@@ -376,7 +375,7 @@ def is_under(cells: Cells, still_sd: float) -> Bools:
 
 
 def _is_turning(cells: Cells) -> Bools:
-    """Whether the gyroscope shows a cell to shake or turn, relative to its drifting level."""
+    """Whether the unit shakes or turns in a cell, by the angular rate less its drifting level."""
     shakes = (cells.rate_variance > _STILL_RATE_SD**2).any(axis=1)
     calm = np.flatnonzero(~shakes)
     if not len(calm) or not cells.rate.any():

@@ -205,7 +205,7 @@ def select_topics(
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    among = ["driver's", 'only']  # the topic with the usual name, and the only one of its type
+    among = ["driver's", 'only']  # the topic with the usual name, and the only topic of its type
     chosen = [
         choice_note(
             name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]
@@ -265,7 +265,7 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # of several possible Imu topics none is chosen
+            return  # several Imu topics are ambiguous
 
 
 def _corrected(present: Present, metadata: Mapping[str, str]) -> str:

@@ -44,8 +44,8 @@ class StateResult(NamedTuple):
     """
     One axis in a soak or a ramp at one temperature of the board.
 
-    Each deviation is that of the preceding value from the straight line over temperature that
-    passes through the value in a soak at the reference temperature, with the slope of the soak.
+    A deviation is the preceding value less a straight line over temperature: the line through the
+    value in a soak at the reference temperature, with the fitted slope of soaks.
     """
 
     program: str
@@ -78,7 +78,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     claimed = noise
     if calibration.has_uncertainty:
         x, y, z = (windows.force / np.linalg.norm(windows.force, axis=1, keepdims=True)).T
-        # d|f| / dM for the three elements below the diagonal, of a vector of length g.
+        # Derivatives of |f| = g by M[1][0], M[2][0] and M[2][1].
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)

@@ -52,7 +52,7 @@ class ShownBag:
 
 
 def span_of(bag: ReducedBag) -> tuple[int, float]:
-    """Return start [ns] and length [s] of a bag's samples, or without samples of its readings."""
+    """Return start [ns] and length [s] of a bag's samples or, without samples, of its readings."""
     start_ns, end_ns = bag.start_ns, bag.end_ns
     if not bag.n_samples:
         start_ns, end_ns = bag.board.stamp_ns[[0, -1]].tolist()

@@ -32,7 +32,7 @@ from .relay import Relay
 from .waitloop import WaitLoop
 
 IDLE_S = 5.0  # silence of the samples after which readings apply [s]; Fast DDS may be 3 s late
-#: Lead of the readings' stamps over the samples' [s] above which the clocks differ.
+#: Readings stamped later than the samples by more than this time are of another clock [s].
 AHEAD_S = 5.0
 #: Delay of the next sample, in cycles and in s, beyond both of which the samples have stopped.
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
@@ -108,8 +108,8 @@ class Reporter:
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._inputs(), *self._lost_rests()]
         findings += findings_of(loaded, status, new, rate, silence_s)
-        # For a calibration at rest alone a warning at each acceleration of a vehicle would be
-        # useless: the warning begins where the unknown square term has an sd of 0.1 mg.
+        # Without a nonlinearity the warning begins 1 g above the fit, where the unknown square
+        # term has an sd of 0.1 mg, and not at each acceleration of a vehicle.
         least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > least:
             findings.append((_WARN, f'|f| {over:.3g} m/s^2 {_BEYOND_FORCE}'))

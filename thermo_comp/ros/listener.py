@@ -36,7 +36,7 @@ class LiveTopics:
         self._topics, self._ros_args = topics, ros_args
         self._heard: dict[Role, RawSubscription] = {}
         #: Received messages: role, messages, times of reception [ns].
-        self._came: list[tuple[Role, list[bytes], list[int]]] = []
+        self._received: list[tuple[Role, list[bytes], list[int]]] = []
         self._feeds: dict[Role, Topic] = {}
         self._fields: dict[Role, LiveField] = {}
         self._last_ns = NO_STAMP_NS
@@ -64,7 +64,7 @@ class LiveTopics:
         for role, subscription in self._heard.items():
             messages, received_ns, _ = subscription.drain()
             if messages:
-                self._came.append((role, messages, received_ns))
+                self._received.append((role, messages, received_ns))
 
     @property
     def n_lost(self) -> int:
@@ -78,9 +78,9 @@ class LiveTopics:
             is_over = wait(BLOCK_S)
             if is_over:
                 self._stack.close()
-            waiting = self._came[:]
+            waiting = self._received[:]
             # The receiving thread may have appended more messages meanwhile.
-            del self._came[: len(waiting)]
+            del self._received[: len(waiting)]
             if waiting:
                 feeds = [Feed(k, *source) for k, source in enumerate(self._feeds.items())]
                 numbers = {feed.role: feed.channel for feed in feeds}

@@ -51,7 +51,7 @@ class SignalWatch:
     def __enter__(self) -> SignalWatch:
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
-        # Empty handlers: the interpreter writes the signal's number to the wake-up socket.
+        # The handlers are empty: the interpreter itself writes the signal's number to the pipe.
         self._handlers = {number: signal.signal(number, lambda *_: None) for number in SIGNALS}
         self._wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         self._thread.start()

@@ -29,7 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples a reading takes effect when it is older than the newest one by this time [ns].
+#: Without samples, a reading applies once the newest reading is later by this time [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.

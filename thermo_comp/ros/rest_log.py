@@ -31,7 +31,7 @@ BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes 10 MB at most.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 #: Files of a day that are not larger than this [bytes] are not thinned to bound the folder.
-_FLOOR = 16_000
+_UNTHINNED_BYTES = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000
 #: Stamps before 2000-01-01 [ns] are times since the start of a driver, no dates: rests with such
@@ -39,9 +39,10 @@ _WAITING = 1000
 _EPOCH_NS = 946_684_800 * 10**9
 #: Backward step of the stamps [ns] from which a recording has begun anew.
 _JUMP_NS = 10**9
-# Plain form of a message (see `relay`): offsets from its end of counts, force and angular rate.
+# First bytes of a message in plain form (see `conversion`), and offsets from its end of counts,
+# force and angular rate.
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
-_SHORTEST = {False: 44, True: 316}  # shortest message [bytes]; True: an Imu
+_SHORTEST = {False: 44, True: 316}  # shortest message [bytes]: of counts, and of an Imu (True)
 
 
 class RestLog:
@@ -131,7 +132,7 @@ class RestLog:
     def _bound_folder(self) -> None:
         while True:
             sizes = {path.name: path.stat().st_size for path in self._folder.glob(f'*{SUFFIX}')}
-            oldest = next((day for day in sorted(sizes) if sizes[day] > _FLOOR), None)
+            oldest = next((day for day in sorted(sizes) if sizes[day] > _UNTHINNED_BYTES), None)
             if oldest is None or sum(sizes.values()) <= FOLDER_BYTES:
                 return
             self._thin(self._folder / oldest)

@@ -153,8 +153,8 @@ class RawSubscription:
 class WaitLoop:
     """Runs a node without an executor; raw subscriptions are left to the caller."""
 
-    # Messages of a best-effort subscription gather for `rest_s` [s] after each wake-up if four
-    # messages or more come in three times `rest_s`, so that no message waits alone.
+    # `rest_s`: pause after each wake-up by best-effort messages [s], if four messages or more
+    # arrive in three times this pause.
     def __init__(self, node: Node, rest_s: float = 0.0) -> None:
         self.node = node
         self._rest_ns = int(rest_s * 1e9)
@@ -173,7 +173,9 @@ class WaitLoop:
     def subscribe(
         self, message_type: Any, topic: str, qos: QoSProfile, *, wakes: bool = True
     ) -> RawSubscription:
-        """Subscribe in serialized form; the first that `wakes` ends a wait at once."""
+        """
+        Subscribe in serialized form; the first subscription that `wakes` ends a wait at once.
+        """
         # rclpy needs a callback for each subscription, but without an executor never calls it.
         create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)
         subscription = _opened(create, message_type, topic, qos)

@@ -172,8 +172,8 @@ class Position:
 def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
     Return the positions of a test in the order of their recording: 'chamber-18' (of 9.5 h each),
-    'chamber-9' (3 h), 'tumble' (18 of 20 min at room temperature), 'tumble-3', 'tumble-1' (the
-    same and 3 or 1 of 3 h in the chamber), 'held-out' (3 with other ramps and attitudes),
+    'chamber-9' (3 h), 'tumble' (18 of 20 min at room temperature), 'tumble-3', 'tumble-1'
+    ('tumble', then 3 or 1 of 3 h in the chamber), 'held-out' (3 with other ramps and attitudes),
     'centrifuge' or 'rate-table' (12 mountings, each at 1 g and at four rates in three soaks).
     `seed` determines the attitudes and the room temperature.
     """

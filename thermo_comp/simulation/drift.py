@@ -69,8 +69,8 @@ class Effect(ABC):
 @dataclass(frozen=True)
 class PartEffect(Effect):
     """
-    Tempco of a part, or stress or thermo-EMF between two parts: deviation of `part` less that of
-    `cold` [K] and, for coefficients that change with temperature, the difference of the squares.
+    Tempco of a part, or stress or thermo-EMF between two parts. The first signal is the deviation
+    of `part` less that of `cold` [K], the second signal the difference of their squares.
     """
 
     part: str
@@ -89,10 +89,10 @@ class FlowEffect(Effect):
     """
     Effect of a heat flow in either direction, less its effect at rest.
 
-    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent``: convection in a gap
-    (1.25), the load of a heat pump (1), its losses (2); times the deviation of `cold` to the
-    `power`. If the pump's supply is limited, the signal saturates at 1, ``x^e / (1 + x^e)``. The
-    second signal is the first times the deviation of `cold`.
+    With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent`` times the deviation
+    of `cold` to the `power`: 1.25 for convection in a gap, 1 for the load of a heat pump, 2 for
+    its losses. If the pump's supply is limited, the signal saturates at 1, ``x^e / (1 + x^e)``.
+    The second signal is the first times the deviation of `cold`.
     """
 
     hot: str

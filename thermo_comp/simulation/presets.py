@@ -45,11 +45,11 @@ class Specimen:
         return triple(sd * self._rng.standard_normal(3))
 
     def heat(self, **capacity: float) -> dict[str, float]:
-        """Draw heat capacities near those given."""
+        """Draw heat capacities within 5 % of the given values."""
         return {part: self.near(value) for part, value in capacity.items()}
 
     def links(self, *paths: tuple[str, str, float]) -> tuple[Link, ...]:
-        """Draw heat paths with conductances near those given."""
+        """Draw heat paths with conductances within 5 % of the given values."""
         return tuple(Link(a, b, self.near(conductance)) for a, b, conductance in paths)
 
     def unit(

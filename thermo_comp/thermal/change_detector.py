@@ -25,7 +25,7 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-BEND_SHARES = (1.0, 10.0)  # accelerations of the two filters' tuning / that of the smallest onset
+BEND_SHARES = (1.0, 10.0)  # tuned acceleration of a filter / smallest acceleration at an onset
 TUNING: Final = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
 # Noise variance / filter variance for a sensor whose noise is mostly quantization.
 CELL_NOISE_SHARE: Final = 0.4

@@ -209,12 +209,12 @@ class ThermalMemory:
         """
         Return each lag [K] and its extra variance [K^2], then each play less its input [K].
 
-        still: if readings of an input stand still, for each input their possible error [K] and
-            for how long they do [s]
+        still: for each input the possible error of constant readings [K], and the time since their
+            last change [s]; empty without constant readings
         """
         behind, extra = self._single_lags(stamp_ns, board, gradients)
         if still:
-            # An error of the board temperature is one of each gradient, too.
+            # An error of the board temperature is also an error of each gradient.
             causes = [still[:1], *((still[0], cause) for cause in still[1:])]
             grown = [
                 sum((sd * math.expm1(-still_s / tau)) ** 2 for sd, still_s in of_bank)

@@ -24,8 +24,8 @@ LARGEST_RATE: Final = 0.2
 #: readings may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: The first reading is wrong if its change to the second reading does not continue: if the next
-#: change is less than this share of it.
+#: The first reading is wrong if the change after the second reading is less than this share of the
+#: change before.
 CONTINUED_SHARE: Final = 0.25
 
 #: A sensor's readings count as standing still after this number of equal readings over at least
@@ -37,7 +37,7 @@ STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row from which the variance of the temperature is increased.
 DOUBTFUL_READINGS: Final = 4
 #: Change of the other sensor's temperature [K] from which a sensor with constant readings counts
-#: as frozen: if its noise exceeds its quantum, and if its quantum hides the noise.
+#: as frozen: for a sensor that shows its noise, and for a sensor whose quantum hides it.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
 #: Largest assumed error of a sensor with frozen readings [K].
@@ -47,9 +47,8 @@ LARGEST_ERROR: Final = 60.0
 #: share of the temperature change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: A sensor leads if the difference lasts for a number of consecutive readings, with at least the
-#: larger ratio of the slower rate to the faster rate; from the smaller ratio on, a lead of the
-#: board adds to the variance.
+#: A sensor leads after this number of consecutive readings with at least this ratio of the slower
+#: to the faster rate. Above `DOUBTFUL_RATE_SHARE` a lead of the board adds variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
@@ -116,8 +115,8 @@ class SensorCheck:
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
         """
-        Judge the sensor's first reading by the two that follow; call with each reading. A sensor
-        may have a wrong reading after power-up, which no earlier reading contradicts.
+        Judge the sensor's first reading by the two readings that follow; call with each reading. A
+        sensor may have a wrong reading after power-up, which no earlier reading contradicts.
         """
         first = self._first
         if first is None or not isfinite(celsius):
@@ -182,9 +181,7 @@ class SensorCheck:
         return True
 
     def watch_other(self) -> None:
-        """
-        Note the other sensor's change since this sensor's reading changed; call after a reading.
-        """
+        """Note the change of the other sensor since the last change of this sensor's reading."""
         other = self._other
         now_ns = other.stamp_ns
         moved = other.temperature - self._other_then
@@ -236,8 +233,8 @@ class SensorCheck:
 
     def still(self, stamp_ns: int) -> tuple[float, float]:
         """
-        Return the possible error of readings that stand still [K], and for how long they do [s];
-        0 if they do not.
+        Return the possible error of constant readings [K], and the time since their last change
+        [s]; zeros if the readings change.
         """
         changed_ns = self.sensor.changed_ns
         if changed_ns is None or self._n_same < self._n_doubtful:

@@ -22,12 +22,12 @@ NEVER_NS: Final = 1 << 62
 
 
 class ReadingQueue:
-    """Readings by stamp; at equal stamps the board's first: the case's decides the regime."""
+    """Waiting readings by stamp; at equal stamps the board's come before the deciding case's."""
 
     def __init__(self) -> None:
         self._entries: list[Entry] = []
         self._n_pushed = 0
-        #: Stamp of the reading of each thermometer that arrived last.
+        #: Stamp of the last received reading of each thermometer.
         self._last_ns: dict[str, int] = {}
 
     @property

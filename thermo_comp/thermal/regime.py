@@ -150,9 +150,7 @@ class RegimeDetector:
 
 
 class _Watch:
-    """
-    Change detection of a sensor; whether its rate is low, now and as predicted for half a lag.
-    """
+    """Change detection of a sensor, and whether its rate is low now and half a lag ahead."""
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
         self.change = ChangeDetector(
@@ -164,9 +162,9 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # An unchanged reading proves a low rate if it lasts longer than a change at the relaxed
-        # rate takes to cross a cell, and longer than a reversal at the smallest ramp's
-        # acceleration stays in a cell.
+        # An unchanged reading proves a low rate after the longer of two times: that in which the
+        # relaxed rate crosses a cell, and that for which a reversal in the smallest ramp stays in
+        # a cell.
         quantum = sensor.quantum_c
         bend = settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         self._still_ns = round(

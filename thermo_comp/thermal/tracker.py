@@ -28,7 +28,6 @@ UNWATCHED_SHARE: Final = 0.25
 #: temperature, because the air flow may differ: in K, and as a share of the gradient in the fit.
 SELF_HEATING_CHANGE_K: Final = 1.0
 SELF_HEATING_CHANGE: Final = 0.5
-#: A range without limits.
 ANY_RANGE: Final = (-inf, inf)
 
 
@@ -299,8 +298,8 @@ class ThermalTracker:
 
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
-        Estimate a gradient while its sensor is lost: the gradient by self-heating (that of the
-        last rest, before any rest that of the fit), plus the board's lag times its rate.
+        Estimate a gradient while its sensor is lost: the gradient by self-heating, from the last
+        rest or else from the fit, plus the board's lag times its rate.
         """
         lag = self._board_lag_s
         lower, upper = self._rest_gradient_range

@@ -38,7 +38,7 @@ def load_calibration(path: str | Path) -> Calibration:
     Read and validate a calibration file.
 
     Raises CalibrationError if the file cannot be read, is not YAML of the accepted kind, or holds
-    a value that is not acceptable; the message names file, key, value and what was expected.
+    a value that is not acceptable; the message names file, key, value and the expected value.
     """
     try:
         content = read_bounded(path, SIZE_LIMIT)

@@ -38,7 +38,6 @@ from .functions import by_element, hold
 from .schema import check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
-#: A range of a column that limits no value.
 UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the bank [s], in ratios of sqrt(2), from a few readings to the longest lag
 #: that bags determine. Linear lags use all time constants of the bank, so that sums of lags
@@ -51,13 +50,13 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Lags [s] of the parts whose slope changes at a temperature, the knee; smallest distance of knees
-#: [K]; largest number of knees, without and with known parts.
+#: Lags of the bend columns [s]; smallest distance of their knees [K]; largest number of knees for
+#: a bank of lags, and for known lags of the parts.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
-# The names of groups and kinds, as the schema of the calibration file reads them.
+# Types of the names of groups and kinds: for type checkers, and for the file's schema.
 if TYPE_CHECKING:
     _Group: TypeAlias = str
     _Kind: TypeAlias = str

@@ -157,7 +157,7 @@ class Curves:
 
     @cached_property
     def _families(self) -> list[int]:
-        """For each bias or scale, the index of the first with the same families of functions."""
+        """For each of the six biases and scales, the first with the same families of functions."""
         bases = [
             tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
             for functions in zip(*self._functions.rows, strict=True)
@@ -166,9 +166,8 @@ class Curves:
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
-        Differentiate values beyond the ranges by the free coefficients of one function, (n_free,
-        n): the function's tangent, in each set that follows it, and the held difference of the
-        sets.
+        Differentiate values beyond the ranges by the free coefficients of a function, (n_free, n).
+        The values contain the function's tangent, and the held difference of the sets.
         """
         function = self._functions.rows[regime][place]
         own_range, other_range = (

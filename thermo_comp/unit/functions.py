@@ -29,8 +29,8 @@ from ..typing import Floats
 Kelvins: TypeAlias = float | Floats
 
 #: Length of the tangent that continues a curve beyond its range, in spans of the range. At the end
-#: of the tangent a parabola differs from it by a sixteenth of the difference at the opposite end
-#: of the range.
+#: of the tangent a parabola is a sixteenth as far from the tangent as at the opposite end of the
+#: range.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9

@@ -34,7 +34,7 @@ Kind = Literal['square', 'odd_square', 'cube']
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
 #: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 .. 60 ug/g^2.
 K2_SD = 1e-4
-#: Largest |f| of a rest that counts as at 1 g, over gravity.
+#: Largest |f| / gravity of a rest that counts as at 1 g.
 AT_REST = 1.01
 #: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
 #: sufficient.
@@ -51,7 +51,7 @@ Real = TypeVar('Real', float, Floats)
 class NonlinearTerm:
     """One term of the nonlinearity; `coefficient` and `per_kelvin` are for x, y, z."""
 
-    kind: Annotated[Kind, 'K2 f^2, Kq |f| f or K3 f^3.']
+    kind: Annotated[Kind, 'K2 f^2, Kq abs(f) f or K3 f^3.']
     coefficient: Annotated[
         Vector, 'Coefficient at the reference temperature [g/g^2; K3 in g/g^3].'
     ]
@@ -83,12 +83,14 @@ class Nonlinearity:
 
     force_range_m_s2: Annotated[
         tuple[Annotated[float, QUANTITIES['error']], Annotated[float, QUANTITIES['error']]],
-        'Smallest and largest |f| in the data of the fit.',
+        'Smallest and largest norm of the specific force in the fit.',
     ]
     beyond_sd_g_g2: Annotated[
-        float, QUANTITIES['nonlinearity'], 'Sd of an unknown square term beyond the largest |f|.'
+        float, QUANTITIES['nonlinearity'], 'Sd of an unknown square term beyond the largest norm.'
     ]
-    terms: tuple[NonlinearTerm, ...] = ()
+    terms: Annotated[
+        tuple[NonlinearTerm, ...], 'Square, odd square and cube in this order, at most one each.'
+    ] = ()
 
     def __post_init__(self) -> None:
         check_ranges(self, force_range_m_s2=QUANTITIES['error'])
@@ -175,7 +177,7 @@ def nonlinear_covariance(
 class BeyondForce(NamedTuple):
     """
     The variance of an unknown square term that begins at the largest |f| of the fit [m/s^2];
-    `growth`: variance over the fourth power of twice the distance beyond this force.
+    `growth`: variance / fourth power of twice the distance beyond this force.
     """
 
     edge: float

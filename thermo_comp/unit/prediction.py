@@ -46,7 +46,7 @@ class SlowUncertainty:
         #: By axis the rows of the posterior's factor, and the added variances: of bias, scale and
         #: nonlinear terms.
         self._blocks: list[list[tuple[Floats, Floats]]] = []
-        #: The same of the misalignment.
+        #: Rows of the factor and added variances of the misalignment.
         self._misalignment = np.zeros((3, 0)), np.square(calibration.misalignment_sd)
         posterior = calibration.posterior
         if posterior is None:
@@ -80,15 +80,16 @@ class SlowUncertainty:
     def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         """
         Differentiate bias [input units] and scale [relative] by the unknowns of a start, which
-        have unit variance, shape (n_unknown, 6, n). `rates`: largest rate of the board temperature
-        since the start, or a smaller one that is known, (n,) [K/s].
+        have unit variance, shape (n_unknown, 6, n). `rates`: largest known rate of the board
+        temperature since the start, (n,) [K/s].
         """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # If the start was in a ramp, the parts were behind the board, by an unknown amount up to
-        # that of a long ramp at the largest rate since then, within the calibrated temperatures.
+        # If the start was in a ramp, a part was behind the board by at most the lag in a long ramp
+        # at the largest rate since the start, and by at most the span of the calibrated
+        # temperatures.
         behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
@@ -153,7 +154,6 @@ class SlowUncertainty:
 
 def _combined(rows: Floats, by: Floats) -> Floats:
     """Return ``rows.T @ by``, (rank, n), for a factor (p, rank) and derivatives (p, n)."""
-    # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
     return in_order(rows[:, :, np.newaxis] * by[:, np.newaxis], 0)
 
 
@@ -161,8 +161,8 @@ def in_a_soak(
     calibration: Calibration, temperature: float | None = None
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
-    Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,), in a
-    soak at the reference temperature or at another one.
+    Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,), in a soak
+    at the reference or another temperature.
     """
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
     states = ramp_states(calibration, at)

@@ -26,7 +26,7 @@ class GroupEvidence:
     log_evidence_change: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Loss of log evidence without the group, or, in a fit with a prior, with its values.',
+        'Loss of log evidence without the group; in a fit with a prior, with its values.',
     ]
     prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
 
