@@ -159,8 +159,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd = np.zeros_like(typical)
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
-    drifts = within_positions(regression.columns, regression.windows.position)
-    if float(np.abs(drifts).max()) < 1e-9:
+    if not regression.windows.has_drifts:
         # Lags differ from soak to soak by errors of the thermometer, which determine no weight.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))

@@ -115,7 +115,8 @@ def _at_rest(data: Windows) -> Windows:
     """Return the windows with columns that are constant in each position."""
     # In a soak a lag of unknown size and the remaining drift of the temperature change the
     # readings by similar amounts, so only the norms of the positions determine the curve.
-    columns = data.columns - within_positions(data.columns, data.position)
+    means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
+    columns = means[data.position]
     square, of_means = (np.mean(values**2, axis=0) for values in (data.columns, columns))
     kelvins = data.kelvins * np.sqrt(of_means / np.where(square > 0.0, square, 1.0))
     return replace(data, columns=columns, kelvins=kelvins, start=np.zeros_like(data.start))
