@@ -62,7 +62,10 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     if problem.options.prior is not None or not _has_soaks(windows):
         return _regress(windows, problem)
     at_rest = replace(windows, data=_at_rest(windows.data))
-    fit, of_drifts = _regress(at_rest, problem, is_at_rest=True), _regress(windows, problem)
+    # A regression reports progress from 0.7 to 0.95; each of the two takes half of this range.
+    first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
+    second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
+    fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
     return of_drifts if is_better(fit.selected.score, of_drifts.selected.score) else fit
 
 
