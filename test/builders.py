@@ -203,3 +203,36 @@ def arrays_of(run, every=1):
     """Return samples and every `every`-th reading of a simulated run, as arrays of a block."""
     readings = (run.board_stamp_ns, run.board, run.case_stamp_ns, run.case)
     return (run.accel_stamp_ns, run.counts.astype(float), *(part[::every] for part in readings))
+
+
+def drawn(unit, layout, d):
+    """Change all parameters but the scale levels, which a constant curve does not have."""
+
+    def moved_by(values, start):
+        return tuple(value + d[start + k] for k, value in enumerate(values))
+
+    def moved(regime_set_, start):
+        axes = []
+        for axis, curves in enumerate(regime_set_.axes()):
+            bias, scale = start(layout.bias[axis]), start(layout.scale[axis])
+            fs, fc = curves.bias_function, curves.scale_function
+            bias_function = fs.with_free(moved_by(fs.free_coefficients, bias + 1), 0.0)
+            scale_function = fc.with_free(moved_by(fc.free_coefficients, scale + 1), 1.0)
+            axes.append(replace(curves, delta=curves.delta + d[bias], bias_function=bias_function,
+                                scale_function=scale_function))  # fmt: skip
+        return replace(regime_set_, x=axes[0], y=axes[1], z=axes[2])
+
+    response = tuple(
+        replace(
+            term,
+            bias=tuple(w + d[layout.bias[i].response + k] for i, w in enumerate(term.bias)),
+            scale=tuple(w + d[layout.scale[i].response + k] for i, w in enumerate(term.scale)),
+        )
+        for k, term in enumerate(unit.response)
+    )
+    return replace(
+        unit,
+        static=moved(unit.static, lambda block: block.static),
+        dynamic=moved(unit.dynamic, lambda block: block.dynamic),
+        response=response,
+    )

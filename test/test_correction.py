@@ -12,6 +12,7 @@ from builders import (
     axis_set,
     calibration,
     columns_from_events,
+    drawn,
     regime_set,
     rich_calibration,
     stream,
@@ -24,19 +25,12 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.lags import start_covariance
-from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Layout
+from thermo_comp.thermal.state import RATE, Layout
 from thermo_comp.thermal.tracker import ThermalTracker
-from thermo_comp.unit.calibration import (
-    Axes,
-    AxisReference,
-    AxisSet,
-    ResponseTerm,
-    parameter_layout,
-)
+from thermo_comp.unit.calibration import ResponseTerm, parameter_layout
 from thermo_comp.unit.columns import bank
-from thermo_comp.unit.correction import VARIANCES, Correction
-from thermo_comp.unit.covariance import N_ROWS, CovarianceMap, covariance_at
-from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
+from thermo_comp.unit.correction import Correction
+from thermo_comp.unit.covariance import CovarianceMap, covariance_at
 from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import SlowUncertainty
 
@@ -193,39 +187,6 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
             assert np.abs(root @ claimed @ root.T - np.eye(3)).max() < 0.5
 
 
-def drawn(unit, layout, d):
-    """Change all parameters but the scale levels, which a constant curve does not have."""
-
-    def moved_by(values, start):
-        return tuple(value + d[start + k] for k, value in enumerate(values))
-
-    def moved(regime_set_, start):
-        axes = []
-        for axis, curves in enumerate(regime_set_.axes()):
-            bias, scale = start(layout.bias[axis]), start(layout.scale[axis])
-            fs, fc = curves.bias_function, curves.scale_function
-            bias_function = fs.with_free(moved_by(fs.free_coefficients, bias + 1), 0.0)
-            scale_function = fc.with_free(moved_by(fc.free_coefficients, scale + 1), 1.0)
-            axes.append(replace(curves, delta=curves.delta + d[bias], bias_function=bias_function,
-                                scale_function=scale_function))  # fmt: skip
-        return replace(regime_set_, x=axes[0], y=axes[1], z=axes[2])
-
-    response = tuple(
-        replace(
-            term,
-            bias=tuple(w + d[layout.bias[i].response + k] for i, w in enumerate(term.bias)),
-            scale=tuple(w + d[layout.scale[i].response + k] for i, w in enumerate(term.scale)),
-        )
-        for k, term in enumerate(unit.response)
-    )
-    return replace(
-        unit,
-        static=moved(unit.static, lambda block: block.static),
-        dynamic=moved(unit.dynamic, lambda block: block.dynamic),
-        response=response,
-    )
-
-
 def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     unit = full_bank(rng)
     correction = Correction(unit)
@@ -320,188 +281,3 @@ def test_a_swap_of_calibrations_keeps_the_lags_that_the_two_share(rng):
     assert compensator.thermal.tracker.memory is not tracker.memory
     assert compensator.thermal.tracker.board.stamp_ns == tracker.board.stamp_ns
     assert compensator.process(61 * SECOND_NS, 0.0, 0.0, 2900.0) is not None
-
-
-def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
-    unit = calibration(
-        axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
-        response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
-    )
-    correction = Correction(unit)
-    inside, outside = ((20.0, 0.0, 0.0, 0.0, 0.0, g, 0.0) for g in (1.0, 3.0))
-    edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
-    assert beyond[:12].tolist() == edge[:12].tolist()
-    assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the element yy
-    assert beyond[of_y].tolist() == edge[of_y].tolist()
-    excess = correction.excess(outside, is_dynamic=False)
-    assert excess.relative == pytest.approx(2.0)
-    assert excess[:3] == (0.0, 0.0, 2.0)
-
-
-def sd_at(unit, board, behind=0.0, force=0.0):
-    """Return the claimed sd of the x axis in a soak, without the noise of a message [m/s^2]."""
-    correction = Correction(unit)
-    layout = Layout(correction.memory)
-    state = [0.0] * layout.width
-    state[BOARD] = board
-    for lag in layout.lags:
-        state[layout.places[lag]] = behind
-    line = correction.line(tuple(state), tuple(state), np.zeros(N_ROWS), 0.0)
-    a, b, c = line[12:15]
-    return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
-
-
-def test_beyond_the_range_lagging_parts_do_not_lower_the_claimed_sd():
-    # For an error of the thermometer the slopes of curve and lag cancel inside the range only.
-    bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
-    unit = calibration(
-        static=regime_set(bias), dynamic=regime_set(bias),
-        response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
-    )  # fmt: skip
-    assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
-    # The board is at 41 degC, 6 K outside a range of +-15 K.
-    far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
-    assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
-
-
-def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
-    # The slope of the bias is 0.8 counts/K at the upper edge; a force of 10 m/s^2 cancels it.
-    bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
-    unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # The RMS change of the slope over 30 K is 0.02 * 30 / sqrt(12), larger on a coarse grid.
-    bends = 0.6 / math.sqrt(12.0)
-    far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
-    assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
-    assert sd_at(unit, 41.0) == pytest.approx(math.hypot(bends, 0.8) * 6.0 / 300.0 * far, rel=0.05)
-
-
-def curves_at(unit, celsius):
-    """Return bias and relative scale of x in both sets at temperatures, shape (2, 2, n)."""
-    return Correction(unit).curves.values(np.array(celsius))[:, ::3]
-
-
-BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
-
-
-def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span():
-    one, two = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
-    unit = calibration(static=regime_set(one), dynamic=regime_set(two))
-    for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
-        at_edge, *outside = np.moveaxis(
-            curves_at(unit, edge + sign * np.array([0.0, 1e-9, 3.0, 7.5, 7.5 + 1e-9, 300.0])), 2, 0
-        )
-        t = edge - 20.0
-        slopes = [
-            [np.polynomial.Polynomial(c).deriv()(t) for c in rows]
-            for rows in ((BENT, (1.0, 1e-4, 2e-6)), (WAVY, (1.0, 5e-5)))
-        ]
-        for value, beyond in zip(outside, (1e-9, 3.0, 7.5, 7.5, 7.5), strict=True):
-            expected = at_edge + sign * beyond * np.array(slopes)
-            np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
-
-
-def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
-    # Ranges: static 5 to 35 degC, dynamic 0 to 30 degC.
-    unit = calibration(
-        static=regime_set(axis_set(BENT)),
-        dynamic=regime_set(axis_set(WAVY, delta=2.0), temperature_range_c=(0.0, 30.0)),
-    )
-    celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
-    static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside both ranges the sets differ as at the last common temperature.
-    np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
-    np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
-    wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
-    lower, upper = wavy.deriv()(-20.0), bent.deriv()(15.0)
-    np.testing.assert_allclose(dynamic[:4] - dynamic[3], lower * np.array([-7.5, -7.5, -3, 0]))
-    np.testing.assert_allclose(static[6:] - static[6], upper * np.array([0, 3, 7.5, 7.5]))
-
-
-def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # The correction must change by the regressors times the change of the parameters. The dynamic
-    # range ends before the static range when warming, after it when cooling.
-    spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
-    exponential = Exponential(-1.0, (1.0,), (18.0,))
-    one = AxisSet(spline, Polynomial((1.0, 1e-4)))
-    two = AxisSet(exponential, Polynomial((1.0, 1e-4, 1e-6)))
-    unit = calibration(
-        static=regime_set(one, two, axis_set(BENT)),
-        dynamic=regime_set(two, one, axis_set(WAVY), temperature_range_c=(0.0, 30.0)),
-    )
-    layout = parameter_layout(unit)
-    change = 1e-3 * rng.standard_normal(layout.n_parameters)
-    change[[level for block in layout.scale for level in (block.static, block.dynamic)]] = 0.0
-    states = np.zeros((Layout(Correction(unit).memory).width, 9))
-    states[BOARD] = -40.0, -5.0, 3.0, 20.0, 33.0, 36.0, 42.0, 43.0, 90.0
-    states[WEIGHT] = 0.0, 1.0, 0.3, 0.5, 1.0, 0.3, 0.0, 0.7, 1.0
-    moved, nominal = (
-        Correction(each).bias_scale(states) for each in (drawn(unit, layout, change), unit)
-    )
-    regressors = Correction(unit).curves.regressors(states, np.zeros((0, 9)))
-    moved_by = moved - nominal
-    moved_by[1] /= 300.0
-    for axis in range(3):
-        for block, of, row in (
-            (layout.bias[axis], regressors[axis], moved_by[0, axis]),
-            (layout.scale[axis], regressors[axis + 3], moved_by[1, axis]),
-        ):
-            expected = change[block.static : block.end] @ of
-            np.testing.assert_allclose(row, expected, rtol=1e-9, atol=1e-12)
-
-
-def test_the_claimed_sd_grows_with_the_distance_from_the_range():
-    unit = rich_calibration()
-    correction = Correction(unit)
-    slow = SlowUncertainty(unit, correction)
-    nobody = np.zeros((len(correction.memory.lags), 1))
-    for sign in (1.0, -1.0):
-        variances = []
-        for beyond in (0.0, 0.1, 1.0, 3.0, 7.4, 7.6, 15.0, 40.0):
-            state = np.zeros((Layout(correction.memory).width, 1))
-            state[BOARD] = 20.0 + sign * (15.0 + beyond)
-            line = correction.line(state, state, slow.at(state, nobody), 0.0)
-            variances.append(line[list(VARIANCES), 0])
-        assert (np.diff(variances, axis=0) > 0.0).all()
-        # The claimed sd covers the case that the true curve is constant beyond the edge.
-        slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
-        assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
-
-
-def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
-    # WHY: bags of soaks have rates below 0.1 K/min, and a ramp multiplied the variance of all
-    # parameters by several hundred, although that of the lag grew with the ramp already.
-    axis = axis_set(residual_sd_m_s2=1e-5)
-    soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
-    sds = []
-    for response in ((), (term('board', tau_s=600.0),)):
-        correction = Correction(calibration(static=soaks, dynamic=soaks, response=response))
-        state = np.zeros(Layout(correction.memory).width)
-        state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
-        line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
-        sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # Without a lag the sd grows with the 19 half ranges by which the ramp is too fast.
-    assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
-
-
-def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
-    # WHY: a difference of 10 K after bags with 0.1 K is 100 times too large, its square 10000
-    # times, and the claimed sd was that of a distance of 10000 half ranges: 0.1 g.
-    unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
-    correction = Correction(unit)
-    state = np.zeros(Layout(correction.memory).width)
-    state[BOARD], state[correction.layout.places[unit.response[0].source]] = 20.0, 10.0
-    excess = correction.excess(state, is_dynamic=False)
-    assert 99.0 < excess.relative < 150.0
-
-
-def test_a_part_that_is_still_outside_the_range_widens_the_claimed_sd():
-    bent = axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6)
-    unit = calibration(
-        static=regime_set(bent), dynamic=regime_set(bent),
-        response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
-    )  # fmt: skip
-    # The board is back at 33 degC; a part at 34 degC adds no variance, a part at 41 degC does.
-    assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
-    bends = 0.6 / math.sqrt(12.0)
-    assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)
