@@ -95,23 +95,20 @@ def claim_of(
         prior = replace(prior, misalignment_sd=prior.unseen_misalignment_sd)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
-    # The mountings of a turn-on share its offset: a stated sd is that of this offset, an estimated
-    # one that of the independent offsets of mountings, beside which there are turn-ons.
-    shared_sd, independent_sd = offset_sd, prior.offset_sd
+    # A stated sd is that of a mounting or of a turn-on: beside the independent offsets of m
+    # mountings the covariance contains the offsets of n turn-ons with 1 - n / m of the variance.
+    n_turn_ons = regression.windows.n_turn_ons
+    shared_variance = offset_sd**2 * (1.0 - n_turn_ons / (mounting[-1] + 1))
     if prior.offset_scale > 0.0:
         tried = prior.offset_scale * _GRID, _LOG_DENSITY
         if known_offset_sd:
             tried = known_offset_sd * _KNOWN_GRID, _KNOWN_LOG_DENSITY
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
-        shared_sd, independent_sd = _turn_on_sd(regression, posterior, *tried), 0.0
-        offset_sd = float(np.hypot(offset_sd, shared_sd))
+        shared_variance = _turn_on_sd(regression, posterior, *tried) ** 2
+        offset_sd = float(np.sqrt(offset_sd**2 + shared_variance))
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
-    if shared_sd and _shares_turn_ons(regression):
-        turn_on = regression.windows.turn_on_of_position
-        covariance += shared_sd**2 * _of_offsets(regression, posterior, turn_on)
-        if independent_sd:
-            each = np.arange(len(turn_on))
-            covariance -= independent_sd**2 * _of_offsets(regression, posterior, each)
+    if shared_variance:
+        covariance = covariance + shared_variance * _of_turn_ons(regression, posterior)
     if candidates is not None:
         widened = _with_unseen(regression, posterior, candidates)
         with_unseen = regression.solve(posterior.state, widened, n_steps=0)
@@ -266,7 +263,8 @@ def _turn_on_sd(
     The norms show how well turn-ons repeat only if there are several; for a single turn-on the sd
     is that of the prior; `tried` and `log_density` as in `_over_mountings`.
     """
-    if not regression.gravity or not _shares_turn_ons(regression):
+    windows = regression.windows
+    if not regression.gravity or windows.n_turn_ons == windows.mounting[-1] + 1:
         return 0.0
     without_norms = replace(posterior.prior, offset_sd=float(tried[-1]))
     by_drifts = regression.solve(posterior.state, without_norms, n_steps=1).root
@@ -276,24 +274,19 @@ def _turn_on_sd(
     return float(np.sqrt(weight @ tried**2 / weight.sum()))
 
 
-def _shares_turn_ons(regression: Regression) -> bool:
-    """Whether a turn-on has several mountings."""
-    windows = regression.windows
-    return bool(windows.n_turn_ons < windows.mounting[-1] + 1)
-
-
-def _of_offsets(regression: Regression, posterior: Posterior, group: Ints) -> Floats:
+def _of_turn_ons(regression: Regression, posterior: Posterior) -> Floats:
     """
-    Return the covariance of the unit's unknowns by bias offsets of unit variance, each common to
-    the positions of a group, shape (n_unit, n_unit); `group`: of each position.
+    Return the covariance of the unit's unknowns by bias offsets of turn-ons, of unit variance and
+    common to the positions of a turn-on, shape (n_unit, n_unit).
 
     Offsets of turn-ons at different temperatures change the curve; those of turn-ons with one
     program change the bias by their mean.
     """
     point = regression.at(posterior.state, posterior.prior)
+    turn_on = regression.windows.turn_on_of_position
     by_offsets = np.array([
-        point.by_offset(np.flatnonzero(group == number), axis)
-        for number in np.unique(group) for axis in range(3)
+        point.by_offset(np.flatnonzero(turn_on == number), axis)
+        for number in np.unique(turn_on) for axis in range(3)
     ])  # fmt: skip
     return np.asarray(by_offsets.T @ by_offsets)
 
