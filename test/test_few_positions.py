@@ -133,10 +133,11 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
     # 36 norms with a noise of 1 ug: the warm-up, 1 K in 600 s, limits the temperature to 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in {finding.name for finding in result.findings}
-    # Soaks do not show how far the sensor lags the board in a ramp: by up to all of the slope.
+    # Soaks do not show the lag of the sensor, whose effect is at most that of the slope: twice the
+    # claimed sd covers this effect, and the sd is not larger than it.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
-    assert np.sqrt(np.mean(of_lags)) == pytest.approx(np.sqrt(np.mean(slopes**2)), rel=0.7)
+    assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
 
 
 def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
@@ -152,7 +153,8 @@ def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 50e-6
+    # At 0.03 g this is 33 ppm/K of the scale factor, in the difference of two rests 47 ppm/K.
+    assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
 def test_one_position_becomes_parameters_of_an_autopilot(one_position):
