@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import strangers
 from builders import source_of
 from position_helpers import GRAVITY, MG, START_NS, Rest
+from strangers_cases import HALF, Study, consumer_grade
+from strangers_units import record, rng_of
 
 import thermo_comp as tc
 from thermo_comp.convert.exchange import export_calibration
@@ -155,6 +158,25 @@ def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
     # At 0.03 g this is 33 ppm/K of the scale factor, in the difference of two rests 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
+
+
+def test_one_tilted_support_is_not_the_scale_of_an_axis_across_gravity():
+    # WHY: with a prior sd of up to 200 ppm/K a tilt of 17 urad/K gave a slope of 817 +- 23 ppm/K.
+    rng = rng_of('linear tilts', 1)
+    unit = replace(consumer_grade(rng), counts=0.0)
+    ups = (1.0, 0.0, 0.03), (0.0, 1.0, 0.0)
+    tilted, level = (record(unit, HALF, np.array(up), rng, rate_hz=10.0) for up in ups)
+    celsius = np.interp(tilted.time_s, *tilted.temperatures['board'])
+    samples = tilted.samples + np.outer(GRAVITY * 17e-6 * (celsius - 20.0), [0.0, 0.0, 1.0])
+    study = Study('', (replace(tilted, samples=samples), replace(level, name='level')), {},
+                  {'input': 'm/s^2'})  # fmt: skip
+    calibration = strangers.fitted(study)
+    slope = parameter_layout(calibration).scale[2].static + 1
+    sd = np.sqrt(calibration.posterior.covariance()[slope, slope])
+    found = np.diff(calibration.static.z.scale_function.value(np.array([0.0, 1.0])))[0]
+    # The prior of the slope has an sd of 100 ppm/K or less, and no position shows the slope.
+    assert sd < 100e-6
+    assert abs(found - 1e-6 * unit.scale_curve[0, 2]) < 3.0 * sd
 
 
 def test_one_position_becomes_parameters_of_an_autopilot(one_position):

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import FitError
 from ..typing import Bools, Floats
 from .coverage import distinct_directions, norm_columns
-from .data_checks import POSITIONS_NEEDED
+from .data_checks import POSITIONS_FOR_MISALIGNMENT, POSITIONS_NEEDED
 from .hyperparameters import Candidates
 from .initial_triad import (
     ConstantCalibration,
@@ -34,6 +34,10 @@ from .windows import CURVE, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
+#: Factor of the prior sd of the scale factor's slopes with fewer than nine attitudes: a tilt of
+#: the support then explains what the scale factor of an axis that is nearly level explains only
+#: by a slope of several hundred ppm/K.
+OF_FEW_ATTITUDES = 0.5
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if n_directions >= POSITIONS_NEEDED:
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
-    candidates = _candidates(windows, steepness, options, has_one_direction=n_directions == 1)
+    candidates = _candidates(windows, steepness, options, n_directions)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
         *others, widest = informative_priors(known, regression, state, windows.model, options)
@@ -104,7 +108,9 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
-    return Fit(windows, regression, selected, candidates.typical)
+    # Slopes of the scale factor that no position shows are claimed in full.
+    claimed = candidates.typical / _slope_factors(n_directions)[:, np.newaxis]
+    return Fit(windows, regression, selected, claimed)
 
 
 def _has_soaks(windows: ThermalWindows) -> bool:
@@ -226,7 +232,7 @@ def _mounting_scale(noise: float) -> float:
 
 
 def _candidates(
-    windows: ThermalWindows, steepness: float, options: FitOptions, *, has_one_direction: bool
+    windows: ThermalWindows, steepness: float, options: FitOptions, n_directions: int
 ) -> Candidates:
     """Return the columns that may take part, with the typical and largest sd of their weights."""
     data = windows.data
@@ -236,10 +242,12 @@ def _candidates(
     is_candidate &= windows.has_temperature
     parts = np.stack((is_candidate, is_candidate & data.in_scale))
     # The smallest typical slope of the bias is 0.1 ug/K, better than navigation grade.
+    factors = _slope_factors(n_directions)
     slope = float(np.clip(steepness, 1e-6, STEEPEST[0] / 3.0))
-    slopes = np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
+    slopes = factors * np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
+    steepest = factors * STEEPEST
     fixed = np.zeros(parts.shape, dtype=bool)
-    if has_one_direction:
+    if n_directions == 1:
         # One attitude cannot separate scale and bias: the curve of the scale keeps its prior.
         parts[1] &= groups == CURVE
         fixed[1] = parts[1]
@@ -248,13 +256,19 @@ def _candidates(
         # All columns of the paper's sets are kept; ten times the largest sd is a flat prior.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (
-        np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, STEEPEST)
+        np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, steepest)
     )
     if not windows.was_measured:
         # Without a thermometer the slope is unknown: its whole prior goes into the covariance.
-        typical[:, 0] = largest[:, 0] = STEEPEST
+        typical[:, 0] = largest[:, 0] = steepest
         forced[0] = fixed[:, 0] = True
     return Candidates(typical, largest, forced, fixed)
+
+
+def _slope_factors(n_directions: int) -> Floats:
+    """Return the factors of the prior sd of slopes of bias and scale, shape (2,)."""
+    is_few = n_directions < POSITIONS_FOR_MISALIGNMENT
+    return np.array([1.0, OF_FEW_ATTITUDES if is_few else 1.0])
 
 
 def _steepness(
