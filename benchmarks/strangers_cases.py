@@ -317,6 +317,14 @@ def cold_start(number: int) -> Iterator[Study]:
     yield Study('', fit, one_test(held), FULL_SCALE)
 
 
+def slow_thermometer(number: int) -> Iterator[Study]:
+    """Read a board thermometer that lags the board by 30 to 90 s; all bags have the same thaw."""
+    rng = rng_of('slow-thermometer', number)
+    unit = navigation(rng, thermometer_s=rng.uniform(30, 90), sensors=('board',))
+    fit = positions(unit, FROST, spread(12, rng), rng)
+    yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
+
+
 def third_node(number: int) -> Iterator[Study]:
     """Add a node without a thermometer, and a bag in still air, fitted jointly or with a prior."""
     rng = rng_of('third-node', number)
@@ -420,6 +428,7 @@ CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'support': (support, 3),
     'gravity': (gravity, 3),
     'cold-start': (cold_start, 3),
+    'slow-thermometer': (slow_thermometer, 3),
     'third-node': (third_node, 3),
     'bench3': (bench3, 3),
     'quadratic': (quadratic, 100),

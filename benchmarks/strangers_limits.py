@@ -133,6 +133,7 @@ LIMITS = {
     # The data do not show a wrong gravity, which the baselines also use: limit only the ratio.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
+    'slow-thermometer': Limit(),
     # A further bag of another environment must not increase the error by more than the noise of
     # the fit, 2 %.
     'third-node alone': Limit(),

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
 Floats = npt.NDArray[np.float64]
 
@@ -82,6 +83,8 @@ class Unit:
         White noise [ug/sqrt(Hz)].
     reading_sd, reading_step, reading_s : float
         Noise [K], rounding [K] and interval [s] of the thermometers.
+    thermometer_s : float
+        Time constant by which the thermometers lag case and board [s].
     sensors : tuple of str
         Thermometers that are recorded.
 
@@ -111,6 +114,7 @@ class Unit:
     reading_sd: float = 0.005
     reading_step: float = 0.001
     reading_s: float = 5.0
+    thermometer_s: float = 0.0
     sensors: tuple[str, ...] = ('board', 'case')
 
     def bias_at(self, part_c: Floats, hidden_k: Floats | float = 0.0) -> Floats:
@@ -316,10 +320,21 @@ def record(
     read = np.arange(0.3, lasts_s, unit.reading_s)
     temperatures = {}
     for sensor in unit.sensors:
-        node = states[:, CASE if sensor == 'case' else BOARD]
+        node = lagged(states[:, CASE if sensor == 'case' else BOARD], unit.thermometer_s)
         value = np.interp(read, grid, node) + unit.reading_sd * rng.standard_normal(len(read))
         temperatures[sensor] = read, np.round(value / unit.reading_step) * unit.reading_step
     return Bag(name, stamps, samples, temperatures, force)
+
+
+def lagged(node: Floats, tau_s: float) -> Floats:
+    """Lag a node of the network by a time constant; the node is linear in time between steps."""
+    if not tau_s:
+        return node
+    decay = np.exp(-STEP_S / tau_s)
+    # In a ramp the lag is behind by the rate times the time constant, which starts from zero.
+    gain = tau_s / STEP_S * (1.0 - decay)
+    behind = lfilter([gain], [1.0, -decay], np.diff(node, prepend=node[0]))
+    return np.asarray(node - behind)
 
 
 def quantised(words: Floats, carries: bool) -> Floats:

@@ -136,6 +136,32 @@ def test_the_lag_of_a_part_between_board_and_sensor(rng):
     assert late.start_shares(700 * SECOND_NS)[0] == lag.start_share(100.0)
 
 
+@pytest.mark.parametrize('second_s', [0.0, 150.0])
+def test_the_lag_of_a_part_behind_a_thermometer_that_lags_the_board(rng, second_s):
+    times = np.arange(0.0, 7200.0, 30.0)
+    board = 20.0 + np.cumsum(0.2 * rng.standard_normal(len(times)))
+    own = 60.0
+
+    def slope(t, nodes):
+        u = np.interp(t, times, board)
+        ahead = nodes[1] if second_s else u
+        return [
+            (u - nodes[0]) / own,
+            (u - nodes[1]) / (second_s or 1.0),
+            (ahead - nodes[2]) / 900.0,
+        ]
+
+    lag = Lag('board', 900.0, second_s, lead_s=own)
+    fine = np.arange(0.0, times[-1], 1.0)
+    reading, _, part = solve_ivp(slope, (0.0, fine[-1]), [board[0]] * 3, t_eval=fine, rtol=1e-9,
+                                 atol=1e-9, max_step=1.0).y  # fmt: skip
+    behind = memory_on_grid(MemorySpec(lags=(lag,)), 1.0, reading, [reading])[:, 0]
+    # The memory takes the reading as linear between two stamps.
+    np.testing.assert_allclose(reading - behind, part, atol=1e-3)
+    assert lag.by_board == pytest.approx(1.0 if second_s else 1.0 - own / 900.0)
+    assert sum(lag.shares) == pytest.approx(lag.by_board)
+
+
 def test_the_unknown_start_of_a_lag_of_two_stages(rng):
     # The board temperature walks at random for 90 min, then is constant.
     D, step, n = 0.005, 6.0, 4000

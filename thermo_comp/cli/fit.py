@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ..fitting import FitResult
     from ..fitting.selection import Trial
     from ..unit.calibration import Calibration
+    from ..unit.columns import Part
     from ..unit.rate_bias import Gyroscope
 
 #: Largest width of a model in a table [characters].
@@ -192,18 +193,8 @@ def _print_fit(
         _print_positions(out, result)
     _print_models(out, result.fit.selected.trials)
     parts = result.fit.windows.model.parts
-    # In a steady ramp the lag behind two stages is the sum of their time constants.
-    taus = parts and [part.tau_s + part.second_tau_s for part in parts]
-    shares = parts and [part.sensor_share for part in parts]
-    if taus and shares:
-        source = 'the board'
-        if any(shares):
-            case_shares = ', '.join(f'{share:.2f}' for share in shares)
-            source = f'a temperature between board and case (case share {case_shares})'
-        out.line(
-            f'each axis is a curve of the temperature of its part, which lags {source} by '
-            f'{", ".join(f"{tau:.0f}" for tau in taus)} s (x, y, z)'
-        )
+    if parts:
+        out.line(_text_of(parts))
     _print_groups(out, calibration, has_prior=result.fit.posterior.prior.informative is not None)
     print_nonlinearity(out, calibration)
     _print_residuals(out, result, n_positions)
@@ -226,12 +217,35 @@ def _print_fit(
         left_out_rms_m_s2=left_out.rms,
         residuals_m_s2=result.residuals,
         models=[_model(trial) for trial in result.fit.selected.trials],
-        part_lags_s=taus,
-        part_case_shares=shares,
+        part_lags_s=parts and _behind_s(parts),
+        part_case_shares=parts and [part.sensor_share for part in parts],
+        part_leads_s=parts and [part.lead_s for part in parts],
         **picked(calibration, 'evidence noise_density_m_s2_sqrt_hz slow_noise_m_s2_sqrt_h'),
         gyroscope=gyroscope and picked(gyroscope, _RATES) | {'residuals_rad_s': result.rates},
         **picked(result, 'positions least_known findings'),
     )
+
+
+def _behind_s(parts: Sequence['Part']) -> list[float]:
+    """Return how far each part is behind the board in a steady ramp [s]."""
+    return [part.tau_s + part.second_tau_s for part in parts]
+
+
+def _text_of(parts: Sequence['Part']) -> str:
+    """Say how far the part of each axis lags the board, or what leads the board."""
+    source = 'the board'
+    if any(part.sensor_share for part in parts):
+        case_shares = ', '.join(f'{part.sensor_share:.2f}' for part in parts)
+        source = f'a temperature between board and case (case share {case_shares})'
+    lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
+    text = (
+        f'each axis is a curve of the temperature of its part, which lags {source} by {lags} s '
+        '(x, y, z)'
+    )
+    if any(part.lead_s for part in parts):
+        leads = ', '.join(f'{part.lead_s:.0f}' for part in parts)
+        text = text.replace('lags the board', f'lags what leads the board by {leads} s')
+    return text
 
 
 def _print_positions(out: Output, result: 'FitResult') -> None:

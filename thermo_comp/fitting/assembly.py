@@ -136,8 +136,10 @@ def _valid_columns(
     """Return the response columns in use with their valid ranges."""
     lower, upper = temperature_range(windows)
     is_weighed = np.any(state.weights != 0.0, axis=(0, 1))
+    n_alone = windows.model.part_curves.sums.shape[1]
     alone = is_weighed[len(windows.model.sets.groups) :]
     weighed = _of_columns(windows, is_weighed)
+    of_parts = _of_columns(windows, is_weighed & (np.arange(len(is_weighed)) >= n_alone))
     result = []
     for k in used:
         column = windows.model.columns[k]
@@ -150,6 +152,9 @@ def _valid_columns(
                 # value.
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
+        if k in of_parts and column.term.order % 2:
+            # A part lags as far when it cools as when it warms.
+            valid = union((valid, (-valid[1], -valid[0])))
         # A column used only in the curves over parts' temperatures gets the group of these curves.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else union((valid, column.range))

@@ -7,14 +7,14 @@ The bias and the scale factor of an axis are modelled as functions of ``x = t - 
 temperature of one part of the unit: t is the board temperature less the reference temperature, and
 m = T - L(T + v g) the difference between the board temperature T and that of the part. The part
 lags a temperature between board and case: that of the board plus the share v of the gradient g.
-The lag has one stage or, for a part that is heated through another part, two stages in series. The
-time constants and v minimise the RMS residual of a spline of the bias and a cubic of the scale
-factor, both over x.
+The lag has one stage or, for a part that is heated through another part, two stages in series.
+Without a case thermometer, what the part lags may lead the board's. The time constants, v and the
+lead minimise the RMS residual of a spline of the bias and a cubic of the scale factor, over x.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,11 +50,29 @@ class _Shape(NamedTuple):
     has_gradient: bool = False
 
 
+class _Steps(NamedTuple):
+    """
+    First steps of a search: of the logarithms of both time constants of a part, of the share of
+    the gradient, and of the lead over the first time constant; 0 keeps a value.
+    """
+
+    tau: float
+    second: float = 0.0
+    share: float = 0.0
+    lead: float = 0.0
+
+
+# Steps of the search in the neighbourhood of a lag.
+_NEAR = _Steps(0.03, 0.06, 0.02, 0.02)
+
+
+# Ratio of the RMS residual to white noise below which no other shape is tried.
+_EXPLAINED = 1.1
 # Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so the
 # residual must be noise.
 _SHAPES = (
-    _Shape(4, 1.1),
-    _Shape(4, 1.1, has_gradient=True),
+    _Shape(4, _EXPLAINED),
+    _Shape(4, _EXPLAINED, has_gradient=True),
     _Shape(60, 1.5),
     _Shape(60, 1.5, has_gradient=True, has_stress=True),
 )
@@ -86,7 +104,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
         return None
     noise = white_noise_of(data, start.scale)
-    accepted = None
+    accepted, least = None, np.inf
     for shape in _SHAPES:
         if shape.has_gradient and not windows.gradient.any():
             continue
@@ -100,20 +118,22 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
-        x, y, z = (Part(round(lag[0], 1), round(lag[1], 1), round(lag[2], 4)) for lag in lags)
-        parts = Parts((x, y, z), factors, 2.0 * float(noise.mean()))
-        if (square <= (shape.most_noise * noise) ** 2).all():
-            if shape.has_stress:
-                return parts
-            # Curves alone explain the drift, but extrapolate to left-out sections.
-            return replace(parts, most_drift=10.0 * float(noise.mean()))
-        # A larger residual has another cause, for example slow noise: the lags are then accepted
-        # only if they reduce the RMS residual of each axis to an eighth or less of the residual
-        # without a lag.
-        if shape is _SHAPES[0] or accepted is not None:
+        square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
+        # A residual above the limit has another cause, for example slow noise: the lags are then
+        # accepted only if they reduce the RMS residual of each axis to an eighth or less of the
+        # residual without a lag.
+        is_explained = bool((square <= (shape.most_noise * noise) ** 2).all())
+        if not is_explained and min(map(subset.reduction, lags, range(3))) < 8.0:
             continue
-        if min(map(subset.reduction, lags, range(3))) >= 8.0:
-            accepted = parts
+        largest = float(np.sqrt((square / noise**2).max()))
+        if largest < least:
+            x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
+            # Curves alone explain the drift, but extrapolate to left-out sections.
+            most_drift = 10.0 if is_explained and not shape.has_stress else 2.0
+            accepted = Parts((x, y, z), factors, most_drift * float(noise.mean()))
+            least = largest
+        if largest <= _EXPLAINED:
+            break
     return accepted
 
 
@@ -182,39 +202,68 @@ class _PartCurves:
         """
         Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual.
 
-        A second stage, or a share of the gradient, must reduce a residual above the white noise
-        (`noise`) by 5 %.
+        A second stage, or another share of the gradient, must reduce a residual above the white
+        noise (`noise`) by 5 %.
         """
-        best = self._time_constant(axis)
+        single = self._time_constant(axis)
+        best = self._with_lead(single, axis)
         enough = 1.1**2 * noise**2 * len(self._t)
         if self._square(best, axis) > enough:
-            starts = [best]
+            starts = [single]
             if self._has_case:
                 # The residual has several minima in a valley, in which the time constant grows
                 # with the time by which the temperature between board and case leads the board.
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
-            if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in starts):
+            if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
                 # A second stage or another share would change the lag too little to help.
                 return best
-            lags = [self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0))]
+            lags = [self._searched(axis, _in_two_stages(single), _Steps(0.2, 0.4))]
+            if best.lead_s:
+                steps = _Steps(0.2, 0.4, lead=0.1)
+                lags.append(self._searched(axis, _in_two_stages(best), steps))
             if self._has_case:
                 for near in starts:
                     first = near._replace(tau_s=max(near.tau_s, 15.0))
-                    lags.append(self._searched(axis, first, (0.2, 0.0, 0.1)))
+                    lags.append(self._searched(axis, first, _Steps(0.2, share=0.1)))
             best = self._better(axis, best, min(lags, key=lambda lag: self._square(lag, axis)))
         is_incomplete = self._is_of_use(best, axis, noise) and self._square(best, axis) > enough
         if self._has_case and is_incomplete:
             first = best if best.second_tau_s else _in_two_stages(best)
-            best = self._better(axis, best, self._searched(axis, first, (0.2, 0.4, 0.3)))
+            searched = self._searched(axis, first, _Steps(0.2, 0.4, share=0.3))
+            best = self._better(axis, best, searched)
         return best
+
+    def _with_lead(self, lag: Part, axis: int) -> Part:
+        """
+        Let the temperature that a part lags lead the reading of the board, if the data show this:
+        by a share of the gradient or, without a case thermometer, by a time.
+
+        The residual is linearised in the time constant and the lead. The lead must reduce the sum
+        of squares so far that white residuals would do so by a chance of 1e-5.
+        """
+        tau = lag.tau_s
+        if not tau:
+            return lag
+        key, unit = ('sensor_share', 1.0) if self._has_case else ('lead_s', tau)
+        near = lag._replace(tau_s=1.03 * tau), lag._replace(**{key: 0.03 * unit})
+        residual = self._weighted(lag, axis)
+        slopes = np.column_stack([self._weighted(other, axis) - residual for other in near])
+        steps = -np.linalg.lstsq(slopes, residual, rcond=None)[0]
+        left = residual + slopes @ steps
+        is_possible = steps[1] > 0.0 or self._has_case
+        if not is_possible or left @ left > np.exp(-20.0 / len(left)) * (residual @ residual):
+            return lag
+        longer, lead = 0.03 * np.clip(steps, -10.0, 20.0)
+        first = lag._replace(tau_s=float(tau * (1.0 + longer)), **{key: float(lead * unit)})
+        of_lead = _Steps(0.1, **{'share' if self._has_case else 'lead': 0.1})
+        return self._searched(axis, first, of_lead)
 
     def refined(self, lag: Part, axis: int) -> Part:
         """Return the lag with the smallest RMS residual in the neighbourhood of a lag."""
         if not lag.tau_s:
             return lag
-        tau_step, second_step, share_step = 0.03, 0.06, 0.02
-        steps = tau_step, second_step * bool(lag.second_tau_s), share_step * bool(lag.sensor_share)
+        steps = _Steps(*(step * bool(value) for step, value in zip(_NEAR, lag, strict=True)))
         return self._searched(axis, lag, steps, accuracy=1e-3)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
@@ -222,23 +271,21 @@ class _PartCurves:
         is_better = self._square(other, axis) < self._square(simple, axis) / 1.05**2
         return other if is_better else simple
 
-    def _searched(
-        self, axis: int, first: Part, steps: tuple[float, float, float], accuracy: float = 0.01
-    ) -> Part:
+    def _searched(self, axis: int, first: Part, steps: _Steps, accuracy: float = 0.01) -> Part:
         """
         Return the lag of the smallest RMS residual by the simplex method, begun at `first`.
 
-        `steps`: first steps of the logarithms of the time constants and of the share; 0 to keep
-        the value of `first`; `accuracy`: of these values
+        `accuracy`: of the values that `steps` change
         """
-        start = np.array([np.log(first.tau_s), np.log(first.second_tau_s or 1.0), first[2]])
+        tau, second, share, lead = first
+        start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
         free = np.flatnonzero(steps)
 
         def lag_at(values: Floats) -> Part:
             point = start.copy()
             point[free] = values
-            second = float(np.exp(point[1])) if first.second_tau_s else 0.0
-            return _in_order(float(np.exp(point[0])), second, float(np.clip(point[2], -2.0, 2.0)))
+            taus = np.exp(point[:2]) * (1.0, bool(second))
+            return _in_order(*taus.tolist(), *np.clip(point[2:], (-2.0, 0.0), 2.0).tolist())
 
         simplex = start[free] + np.vstack((np.zeros(len(free)), np.diag(np.array(steps)[free])))
         options: Any = {
@@ -270,8 +317,11 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """Whether time constants longer or shorter by `_STEP` add 5 % to the RMS residual."""
-        tau, second, share = lag
-        others = [Part(ratio * tau, ratio * second, share) for ratio in (1.0 / _STEP, _STEP)]
+        tau, second, share, lead = lag
+        others = [
+            Part(ratio * tau, ratio * second, share, ratio * lead)
+            for ratio in (1.0 / _STEP, _STEP)
+        ]
         if not tau:
             others = [Part(float(self._tried[0]) * _STEP)]
         limit = 1.05**2 * self._square(lag, axis)
@@ -280,6 +330,10 @@ class _PartCurves:
     def reduction(self, lag: Part, axis: int) -> float:
         """Return the ratio of the RMS residual of an axis without a lag to that with `lag`."""
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
+
+    def n_parameters(self, lag: Part) -> int:
+        """Return the number of unknowns of one axis: coefficients and levels of positions."""
+        return int(self._series(lag, 0).shape[1]) + len(self._first)
 
     def residual(self, lag: Part, axis: int) -> Floats:
         """Return the residuals of one axis in all windows, shape (n,) [m/s^2]."""
@@ -299,8 +353,9 @@ class _PartCurves:
         """Return the weighted regressors of bias, scale factor and initial lags, shape (n, k)."""
         x: Floats = self._t.copy()
         if lag.tau_s:
-            tau, second, of_case = lag
-            for tau_s, share in zip((tau, second), Lag('board', tau, second).shares, strict=True):
+            tau, second, of_case, lead = lag
+            shares = Lag('board', tau, second, lead_s=lead).shares
+            for tau_s, share in zip((tau, second), shares, strict=True):
                 at = _interpolation_place(np.asarray(tau_s))
                 x -= share * tau_s * self._ratio(at)
                 if of_case:
@@ -334,14 +389,19 @@ class _PartCurves:
 def _in_two_stages(lag: Part) -> Part:
     """Split a lag of one stage into two stages, as the start of a search."""
     # The residual has a valley where the sum of both time constants is constant.
-    return Part(0.8 * lag.tau_s + 1.0, 0.2 * lag.tau_s + 1.0, lag.sensor_share)
+    tau, _, share, lead = lag
+    return Part(0.8 * tau + 1.0, 0.2 * tau + 1.0, share, lead)
 
 
-def _in_order(tau_s: float, second_tau_s: float, sensor_share: float) -> Part:
-    """Return a lag with the longer time constant first, the shorter at most 0.89 of the longer."""
+def _in_order(tau_s: float, second_tau_s: float, sensor_share: float, lead_share: float) -> Part:
+    """
+    Return a lag with the longer time constant first, the shorter at most 0.89 of the longer.
+
+    `lead_share`: the lead over `tau_s`
+    """
     # Columns accept ratios of both time constants up to 0.9, after rounding to 0.1 s.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
-    return Part(longer, min(shorter, 0.89 * longer), sensor_share)
+    return Part(longer, min(shorter, 0.89 * longer), sensor_share, lead_share * tau_s)
 
 
 def _interpolation_place(tau_s: Floats) -> Floats:

@@ -22,6 +22,7 @@ import math
 from bisect import bisect
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -49,6 +50,9 @@ from .windows import Model, Sets
 UNITS_NEEDED = 3
 #: Smallest share by which correlations of the curves are reduced, so that a covariance is regular.
 LEAST_SHARE = 0.01
+#: The keys of a column of a single lag of the board alone, and its shortest time constant [s].
+_ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
+_LEAST_BEHIND_S = 1.0
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
@@ -253,23 +257,25 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
     the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
-    or behind a temperature between board and sensor, is a sum of single lags; its powers are
-    approximated by the powers of one lag of the board with the sum of the time constants.
+    behind a temperature between board and sensor, or with a lead is a sum of single lags; its
+    powers are approximated by the powers of one lag of the board that is the same time behind in a
+    long ramp.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE
-    if not is_line and (second or column.sensor_share):
-        return _on_common_lags(
-            replace(column, tau_s=tau + second, second_tau_s=0.0, sensor_share=0.0)
-        )
+    if not is_line and any(column.part[1:]):
+        behind_s = max(tau + second - column.lead_s, _LEAST_BEHIND_S)
+        return _on_common_lags(replace(column, tau_s=behind_s, **_ALONE))
     summands: list[tuple[Column, float]] = []
     if column.sensor_share:
         of_board = replace(column, sensor_share=0.0)
         of_sensor = replace(of_board, group='gradient_lag', kind='gradient_lag')
         summands = [(of_board, 1.0), (of_sensor, -column.sensor_share)]
-    elif second and isinstance(lag, Lag):
-        stages = (replace(column, tau_s=tau_s, second_tau_s=0.0) for tau_s in (tau, second))
-        summands = list(zip(stages, lag.shares, strict=True))
+    elif any(column.part[1:]) and isinstance(lag, Lag):
+        summands = [
+            (replace(column, tau_s=tau_s, **_ALONE), share)
+            for (_, tau_s), share in lag.singles.items()
+        ]
     if summands:
         return [
             (common, share * part)

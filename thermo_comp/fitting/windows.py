@@ -109,8 +109,7 @@ class Model:
         """Axes that each column of the response acts on, shape (k, 3); None for all."""
         if self.parts is None:
             return None
-        # A lag of a gradient has no `sensor_share`.
-        own = [(part, part._replace(sensor_share=0.0)) for part in self.parts]
+        own = [(part, part.of_gradient) for part in self.parts]
         return np.array([
             [not column.source.is_of_part or column.part in lags for lags in own]
             for column in self.columns

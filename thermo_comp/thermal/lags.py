@@ -10,6 +10,12 @@ A part may exchange heat with another part that lags the board: the lag then has
 series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of
 two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
+The temperature that a part lags may lead the board thermometer by a time theta: the thermometer
+itself lags the board, or the part also exchanges heat with a case that has no thermometer. The
+part then responds to the readings by ``(1 + theta s) / (1 + tau s)``, so that
+``m = (1 - theta / tau) m_tau``, and for two stages
+``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``.
+
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
 temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind ``T + v g`` is the lag
 of the board less v times the lag of the gradient.
@@ -43,6 +49,7 @@ class _Lag(NamedTuple):
     second_tau_s: float = 0.0
     sensor: str = ''
     sensor_share: float = 0.0
+    lead_s: float = 0.0
 
 
 class Lag(_Lag, Quantity):
@@ -50,8 +57,16 @@ class Lag(_Lag, Quantity):
     The board temperature less that of a part which lags it, or the lag of the gradient of a sensor
     (`input`) [K], with the time constants of its two stages [s]; the second is shorter, or 0 for a
     lag of one stage. A part may lag a temperature between board and sensor: that of the board plus
-    `sensor_share` of the gradient of `sensor`.
+    `sensor_share` of the gradient of `sensor`. `lead_s`: time by which the temperature that the
+    part lags leads the board thermometer [s].
     """
+
+    @property
+    def by_board(self) -> float:
+        """Derivative by the board temperature at a given state of the lag."""
+        if self.input != BOARD_INPUT:
+            return 0.0
+        return 1.0 if self.second_tau_s else self.shares[0]
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -60,7 +75,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def singles(self) -> dict[tuple[str, float], float]:
-        """Share of each single lag in a lag of two stages, by input and time constant."""
+        """Share of each single lag in this lag, by input and time constant."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -72,8 +87,8 @@ class Lag(_Lag, Quantity):
     @property
     def shares(self) -> tuple[float, float]:
         """Shares of the single lags of both time constants in this lag."""
-        difference = self.tau_s - self.second_tau_s
-        return self.tau_s / difference, -self.second_tau_s / difference
+        tau, second, lead = self.tau_s, self.second_tau_s, self.lead_s
+        return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
     def start_share(self, age_s: Any, exp: Any = math.exp) -> Any:
         """Return the RMS share of the initial value that remains at an age [s], from 1 to 0."""
@@ -96,6 +111,7 @@ class _Play(NamedTuple):
     second_tau_s: float = 0.0
     sensor: str = ''
     sensor_share: float = 0.0
+    lead_s: float = 0.0
 
 
 class Play(_Play, Quantity):

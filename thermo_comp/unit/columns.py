@@ -71,11 +71,18 @@ class Part(NamedTuple):
 
     tau_s, second_tau_s: time constants of its two stages [s]; the second is 0 for one stage
     sensor_share: the part lags the board temperature plus this share of the sensor's gradient
+    lead_s: time by which the temperature that the part lags leads the board thermometer [s]
     """
 
     tau_s: float
     second_tau_s: float = 0.0
     sensor_share: float = 0.0
+    lead_s: float = 0.0
+
+    @property
+    def of_gradient(self) -> 'Part':
+        """The time constants of the part alone, which are those of a lag of a gradient."""
+        return Part(self.tau_s, self.second_tau_s)
 
 
 @dataclass(frozen=True)
@@ -103,6 +110,12 @@ class Column:
         float,
         QUANTITIES['share'],
         'The lag is that of T_board + sensor_share * g_s (board, square, cube, play, bend).',
+    ] = 0.0
+    lead_s: Annotated[
+        float,
+        QUANTITIES['lag'],
+        'Time by which the temperature that the part lags leads the board thermometer, if '
+        '`sensor_share` is 0; 0 = none.',
     ] = 0.0
     width_k: Annotated[
         float, QUANTITIES['width'], 'Width of gradient_even, or half-width of play.'
@@ -140,6 +153,11 @@ class Column:
             raise ValueError(
                 f'`second_tau_s` must be at most 0.9 of `tau_s`, got {self.second_tau_s:g}'
             )
+        if self.lead_s and (self.sensor_share or not self.tau_s):
+            raise ValueError(
+                '`lead_s` must be 0 in a column without `tau_s` or with '
+                f'`sensor_share`, got {self.lead_s:g}'
+            )
 
     @property
     def term(self) -> Term:
@@ -154,7 +172,7 @@ class Column:
     @property
     def part(self) -> Part:
         """The lag of the part that the value is computed from."""
-        return Part(self.tau_s, self.second_tau_s, self.sensor_share)
+        return Part(self.tau_s, self.second_tau_s, self.sensor_share, self.lead_s)
 
     @property
     def is_of_sensor(self) -> bool:
@@ -186,8 +204,7 @@ def bank(
     if parts is not None:
         of_plays = of_bends = sorted({*parts})
         fine = coarse = [part for part in of_bends if part.tau_s]
-        of_gradients = {part._replace(sensor_share=0.0) for part in fine}
-        fine_gradient = coarse_gradient = sorted(of_gradients)
+        fine_gradient = coarse_gradient = sorted({part.of_gradient for part in fine})
     columns = _family('gradient', ['gradient'], sensors)
     columns += _family('board', ['board'], lags=fine)
     columns += _family('gradient_lag', ['gradient_lag'], sensors, lags=fine_gradient)

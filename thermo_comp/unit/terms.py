@@ -95,7 +95,8 @@ class Term(ABC):
 
 def _lag_of_part(column: Column) -> lags.Lag:
     sensor = column.sensor if column.sensor_share else ''
-    return lags.Lag(lags.BOARD_INPUT, *column.part[:2], sensor, column.sensor_share)
+    tau, second, share, lead = column.part
+    return lags.Lag(lags.BOARD_INPUT, tau, second, sensor, share, lead)
 
 
 class Gradient(Term):
