@@ -109,7 +109,11 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
     # Slopes of the scale factor that no position shows are claimed in full.
-    claimed = candidates.typical / _slope_factors(n_directions)[:, np.newaxis]
+    full, used = (
+        _typical_slopes(steepness, limits, options)
+        for limits in (STEEPEST, _steepest(n_directions))
+    )
+    claimed = candidates.typical * (full / used)[:, np.newaxis]
     return Fit(windows, regression, selected, claimed)
 
 
@@ -241,11 +245,8 @@ def _candidates(
     is_candidate = np.isin(groups, list(allowed)) & (data.kelvins > 0.0)
     is_candidate &= windows.has_temperature
     parts = np.stack((is_candidate, is_candidate & data.in_scale))
-    # The smallest typical slope of the bias is 0.1 ug/K, better than navigation grade.
-    factors = _slope_factors(n_directions)
-    slope = float(np.clip(steepness, 1e-6, STEEPEST[0] / 3.0))
-    slopes = factors * np.array([slope, min(slope / options.gravity, STEEPEST[1] / 3.0)])
-    steepest = factors * STEEPEST
+    steepest = _steepest(n_directions)
+    slopes = _typical_slopes(steepness, steepest, options)
     fixed = np.zeros(parts.shape, dtype=bool)
     if n_directions == 1:
         # One attitude cannot separate scale and bias: the curve of the scale keeps its prior.
@@ -260,15 +261,23 @@ def _candidates(
     )
     if not windows.was_measured:
         # Without a thermometer the slope is unknown: its whole prior goes into the covariance.
-        typical[:, 0] = largest[:, 0] = steepest
+        typical[:, 0] = largest[:, 0] = STEEPEST
         forced[0] = fixed[:, 0] = True
     return Candidates(typical, largest, forced, fixed)
 
 
-def _slope_factors(n_directions: int) -> Floats:
-    """Return the factors of the prior sd of slopes of bias and scale, shape (2,)."""
-    is_few = n_directions < POSITIONS_FOR_MISALIGNMENT
-    return np.array([1.0, OF_FEW_ATTITUDES if is_few else 1.0])
+def _steepest(n_directions: int) -> Floats:
+    """Return the largest prior sd of slopes of bias and scale by the number of attitudes, (2,)."""
+    # In one attitude the slope of the scale keeps its prior, so nothing is taken for it.
+    is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
+    return STEEPEST * (1.0, OF_FEW_ATTITUDES if is_few else 1.0)
+
+
+def _typical_slopes(steepness: float, steepest: Floats, options: FitOptions) -> Floats:
+    """Return the typical prior sd of a slope of bias and scale, shape (2,)."""
+    # The smallest typical slope of the bias is 0.1 ug/K, better than navigation grade.
+    slope = float(np.clip(steepness, 1e-6, steepest[0] / 3.0))
+    return np.array([slope, min(slope / options.gravity, steepest[1] / 3.0)])
 
 
 def _steepness(
