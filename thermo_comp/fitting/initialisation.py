@@ -29,7 +29,7 @@ from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, Prior, State, Windows, misalignment_scale
-from .windows import CURVE, ThermalWindows
+from .windows import BEND, CURVE, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
@@ -100,9 +100,13 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     narrow = prior
     if n_directions < POSITIONS_NEEDED:
         narrow = _narrowed(prior, regression, state, options)
-    without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
+    is_unseen = _is_slow(windows)
+    if _has_soaks(windows):
+        # No bag passes through the temperatures between the soaks, where the slope may change.
+        is_unseen |= (np.array(data.groups) == BEND) & ~candidates.forced
+    seen = replace(candidates, typical=candidates.typical * ~is_unseen)
     selected = select(
-        *(regression, state, narrow, without_slow),
+        *(regression, state, narrow, seen),
         progress=lambda part: problem.progress(0.7 + 0.25 * part),
     )
     chosen = selected.posterior
