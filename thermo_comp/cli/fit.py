@@ -232,20 +232,18 @@ def _behind_s(parts: Sequence['Part']) -> list[float]:
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Say how far the part of each axis lags the board, or what leads the board."""
-    source = 'the board'
-    if any(part.sensor_share for part in parts):
-        case_shares = ', '.join(f'{part.sensor_share:.2f}' for part in parts)
-        source = f'a temperature between board and case (case share {case_shares})'
+    """Say how far the part of each axis lags the board, or a temperature that leads the board."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
-    text = (
-        f'each axis is a curve of the temperature of its part, which lags {source} by {lags} s '
-        '(x, y, z)'
-    )
-    if any(part.lead_s for part in parts):
+    text = f'lags the board by {lags} s (x, y, z)'
+    if any(part.sensor_share for part in parts):
+        shares = ', '.join(f'{part.sensor_share:.2f}' for part in parts)
+        source = f'a temperature between board and case (case share {shares})'
+        text = f'lags {source} by {lags} s (x, y, z)'
+    elif any(part.lead_s for part in parts):
         leads = ', '.join(f'{part.lead_s:.0f}' for part in parts)
-        text = text.replace('lags the board', f'lags what leads the board by {leads} s')
-    return text
+        source = f'a temperature that leads the board thermometer by {leads} s'
+        text = f'lags by {lags} s (x, y, z) {source}'
+    return f'each axis is a curve of the temperature of its part, which {text}'
 
 
 def _print_positions(out: Output, result: 'FitResult') -> None:
