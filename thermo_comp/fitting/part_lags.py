@@ -251,13 +251,14 @@ class _PartCurves:
         slopes = np.column_stack([self._weighted(other, axis) - residual for other in near])
         steps = -np.linalg.lstsq(slopes, residual, rcond=None)[0]
         left = residual + slopes @ steps
-        is_possible = steps[1] > 0.0 or self._has_case
-        if not is_possible or left @ left > np.exp(-20.0 / len(left)) * (residual @ residual):
+        enough = float(np.exp(-20.0 / len(left)) * (residual @ residual))
+        if left @ left > enough or (steps[1] <= 0.0 and not self._has_case):
             return lag
         longer, lead = 0.03 * np.clip(steps, -10.0, 20.0)
         first = lag._replace(tau_s=float(tau * (1.0 + longer)), **{key: float(lead * unit)})
         of_lead = _Steps(0.1, **{'share' if self._has_case else 'lead': 0.1})
-        return self._searched(axis, first, of_lead)
+        found = self._searched(axis, first, of_lead)
+        return found if self._square(found, axis) <= enough else lag
 
     def refined(self, lag: Part, axis: int) -> Part:
         """Return the lag with the smallest RMS residual in the neighbourhood of a lag."""
