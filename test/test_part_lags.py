@@ -16,7 +16,6 @@ from strangers_cases import (
     HALF,
     HELD,
     Study,
-    bump,
     consumer_grade,
     gradient,
     navigation,
@@ -189,8 +188,8 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 
 def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
-    # WHY: the bump cuts bags into rests; they were taken for soaks, which have no bends: 99 ug.
-    (study,) = bump(2)
+    bump = np.array([450.0, -400.0, 500.0])
+    _, study = study_of('bump', bump=bump, bump_c=17.0)
     # The groups that a fit of all groups chooses take a third of its time.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import FitError
-from ..typing import Bools, Floats, Ints
+from ..typing import Bools, Floats
 from .coverage import distinct_directions, norm_columns
 from .data_checks import POSITIONS_FOR_MISALIGNMENT, POSITIONS_NEEDED
 from .hyperparameters import Candidates
@@ -29,7 +29,7 @@ from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, Prior, State, Windows, misalignment_scale
-from .windows import BEND, CURVE, ThermalWindows
+from .windows import CURVE, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
@@ -63,7 +63,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     If positions differ in temperature by more than their temperatures change, the curve is that
     of the positions' means, unless drifts within the positions improve it on left-out data.
     """
-    if problem.options.prior is not None or not _has_soaks(windows, windows.data.position):
+    if problem.options.prior is not None or not _has_soaks(windows):
         return _regress(windows, problem)
     at_rest = replace(windows, data=_at_rest(windows.data))
     # A regression reports progress from 0.7 to 0.95; each of the two takes half of this range.
@@ -100,13 +100,9 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     narrow = prior
     if n_directions < POSITIONS_NEEDED:
         narrow = _narrowed(prior, regression, state, options)
-    is_unseen = _is_slow(windows)
-    if _has_soaks(windows, windows.data.bag):
-        # No bag passes through the temperatures between the soaks, where the slope may change.
-        is_unseen |= (np.array(data.groups) == BEND) & ~candidates.forced
-    seen = replace(candidates, typical=candidates.typical * ~is_unseen)
+    without_slow = replace(candidates, typical=candidates.typical * ~_is_slow(windows))
     selected = select(
-        *(regression, state, narrow, seen),
+        *(regression, state, narrow, without_slow),
         progress=lambda part: problem.progress(0.7 + 0.25 * part),
     )
     chosen = selected.posterior
@@ -121,14 +117,10 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     return Fit(windows, regression, selected, claimed)
 
 
-def _has_soaks(windows: ThermalWindows, part: Ints) -> bool:
-    """
-    Whether temperatures change less in the positions, or the bags, than from one to the next.
-
-    `part`: number of the position or of the bag of each window, shape (n,)
-    """
+def _has_soaks(windows: ThermalWindows) -> bool:
+    """Whether temperatures change less in the positions than from one position to the next."""
     t = windows.temperature
-    within = within_positions(t[:, None], part)[:, 0]
+    within = within_positions(t[:, None], windows.data.position)[:, 0]
     return bool(np.var(within) < np.var(t - within))
 
 
