@@ -158,6 +158,11 @@ def test_the_lag_of_a_part_behind_a_thermometer_that_lags_the_board(rng, second_
     behind = memory_on_grid(MemorySpec(lags=(lag,)), 1.0, reading, [reading])[:, 0]
     # The memory takes the reading as linear between two stamps.
     np.testing.assert_allclose(reading - behind, part, atol=1e-3)
+    memory = ThermalMemory(MemorySpec(lags=(lag,)))
+    for time, celsius in zip(fine, reading, strict=True):
+        memory.board_step(round(time * 1e9), celsius)
+    streamed = memory.at(round(fine[-1] * 1e9), reading[-1], [0.0])
+    assert streamed[0] == pytest.approx(behind[-1], abs=1e-9)
     assert lag.by_board == pytest.approx(1.0 if second_s else 1.0 - own / 900.0)
     assert sum(lag.shares) == pytest.approx(lag.by_board)
 
