@@ -33,6 +33,10 @@ from thermo_comp.topics import IMU_OUT, REGIME
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
+# Sd of the sample unit's bias from one turn-on to the next [m/s^2], which the norms of nine
+# positions do not show.
+MOUNTING_SD = 1e-6 * STANDARD_GRAVITY
+
 # Groups of the fits by column heading: one curve for both regimes; two curves; all groups that the
 # evidence supports, which is the fit for the node.
 MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
@@ -47,7 +51,9 @@ def demo(folder: Path, output: Path) -> bool:
     models = {}
     with out.progress('fitting', total=len(MODELS)) as done:
         for name, groups in MODELS.items():
-            models[name] = fit(fit_bags, gravity=STANDARD_GRAVITY, groups=groups)
+            models[name] = fit(
+                fit_bags, gravity=STANDARD_GRAVITY, groups=groups, mounting_sd=MOUNTING_SD
+            )
             done(len(models))
     save_calibration(models['node'], unit)
     out.line(f'fitted {unit} from {len(fit_bags)} bags of {folder / "fit"}')

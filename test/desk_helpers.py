@@ -96,9 +96,9 @@ class Desk:
             from thermo_comp.unit.calibration_file import load_calibration
             from thermo_comp.unit.gravity import MICRO_G
 
-            off = np.array([0.0, 0.0, 25.0 * MICRO_G])
+            off = np.array([0.0, 0.0, 4.0 * MICRO_G])
             unit = load_calibration(self._make('unit42.yaml'))
-            write_log(path, rests(unit, upright, lambda _: off, turn_on=5.0 * MICRO_G))
+            write_log(path, rests(unit, upright, lambda _: off, turn_on=1.0 * MICRO_G))
         elif name == 'log.csv':
             rng = np.random.default_rng(3)
             accel = np.array([0.2, -0.1, 9.8]) + 0.01 * rng.standard_normal((1000, 3))

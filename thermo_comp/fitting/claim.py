@@ -40,13 +40,14 @@ from .selection import LAGS, TRIAL_GAIN, Fit
 from .unknowns import InformativePrior, Layout, Prior, State
 from .windows import CURVE, PART
 
-#: Grid of the standard deviation of offsets, relative to the scale of its prior, in steps of a
-#: quarter decade, over which the log evidence is smooth.
-_GRID = 10.0 ** np.arange(-3.0, 1.51, 0.25)
-#: Log prior density on the grid, per step of the logarithm: flat below the scale, a Student's tail
-#: above, and falling to 0 below a hundredth of the scale, which few mountings reach.
-_LOG_DENSITY = -0.5 * (STUDENT_NU + 1.0) * np.log1p(_GRID**2 / STUDENT_NU)
-_LOG_DENSITY += np.log(np.minimum(_GRID / 0.01, 1.0))
+#: Grid of the standard deviation of offsets, relative to the scale of the fit's prior, in steps of
+#: a third of a decade, over which the log evidence is smooth.
+_GRID = 10.0 ** np.linspace(-2.5, 2.25, 16)
+#: Largest usual standard deviation of turn-ons, relative to the scale of the fit's prior, which is
+#: 3 times the noise in 1 Hz. By data sheets, turn-ons of tactical triads repeat within 0.3 to
+#: 1 mg, those of MEMS within some mg: 30 to 60 times the noise. This ratio is smaller, so that
+#: nine positions of a unit whose turn-ons repeat perfectly do not claim more than 0.1 mg.
+_OF_TURN_ONS = 5.0
 #: Grid and log prior density relative to the sd of a prior calibration: a Student's density of the
 #: logarithm. Its scale is the factor of 1.5 to which twelve positions determine an sd.
 _KNOWN_GRID = 10.0 ** np.arange(-1.5, 1.51, 0.125)
@@ -100,7 +101,8 @@ def claim_of(
     n_turn_ons = regression.windows.n_turn_ons
     shared_variance = offset_sd**2 * (1.0 - n_turn_ons / (mounting[-1] + 1))
     if prior.offset_scale > 0.0:
-        tried = prior.offset_scale * _GRID, _LOG_DENSITY
+        has_turn_ons = n_turn_ons == mounting[-1] + 1
+        tried = prior.offset_scale * _GRID, _log_density(_OF_TURN_ONS if has_turn_ons else 1.0)
         if known_offset_sd:
             tried = known_offset_sd * _KNOWN_GRID, _KNOWN_LOG_DENSITY
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
@@ -123,6 +125,16 @@ def claim_of(
         along[layout.kappa] = posterior.state.kappa * gravity_sd / regression.gravity
         covariance = covariance + np.outer(along, along)
     return Claim(layout, covariance, offset_sd)
+
+
+def _log_density(largest_usual: float) -> Floats:
+    """
+    Return the log prior density on `_GRID`, per step of the logarithm: flat below the largest
+    usual value, a Student's tail above, and falling to 0 below a hundredth of the scale of the
+    fit's prior, which few mountings reach.
+    """
+    tail = -0.5 * (STUDENT_NU + 1.0) * np.log1p((_GRID / largest_usual) ** 2 / STUDENT_NU)
+    return np.asarray(tail + np.log(np.minimum(_GRID / 0.01, 1.0)))
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:

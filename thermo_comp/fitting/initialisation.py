@@ -231,7 +231,7 @@ def _mounting_scale(noise: float) -> float:
     # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer MEMS; the
     # tail of the Student prior allows for more. The lower bound is smaller for almost no noise,
     # because an offset 1e6 times as large as the noise cannot be estimated in double precision.
-    least, most = max(min(3e-4, 100.0 * noise), 1e-6), 5e-3
+    least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 
 
