@@ -27,10 +27,11 @@ from ..unit.columns import Column
 from ..unit.nonlinearity import Kind, Nonlinearity
 from ..unit.posterior import posterior_of
 from ..unit.provenance import Provenance, ResidualSummary, Source
-from .claim import Claim, lack_of_fit
+from .claim import Claim
 from .data_checks import Finding
 from .equations import as_vector
 from .evidence import ResidualRow, group_evidence
+from .lack_of_fit import lack_of_fit
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit

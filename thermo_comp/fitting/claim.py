@@ -2,18 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the published uncertainty: the covariance of the fit, widened by the parameters that the data
-do not determine, and the lack of fit, the excess of the left-out errors over this covariance.
+do not determine.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. A fit's weight in the mixture is the evidence
 of the norms times a half-Student prior. The standard deviation of gravity is a common error of the
 scale factors.
-
-The lack of fit per regime and temperature is the mean square of the left-out drift less the
-published variance of this drift. The lack of fit covers effects that no column describes, such as
-a kink of the curve, a tilt of the support or a drift of the bias. Models within one standard error
-of the chosen model contribute half of the squared difference of their drift to that of the chosen
-model.
 
 References
 ----------
@@ -30,13 +24,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from ..typing import Bools, Floats, Ints
-from ..unit.calibration import LackOfFit
+from ..typing import Floats, Ints
 from .equations import as_vector
 from .hyperparameters import STUDENT_NU
 from .initial_triad import within_positions
 from .regression import Posterior, Regression
-from .selection import LAGS, TRIAL_GAIN, Fit
+from .selection import LAGS, TRIAL_GAIN
 from .unknowns import InformativePrior, Layout, Prior, State
 from .windows import CURVE, PART
 
@@ -78,6 +71,7 @@ def claim_of(
     gravity_sd: float = 0.0,
     known_offset_sd: float = 0.0,
     informative: Sequence[InformativePrior] = (),
+    of_means: State | None = None,
 ) -> Claim:
     """
     Return the published covariance of the fit of the chosen model.
@@ -85,7 +79,8 @@ def claim_of(
     `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
     `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
-    `informative`: priors from one calibration, with different ageings since that calibration
+    `informative`: priors from one calibration, with different ageings since that calibration;
+    `of_means`: see `Fit`
     """
     # All rests of a mounting share an offset, but the regression has an offset for each rest. The
     # mean of k offsets with k times the variance has the variance of a single offset.
@@ -113,6 +108,12 @@ def claim_of(
         covariance = covariance + shared_variance * _of_turn_ons(regression, posterior)
     if candidates is not None:
         widened = _with_unseen(regression, posterior, candidates)
+        other = posterior.state
+        if of_means is not None:
+            other = _with_curve(regression, posterior.state, of_means)
+            # An sd of almost 0 gives the columns of the other curve a place in the covariance.
+            is_used = other.weights.any(axis=1) & (widened.column_sd == 0.0)
+            widened = replace(widened, column_sd=np.where(is_used, 1e-9, widened.column_sd))
         with_unseen = regression.solve(posterior.state, widened, n_steps=0)
         # The covariance with unseen columns is computed at the mode's mounting sd. Add the excess
         # of the mixture's covariance over that of the mode.
@@ -120,6 +121,11 @@ def claim_of(
         excess = covariance - posterior.covariance
         layout, covariance = with_unseen.layout, with_unseen.covariance.copy()
         covariance[np.ix_(at, at)] += excess
+        # A warm-up of the unit changes the board in another way than the chamber does. If drifts
+        # within positions at rest tell the curve, the curve of their means is an alternative.
+        states = (as_vector(state, layout)[: layout.n_unit] for state in (other, posterior.state))
+        difference = np.subtract(*states)
+        covariance += 0.5 * np.outer(difference, difference)
     if gravity_sd and regression.gravity:
         along = np.zeros(len(covariance))
         along[layout.kappa] = posterior.state.kappa * gravity_sd / regression.gravity
@@ -144,6 +150,17 @@ def _places(layout: Layout, widened: Layout) -> Ints:
         at = getattr(layout, name)
         places[at[at >= 0]] = getattr(widened, name)[at >= 0]
     return places
+
+
+def _with_curve(regression: Regression, state: State, of_means: State) -> State:
+    """
+    Return the state of the fit to the means of the positions, with the weights of `state` for the
+    columns that change more within the positions than between them.
+    """
+    columns, position = regression.columns, regression.windows.position
+    within = within_positions(columns, position)
+    is_of_means = np.mean(within**2, axis=0) < np.mean((columns - within) ** 2, axis=0)
+    return replace(of_means, weights=np.where(is_of_means, of_means.weights, state.weights))
 
 
 def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) -> Prior:
@@ -356,55 +373,3 @@ def _norm_evidence(
     squares = [np.sum(solve_triangular(root, errors, lower=True) ** 2) for root in roots]
     logs = [2.0 * np.sum(np.log(np.diag(root))) for root in roots]
     return np.asarray(-0.5 * (np.array(squares) + np.array(logs)))
-
-
-def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:
-    """Return the lack of fit of the static and of the dynamic regime; () for none."""
-    windows, regression, selected, _ = fit
-    prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
-    noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.ratio)
-    claimed = drift_variance(regression, state, claim.layout, claim.covariance)
-    excess = selected.score.drift**2 - noise - claimed
-    near = [trial.posterior.state for trial in selected.trials if trial.is_near]
-    drifts = [within_positions(regression.force(other), position) for other in (state, *near)]
-    model_error = 0.5 * np.max((np.array(drifts) - drifts[0]) ** 2, axis=0)
-    static, dynamic = (
-        _points(windows.temperature, excess, model_error, rows & np.isfinite(excess[:, 0]))
-        for rows in (~windows.is_dynamic, windows.is_dynamic)
-    )
-    return static, dynamic
-
-
-def drift_variance(
-    regression: Regression, state: State, layout: Layout, covariance: Floats
-) -> Floats:
-    """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
-    position = regression.windows.position
-    columns = within_positions(regression.columns, position)
-    by_weights = layout.by_weights(columns, regression.effects(state).force[position])
-    variances = [
-        np.sum((along @ covariance[np.ix_(at, at)]) * along, axis=1) for along, at in by_weights
-    ]
-    return np.column_stack(variances)
-
-
-def _points(
-    temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
-) -> tuple[LackOfFit, ...]:
-    """Average the excess in at most 5 bins of temperature, each of 10 windows or more."""
-    n_bins = min(5, int(rows.sum()) // 10)
-    if not n_bins:
-        return ()
-    points: list[LackOfFit] = []
-    order = np.argsort(temperature, kind='stable')
-    for part in np.array_split(order[rows[order]], n_bins):
-        mean = excess[part].mean(axis=0)
-        # Errors of neighbouring windows are correlated: ten windows count as one observation. An
-        # excess below two standard errors is set to 0.
-        error = excess[part].std(axis=0) / np.sqrt(max(len(part) / 10.0, 1.0))
-        mean = np.where(mean > 2.0 * error, mean, 0.0)
-        x, y, z = np.sqrt(mean + model_error[part].mean(axis=0)).tolist()
-        celsius = float(temperature[part].mean())
-        if not points or celsius > points[-1].temperature_c:
-            points.append(LackOfFit(celsius, (x, y, z)))
-    return tuple(points) if any(any(point.sd_m_s2) for point in points) else ()

@@ -21,10 +21,10 @@ from ..text import one_line
 from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
-from .claim import drift_variance
 from .data_checks import Finding
 from .initial_triad import within_positions
 from .initialisation import initial_state
+from .lack_of_fit import drift_variance
 from .left_out import Folds
 from .options import FitOptions
 from .priors import constants_of, informative_priors, prior_model, with_calibration

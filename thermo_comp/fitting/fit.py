@@ -235,6 +235,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     claim = claim_of(
         *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known)),
         informative=fit.selected.informative,
+        of_means=fit.of_means,
     )
     residuals, in_sample, left_out = residual_rows(fit)
     drift = within_positions(in_sample[:, None], fit.windows.data.position)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import FitError
-from ..typing import Bools, Floats
+from ..typing import Bools, Floats, Ints
 from .coverage import distinct_directions, norm_columns
 from .data_checks import POSITIONS_FOR_MISALIGNMENT, POSITIONS_NEEDED
 from .hyperparameters import Candidates
@@ -63,14 +63,19 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     If positions differ in temperature by more than their temperatures change, the curve is that
     of the positions' means, unless drifts within the positions improve it on left-out data.
     """
-    if problem.options.prior is not None or not _has_soaks(windows):
+    if problem.options.prior is not None or not _is_constant(windows, windows.data.position):
         return _regress(windows, problem)
     at_rest = replace(windows, data=_at_rest(windows.data))
     # A regression reports progress from 0.7 to 0.95; each of the two takes half of this range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
-    return of_drifts if is_better(fit.selected.score, of_drifts.selected.score) else fit
+    if not is_better(fit.selected.score, of_drifts.selected.score):
+        return fit
+    has_curve = any(trial.is_chosen and CURVE in trial.groups for trial in fit.selected.trials)
+    if not has_curve or not _is_constant(windows, windows.data.bag):
+        return of_drifts
+    return of_drifts._replace(of_means=fit.posterior.state)
 
 
 def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = False) -> Fit:
@@ -117,10 +122,13 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     return Fit(windows, regression, selected, claimed)
 
 
-def _has_soaks(windows: ThermalWindows) -> bool:
-    """Whether temperatures change less in the positions than from one position to the next."""
+def _is_constant(windows: ThermalWindows, part: Ints) -> bool:
+    """
+    Whether temperatures change less in the parts, positions or bags, than from part to part;
+    `part`: number of the part of each window, (n,).
+    """
     t = windows.temperature
-    within = within_positions(t[:, None], windows.data.position)[:, 0]
+    within = within_positions(t[:, None], part)[:, 0]
     return bool(np.var(within) < np.var(t - within))
 
 

@@ -81,12 +81,15 @@ class Fit(NamedTuple):
 
     typical: typical prior sd of all columns that could have taken part, shape (2, m); None if the
         model has no choice of columns
+    of_means: for bags at constant temperatures: state of the fit to the means of the positions,
+        if this fit has a curve and is worse on left-out data than the chosen fit; else None
     """
 
     windows: ThermalWindows
     regression: Regression
     selected: Selected
     typical: Floats | None = None
+    of_means: State | None = None
 
     @property
     def posterior(self) -> Posterior:
