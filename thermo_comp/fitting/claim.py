@@ -33,21 +33,6 @@ from .selection import LAGS, TRIAL_GAIN
 from .unknowns import InformativePrior, Layout, Prior, State
 from .windows import CURVE, PART
 
-#: Grid of the standard deviation of offsets, relative to the scale of the fit's prior, in steps of
-#: a third of a decade, over which the log evidence is smooth.
-_GRID = 10.0 ** np.linspace(-2.5, 2.25, 16)
-#: Largest usual standard deviation of turn-ons, relative to the scale of the fit's prior, which is
-#: 3 times the noise in 1 Hz. By data sheets, turn-ons of tactical triads repeat within 0.3 to
-#: 1 mg, those of MEMS within some mg: 30 to 60 times the noise. This ratio is smaller, so that
-#: nine positions of a unit whose turn-ons repeat perfectly do not claim more than 0.1 mg.
-_OF_TURN_ONS = 5.0
-#: Grid and log prior density relative to the sd of a prior calibration: a Student's density of the
-#: logarithm. Its scale is the factor of 1.5 to which twelve positions determine an sd.
-_KNOWN_GRID = 10.0 ** np.arange(-1.5, 1.51, 0.125)
-_KNOWN_LOG_DENSITY = (
-    -0.5 * (STUDENT_NU + 1.0) * np.log1p(np.log(_KNOWN_GRID) ** 2 / np.log(1.5) ** 2 / STUDENT_NU)
-)
-
 
 @dataclass(frozen=True)
 class Claim:
@@ -97,9 +82,8 @@ def claim_of(
     shared_variance = offset_sd**2 * (1.0 - n_turn_ons / (mounting[-1] + 1))
     if prior.offset_scale > 0.0:
         has_turn_ons = n_turn_ons == mounting[-1] + 1
-        tried = prior.offset_scale * _GRID, _log_density(_OF_TURN_ONS if has_turn_ons else 1.0)
-        if known_offset_sd:
-            tried = known_offset_sd * _KNOWN_GRID, _KNOWN_LOG_DENSITY
+        scale = prior.offset_scale
+        tried = _offsets_tried(scale, known_offset_sd, has_turn_ons=has_turn_ons)
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
         shared_variance = _turn_on_sd(regression, posterior, *tried) ** 2
         offset_sd = float(np.sqrt(offset_sd**2 + shared_variance))
@@ -107,25 +91,12 @@ def claim_of(
     if shared_variance:
         covariance = covariance + shared_variance * _of_turn_ons(regression, posterior)
     if candidates is not None:
-        widened = _with_unseen(regression, posterior, candidates)
-        other = posterior.state
-        if of_means is not None:
-            other = _with_curve(regression, posterior.state, of_means)
-            # An sd of almost 0 gives the columns of the other curve a place in the covariance.
-            is_used = other.weights.any(axis=1) & (widened.column_sd == 0.0)
-            widened = replace(widened, column_sd=np.where(is_used, 1e-9, widened.column_sd))
-        with_unseen = regression.solve(posterior.state, widened, n_steps=0)
         # The covariance with unseen columns is computed at the mode's mounting sd. Add the excess
         # of the mixture's covariance over that of the mode.
-        at = _places(posterior.layout, with_unseen.layout)
         excess = covariance - posterior.covariance
-        layout, covariance = with_unseen.layout, with_unseen.covariance.copy()
+        layout, covariance = _widened(regression, posterior, candidates, of_means)
+        at = _places(posterior.layout, layout)
         covariance[np.ix_(at, at)] += excess
-        # A warm-up of the unit changes the board in another way than the chamber does. If drifts
-        # within positions at rest tell the curve, the curve of their means is an alternative.
-        states = (as_vector(state, layout)[: layout.n_unit] for state in (other, posterior.state))
-        difference = np.subtract(*states)
-        covariance += 0.5 * np.outer(difference, difference)
     if gravity_sd and regression.gravity:
         along = np.zeros(len(covariance))
         along[layout.kappa] = posterior.state.kappa * gravity_sd / regression.gravity
@@ -133,14 +104,32 @@ def claim_of(
     return Claim(layout, covariance, offset_sd)
 
 
-def _log_density(largest_usual: float) -> Floats:
+def _offsets_tried(scale: float, known_sd: float, *, has_turn_ons: bool) -> tuple[Floats, Floats]:
     """
-    Return the log prior density on `_GRID`, per step of the logarithm: flat below the largest
-    usual value, a Student's tail above, and falling to 0 below a hundredth of the scale of the
-    fit's prior, which few mountings reach.
+    Return values of the sd of the offsets of mountings [m/s^2], and their log prior density per
+    step of the logarithm.
+
+    `scale`: that of the fit's prior, 3 times the noise in 1 Hz; `known_sd`: the sd by a prior
+    calibration, 0 for none; `has_turn_ons`: whether each mounting has a turn-on of its own
     """
-    tail = -0.5 * (STUDENT_NU + 1.0) * np.log1p((_GRID / largest_usual) ** 2 / STUDENT_NU)
-    return np.asarray(tail + np.log(np.minimum(_GRID / 0.01, 1.0)))
+    if known_sd:
+        # Twelve positions determine an sd to a factor of 1.5.
+        ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
+        return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
+    # By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg, those of MEMS within
+    # some mg: 10 to 20 times the scale. This ratio is smaller, so that nine positions of a unit
+    # whose turn-ons repeat perfectly do not claim more than 0.1 mg.
+    largest_usual = 5.0 if has_turn_ons else 1.0
+    # In steps of a third of a decade, over which the log evidence is smooth.
+    ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)
+    # Few mountings repeat within a hundredth of the scale.
+    small = np.minimum(np.log(ratio / 0.01), 0.0)
+    return scale * ratio, _student(ratio / largest_usual) + small
+
+
+def _student(x: Floats) -> Floats:
+    """Return the log density of Student's distribution at x, without its constant."""
+    return np.asarray(-0.5 * (STUDENT_NU + 1.0) * np.log1p(x**2 / STUDENT_NU))
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
@@ -150,6 +139,30 @@ def _places(layout: Layout, widened: Layout) -> Ints:
         at = getattr(layout, name)
         places[at[at >= 0]] = getattr(widened, name)[at >= 0]
     return places
+
+
+def _widened(
+    regression: Regression, posterior: Posterior, candidates: Floats, of_means: State | None
+) -> tuple[Layout, Floats]:
+    """
+    Return the covariance with the columns that the data do not determine, and its layout.
+
+    Arguments as in `claim_of`.
+    """
+    prior, state = _with_unseen(regression, posterior, candidates), posterior.state
+    if of_means is None:
+        with_unseen = regression.solve(state, prior, n_steps=0)
+        return with_unseen.layout, with_unseen.covariance.copy()
+    # A warm-up of the unit changes the board in another way than the chamber does. If the drifts
+    # in bags at rest determine the curve, the curve of the positions' means is an alternative.
+    other = _with_curve(regression, state, of_means)
+    # An sd of almost 0 gives the columns of the other curve a place in the covariance.
+    is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
+    prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
+    with_unseen = regression.solve(state, prior, n_steps=0)
+    layout = with_unseen.layout
+    difference = (as_vector(other, layout) - as_vector(state, layout))[: layout.n_unit]
+    return layout, with_unseen.covariance + 0.5 * np.outer(difference, difference)
 
 
 def _with_curve(regression: Regression, state: State, of_means: State) -> State:
