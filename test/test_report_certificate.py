@@ -168,12 +168,12 @@ def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
 
 
 def test_residual_beyond_the_claim_is_repeatability():
-    judgement = evidence().judgement
-    doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=1e-3))
+    judgement, claim = evidence().judgement, combined(budget(evidence(), CertificateInfo()))
+    doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=3.0 * claim))
     standards = {one.name: one.standard for one in budget(doubtful, CertificateInfo())}
     whole = combined(budget(doubtful, CertificateInfo()))
-    assert 0.9e-3 < standards['repeatability'] < 1e-3
-    assert whole == pytest.approx(1e-3)
+    assert standards['repeatability'] == pytest.approx(8.0**0.5 * claim)
+    assert whole == pytest.approx(3.0 * claim)
 
 
 def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
