@@ -46,9 +46,6 @@ from .thermal_ranges import (
 from .unknowns import Layout, State
 from .windows import PART, Model, ThermalWindows
 
-# The earliest stamp that is taken for a date: the start of the year 2000 [s since 1970].
-EARLIEST_DATE_S = 946684800.0
-
 
 def build_calibration(
     fit: Fit,
@@ -180,8 +177,9 @@ def _provenance(
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)
-    # Stamps since the start of a computer, or of a wrong clock, are not dates.
-    is_date = EARLIEST_DATE_S <= end_s <= now.timestamp()
+    # Stamps since the start of a computer, or of a wrong clock, are not dates: dates are from the
+    # start of the year 2000 on, 946684800 s after 1970.
+    is_date = 946684800.0 <= end_s <= now.timestamp()
     tested = datetime.fromtimestamp(end_s if is_date else 0.0, timezone.utc)
     return Provenance(
         created=_date_text(now),

@@ -62,10 +62,6 @@ class _Steps(NamedTuple):
     lead: float = 0.0
 
 
-# Steps of the search in the neighbourhood of a lag.
-_NEAR = _Steps(0.03, 0.06, 0.02, 0.02)
-
-
 # Ratio of the RMS residual to white noise below which no other shape is tried.
 _EXPLAINED = 1.1
 # Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so the
@@ -264,7 +260,8 @@ class _PartCurves:
         """Return the lag with the smallest RMS residual in the neighbourhood of a lag."""
         if not lag.tau_s:
             return lag
-        steps = _Steps(*(step * bool(value) for step, value in zip(_NEAR, lag, strict=True)))
+        near = _Steps(0.03, 0.06, 0.02, 0.02)
+        steps = _Steps(*(step * bool(value) for step, value in zip(near, lag, strict=True)))
         return self._searched(axis, lag, steps, accuracy=1e-3)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
