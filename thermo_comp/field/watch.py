@@ -244,26 +244,35 @@ def passage(
     # Directions with less than a thousandth of the largest error are left out.
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
-    mean, walk, covariance = onto @ mean, onto @ walk, onto @ covariance @ onto.T
+    mean, covariance = onto @ mean, onto @ covariance @ onto.T
+    # As many independent variables as directions, with the same covariance.
+    walk = np.linalg.qr((onto @ walk).T, mode='r').T
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))
     error = mean + rng.standard_normal((_WALKS, len(mean))) @ initial.T
-    speed = np.exp(0.5 * rate_sd * rng.standard_normal((_WALKS, 1)))
+    speed = np.exp(0.5 * rate_sd * rng.standard_normal(_WALKS))
     times = np.concatenate(([0.0], np.geomspace(0.01, _HORIZON, 400)))
-    left = bound - np.sqrt((error**2).sum(axis=1))
+    left = np.maximum(bound - np.sqrt((error**2).sum(axis=1)), 0.0)
     inside = np.where(left > 0.0, 1.0, 0.0)
-    stays = [float(inside.mean())]
+    stays = [inside.sum() / _WALKS]
     for step in np.diff(times):
-        moved = speed * np.sqrt(step) * rng.standard_normal((_WALKS, walk.shape[1]))
-        error = error + moved @ walk.T
-        size = np.sqrt((error**2).sum(axis=1))
+        if stays[-1] <= 1.0 - _QUANTILES[-1]:
+            break
+        # Walks that are outside are left out from time to time.
+        is_in = inside > 0.0
+        if is_in.mean() < 0.8:
+            error, speed, left, inside = error[is_in], speed[is_in], left[is_in], inside[is_in]
+        moved = rng.standard_normal((len(error), walk.shape[1])) @ walk.T
+        error = error + (speed * np.sqrt(step))[:, np.newaxis] * moved
+        size = np.sqrt(np.einsum('ij,ij->i', error, error))
         # Between two points a Brownian bridge crosses the bound with the probability exp(-2 a b /
         # variance): a and b are the distances from the bound, the variance is along the error.
-        along = ((error @ walk) ** 2).sum(axis=1) * speed[:, 0] ** 2 * step
-        product = np.maximum(left, 0.0) * np.maximum(bound - size, 0.0) * size**2
+        onto_walk = error @ walk
+        along = np.einsum('ij,ij->i', onto_walk, onto_walk) * speed**2 * step
+        product = left * np.maximum(bound - size, 0.0) * size**2
         inside = inside * -np.expm1(-2.0 * product / np.maximum(along, 1e-300))
-        left = bound - size
-        stays.append(float(inside.mean()))
+        left = np.maximum(bound - size, 0.0)
+        stays.append(inside.sum() / _WALKS)
     survival = np.array(stays)
     return tuple(
         float(times[np.argmax(survival <= 1.0 - p)]) if survival[-1] <= 1.0 - p else np.inf
