@@ -38,8 +38,8 @@ from .windows import CURVE, PART
 _GRID = 10.0 ** np.linspace(-2.5, 2.25, 16)
 #: Largest usual standard deviation of turn-ons, relative to the scale of the fit's prior, which is
 #: 3 times the noise in 1 Hz. By data sheets, turn-ons of tactical triads repeat within 0.3 to
-#: 1 mg, those of MEMS within some mg: 30 to 60 times the noise. This ratio is smaller, so that
-#: nine positions of a unit whose turn-ons repeat perfectly do not claim more than 0.1 mg.
+#: 1 mg, those of MEMS within some mg: 30 to 60 times the noise. The limit is 15 times the noise,
+#: so that nine positions of a unit whose turn-ons repeat perfectly claim at most 0.1 mg.
 _OF_TURN_ONS = 5.0
 #: Grid and log prior density relative to the sd of a prior calibration: a Student's density of the
 #: logarithm. Its scale is the factor of 1.5 to which twelve positions determine an sd.
