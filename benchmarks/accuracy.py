@@ -156,7 +156,7 @@ def fit_and_correct(
 
 @dataclass(frozen=True)
 class Errors:
-    """RMS over all windows of the test: |g|, its peak, the vector [ug], and error / claimed sd."""
+    """RMS and peak of |f| - g, RMS of the error vector [ug] and of error / claimed sd."""
 
     norm: float
     peak: float

@@ -88,7 +88,8 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
     columns = []
     for j in range(len(start)):
-        # Steps: 1e-6 for direction and M; 1e-3 for bias and scale, smaller for their powers of t.
+        # Steps of the numerical derivatives: 1e-6 for direction and M; 1e-3 for bias and scale,
+        # smaller for the coefficients of t and t^2.
         step = np.zeros(len(start))
         step[j] = 1e-6 if j >= 9 else 1e-3
         step[j] *= 1e-3 if j < 18 and j % 3 == 2 else 1e-1 if j < 18 and j % 3 == 1 else 1.0

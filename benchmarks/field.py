@@ -80,8 +80,9 @@ def root_mean(values: Floats) -> float:
 
 def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     """
-    Return whether the update, and the best filter, are worse than the old file on a day: by more
-    than the standard error of the RMS over n starts, which is the claimed sd over sqrt(2 n).
+    Return whether the update, and the best filter, have a larger error than the old file on a day.
+
+    The excess must be above the standard error of an RMS over n starts, claimed sd / sqrt(2 n).
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K

@@ -199,7 +199,11 @@ class BestFilter:
         self._now, self._is_shocked, self._start = 0.0, False, -1
 
     def take(self, now: float, start: int, counts: Floats, warmth: float, variance: float) -> None:
-        """Take the mean [counts / `K`] of a rest, `now` in days, the variance of its norm."""
+        """
+        Update the filter with a rest.
+
+        now: time [days]; counts: mean [counts / `K`]; variance: that of the norm of the mean
+        """
         process = self.process
         if start != self._start:
             elapsed, self._now, self._start = now - self._now, now, start

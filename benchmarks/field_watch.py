@@ -50,10 +50,10 @@ def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generat
 
 def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
     """
-    Compare forecast and recalibration interval of units with their futures.
+    Compare forecasts and recalibration intervals with simulated times of leaving the claim.
 
-    Each row has the share of futures in the forecast's 10 to 90 % interval, the median of the
-    futures, and the forecast's quantiles.
+    Each row has the share of these times in the forecast's 10 to 90 % interval, the median of the
+    times, and the forecast's quantiles.
     """
     rng, process = np.random.default_rng(3), Process()
     found: dict[str, list[tuple[float, ...]]] = {'forecast': [], 'interval': []}

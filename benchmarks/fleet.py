@@ -199,9 +199,9 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             measure(folder / 'fleet', units, workers, options)
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
-        # Other programs on the processors slow two workers more than one. Two workers with a
-        # processor each lose time only by waiting and by sharing caches and memory, which does not
-        # depend on other programs.
+        # Other programs on the processors slow two workers more than one worker. Two workers with
+        # a processor each lose time only by waiting and by sharing caches and memory, which does
+        # not depend on other programs.
         free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
         collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the scenes of benchmarks/regime.py: ramps behind lags, sensors, and the CUSUM bound."""
+"""Owns the simulated ramps and sensors of benchmarks/regime.py, and the CUSUM bound."""
 
 from __future__ import annotations
 

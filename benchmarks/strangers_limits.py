@@ -110,7 +110,7 @@ class Limit:
 _ONE_THERMOMETER = Limit(norm=25.0, low=0.7, high=1.4)
 _REAL_UNIT = Limit(norm=560.0, low=0.7, high=1.4)
 _TURN_ON = Limit(low=0.7, high=1.4, unit=2.0)
-#: Limits by the beginning of a row's title; the longest beginning applies.
+#: Limits of the rows whose title begins with the key; of several such keys the longest applies.
 LIMITS = {
     'sample-bags': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'no-case': _ONE_THERMOMETER,

@@ -331,7 +331,7 @@ def lagged(node: Floats, tau_s: float) -> Floats:
     if not tau_s:
         return node
     decay = np.exp(-STEP_S / tau_s)
-    # In a ramp the lag is behind by the rate times the time constant, which starts from zero.
+    # Late in a ramp the lagged temperature is behind by rate times `tau_s`; before the ramp by 0.
     gain = tau_s / STEP_S * (1.0 - decay)
     behind = lfilter([gain], [1.0, -decay], np.diff(node, prepend=node[0]))
     return np.asarray(node - behind)

@@ -26,7 +26,7 @@ MICRO = 1e-6 * GRAVITY
 
 @dataclass(frozen=True)
 class Truth:
-    """A unit, in m/s^2 of the nominal scale factor; weights per physical unit of the columns."""
+    """True parameters of a unit; biases are counts / nominal scale factor [m/s^2]."""
 
     kappa: Floats = field(default_factory=lambda: np.array([1.0003, 0.9996, 1.0005]))
     bias: Floats = field(default_factory=lambda: np.array([5e-3, -8e-3, 2e-3]))

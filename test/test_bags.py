@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sample bags agree with their README: small, complete, and made by its two commands."""
+"""The sample bags agree with bags/README.md: size, content, and the commands that make them."""
 
 import shlex
 from pathlib import Path

@@ -50,7 +50,7 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # One set has errors by regimes, two sets errors by lags; noise is below 10 ug.
+        # One set lacks the difference of the regimes, two sets lack lags; noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

@@ -4,8 +4,8 @@
 Faults at the worst times of a ramp, through the compensator without DDS.
 
 WHY: the covariance was large enough for a fault in the middle of a ramp, but not for the same
-fault at the start of the ramp, or when a sensor came back with another value. PROMISE: every
-published sample is within five of its standard deviations.
+fault at the start of the ramp, nor after a sensor came back with another value. PROMISE: every
+published sample has an error below five claimed standard deviations.
 """
 
 import math

@@ -129,7 +129,7 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_their_errors():
         if kind == 'level':
             assert abs(updated.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
     before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
-    # A filter that knows the process leaves 12 ug (benchmarks/field.py).
+    # A Kalman filter with the true variances leaves 12 to 14 ug RMS (benchmarks/field.py).
     assert before > 100.0
     assert left < 30.0
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -291,7 +291,7 @@ def test_a_start_that_contradicts_all_others_is_left_out():
 
 def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
     # A computer without a battery clock starts at the date of its image, and the stamps of the
-    # samples are right. Every start, then the last start alone, has such a date.
+    # samples are right. First all starts have the date of an image, then only the last start.
     unit = known()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {one.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for one, _ in logged}

@@ -41,7 +41,8 @@ def test_jump_along_gravity(rng, with_gyro):
 
 @pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
 def test_jump_in_a_slow_log(rng, rate_hz):
-    # WHY: at 2 Hz the gap between the rests around a jump, some 200 samples, is 80 s.
+    # WHY: the gap between the rests around a jump is 120 samples, 60 s at 2 Hz, above the limit of
+    # 30 s.
     rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
     source = rest.source()

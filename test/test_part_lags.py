@@ -100,11 +100,11 @@ def test_thermometers_that_lag_board_and_case(sensors):
     parts = {one.part for one in calibration.response if one.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # A share of the gradient leads the board in all programs of one environment.
+        # Parts lag the board plus a share of the gradient; the share is equal for all axes.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
-        # The shares 1 - theta / tau of all axes are determined to 1 % of 1.
+        # The fit determines the ratio theta / tau of each axis with an error below 0.01.
         assert leads / taus == pytest.approx(60.0 / unit.part_s, abs=0.01)
 
 
@@ -257,7 +257,8 @@ def test_six_faces_in_three_soaks(given):
 
 
 def test_a_curve_between_two_soaks_is_claimed():
-    # WHY: without the powers that the soaks do not determine the claimed sd was 1/8 of the error.
+    # WHY: two soaks do not determine the powers of t; without these powers in the covariance the
+    # claimed sd was 1/8 of the error.
     rng = rng_of('two soaks')
     unit = consumer_grade(rng)
     bags = positions(unit, SOAKS[::2], spread(18, rng), rng, rate_hz=10.0)

@@ -197,8 +197,8 @@ def test_swapped_topics_are_reported(preset, sensor):
 
 
 def test_a_unit_that_was_switched_on_heats_itself_and_is_not_swapped():
-    # WHY: every start in the field looks like a ramp in which the board leads; it was taken for
-    # exchanged topics, with a claimed sd twenty times too large for the whole run. WHAT: a warm-up
+    # WHY: every start in the field looks like a ramp in which the board leads. The start was taken
+    # for exchanged topics; the claimed sd of the run was 20 times too large. WHAT: a warm-up
     # by 4 K, by a third of this in the case, then a ramp with the case in the lead.
     tracker = tracker_of(memory=LAG)
     for second in range(3 * 3600):

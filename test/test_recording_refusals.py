@@ -229,7 +229,7 @@ def driver_bag(path, *topics, metadata=None):
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
-        # Of two equivalent topics none is chosen, and no vector that is not a force.
+        # Neither of two equivalent topics is chosen, nor a vector that is not a force.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
         # A topic is the node's output if it has the regime topics beside it.

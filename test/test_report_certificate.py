@@ -270,7 +270,7 @@ def test_the_uncertainty_of_gravity_is_that_of_the_scale_factors(tmp_path):
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # U is twice the uncertainty of gravity, 1e-3 of it, which is far above that of the fit.
+    # The expanded uncertainty is twice that of gravity, 1e-3, which is far above the fit's.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert (
         rows['bias x']

@@ -14,7 +14,7 @@ This module owns the public names, and states the conventions of all other docst
 Units
     SI and degrees Celsius. Temperature differences and rates are in K and K/s. A name carries a
     unit suffix only where there is no docstring to read (file keys, ROS parameters, command-line
-    flags, columns) or where the unit differs (`rate_k_min`).
+    flags, columns) or where the unit is not SI (`rate_k_min`).
 Counts
     Raw accelerometer outputs are signed counts per conversion cycle: an increment, quantized,
     saturating at the converter's full scale. Where a unit already reports m/s^2, "counts" means

@@ -84,7 +84,7 @@ def shown_name(path: str | Path) -> str:
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file; OSError, before reading can block, for anything else, e.g. a pipe."""
+    """Open a regular file; anything else, e.g. a pipe that may block, raises OSError at once."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):

@@ -31,8 +31,9 @@ def info(
     """
     Describe a bag or a calibration.
 
-    Bag: topics, rate, temperature span and ramps, gaps, and whether a fit
-    can use it. Calibration: unit, ranges, sets, residuals, nonlinear terms.
+    Prints topics, rate, temperature span, ramps and gaps of a bag, and whether
+    a fit can use the bag; unit, ranges, sets, residuals and nonlinear terms of
+    a calibration.
 
     Example:
       thermo_comp info chamber.mcap

@@ -44,8 +44,8 @@ _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
 # Unit of a temperature at the end of a heading, and words of columns that are not temperatures.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
-# Headings that are those of a thermometer only if the values of the column can be temperatures: a
-# heading that ends in a letter for the unit, or that is the place of a thermometer alone.
+# A heading that ends in a letter for the unit, or names only a place, is taken for that of a
+# thermometer only if the column's values can be temperatures.
 _LETTER = re.compile('_[ck]$|^(board|case|imu|die|chip)_f$')
 _PLACE = re.compile('board|case|imu|die|chip')
 # Units as they stand in brackets or, in lower case with underscores, at the end of a heading.

@@ -10,7 +10,8 @@ and s are random walks of bias and scale since the calibration, o_k is a bias of
 unknown lag states at the start, e is independent noise. The slopes of the bias over temperature
 walk slowly, by a fixed sd.
 Jumps of the levels or of gravity, and a change of the curve, are added one at a time while the log
-Bayes factor is high enough. The variances maximise the marginal likelihood, with wide priors.
+Bayes factor is high enough. The variances of walks, offsets and noise maximise the marginal
+likelihood, with wide priors.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ _LAG_SHARE = 1.0
 _LEAST_TURN_ON = 5.0 * MICRO_G
 #: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
-#: Relative sizes of a jump in the biases and in the scales times g, which a shock changes less.
+#: Prior sd of a jump in the biases, and in the scales times g, relative to `_JUMPS`: a shock
+#: changes scales less.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
 #: Smallest log Bayes factor of a change (150:1), and of a jump of gravity relative to a jump of
 #: the levels (20:1).

@@ -136,8 +136,9 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week follows a change late. If the ageing model's error at the last rest agrees,
-    # one day outside the claim begins an excess, and two days within the claim end an excess.
+    # The RMS of a week follows a change late. One day outside the claim begins an excess if the
+    # ageing model's error at the last rest is outside, too. Two days within the claim end an
+    # excess if the model's error is within, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -149,7 +150,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # Here the last two days are within the limit, even if the last week is outside.
+        # If the last week is outside, its last two days are within: a day back within exists.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -162,10 +163,10 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
 
 def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
-    Return the first place of each day's window, and the window's RMS without its largest value.
+    Return the first index of the window that ends on each day, and the window's robust RMS.
 
-    A window has the days with rests of a week, and two days at least. Its largest value, which may
-    be that of a disturbed day, is replaced by the second largest.
+    A window has the days with rests in the week up to a day, and two such days at least. The
+    largest value, perhaps of a disturbed day, is replaced by the second largest.
     """
     n = np.arange(len(day))
     first = np.minimum(
@@ -246,7 +247,7 @@ def passage(
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
     # As many independent variables as directions, with the same covariance.
-    walk = np.linalg.qr((onto @ walk).T, mode='r').T
+    walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))
     error = mean + rng.standard_normal((_WALKS, len(mean))) @ initial.T

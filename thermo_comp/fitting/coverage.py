@@ -107,7 +107,7 @@ def directions(means: Floats, centre: Floats) -> Floats:
 
 def rough_centre(means: Floats) -> Floats:
     """
-    Return the reading at zero force: 0 if the norms of readings agree, else a sphere's centre.
+    Return the reading at zero force: 0 if the norms agree, else the centre of a fitted sphere.
 
     With offset binary codes the angles between raw vectors are meaningless. `means`: mean
     readings, shape (n, 3); with fewer than four readings, or all in a plane, the result is 0.
@@ -162,7 +162,7 @@ def best_rests(candidates: list[Floats]) -> int:
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd of a triad's constant by the scatter of the rests' norms [g]."""
+    """Fit constants to norms of rests; return their largest sd by the scatter of the norms [g]."""
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf

@@ -53,7 +53,7 @@ class PositionReport:
 @dataclass(frozen=True)
 class ResidualRow:
     """
-    ``|f| - g`` of the windows of one section, by step of the model.
+    Statistics of ``|f| - g`` over the windows of one section, after each step of the model.
 
     section: regime of the windows, ``static``, ``dynamic`` or ``all``
     raw: corrected with the constants at the reference temperature

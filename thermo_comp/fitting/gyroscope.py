@@ -5,8 +5,8 @@ Owns the fit of the gyroscope: the angular rate at rest, with the columns of the
 
 A gyroscope at rest measures the component of the Earth's rate in its attitude, plus a bias that
 changes at each turn-on. The regression has one constant offset of the rate in each position as an
-unknown. Changes of the rate within a position determine the effect of temperature; its mean over
-the positions determines the constant bias. The regression is that of the accelerometer with
+unknown. Changes of the rate within a position determine the effect of temperature; the mean rate
+over the positions determines the constant bias. The regression is that of the accelerometer with
 gravity 0, in rad/s in place of m/s^2.
 """
 
@@ -75,7 +75,7 @@ def add_gyroscope(
     # Sd of the component of the Earth's rate along one axis in an unknown attitude [rad/s].
     earth_sd = EARTH_RATE / math.sqrt(3.0)
     prior = Prior(
-        bias_sd=np.full(3, 1.0),  # prior sd of the bias [rad/s], flat for any gyroscope
+        bias_sd=np.full(3, 1.0),  # prior sd of the bias [rad/s], wide for any gyroscope
         scale_sd=1.0,
         misalignment_sd=1.0,
         column_sd=np.zeros((2, len(data.groups))),
@@ -84,7 +84,7 @@ def add_gyroscope(
         offset_scale=earth_sd,
     )
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
-    # The positions determine the offsets, so the sd of the offsets is not marginalised.
+    # The positions determine the sd of the offsets, so `claim_of` does not marginalise over it.
     fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
     claim = claim_of(regression, replace(fit.posterior, prior=fixed_sd))
     # The Earth's rate, which the offsets contain, is a true rate and not an error of the

@@ -109,8 +109,8 @@ def _updated(
         misalignment_sd = min(new_sd, 0.03)
     start_share = prior.start_share
     if layout.start.size:
-        # The prior of the node (`start_share` of 1) counts as one further state, so that the
-        # states of a single bag cannot make `start_share` very small.
+        # One further state with the variance of the node's prior (`start_share` of 1) is added, so
+        # that the states of a single bag cannot make `start_share` very small.
         gamma = float(determined[layout.start].sum())
         start_share = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
         changes.append(float(np.abs(np.log(start_share / prior.start_share))) / 4.0)

@@ -66,7 +66,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     if problem.options.prior is not None or not _is_constant(windows, windows.data.position):
         return _regress(windows, problem)
     at_rest = replace(windows, data=_at_rest(windows.data))
-    # A regression reports progress from 0.7 to 0.95; each of the two takes half of this range.
+    # A regression reports progress from 0.7 to 0.95; each of two regressions gets half the range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
@@ -236,9 +236,10 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
-    # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer MEMS; the
-    # tail of the Student prior allows for more. The lower bound is smaller for almost no noise,
-    # because an offset 1e6 times as large as the noise cannot be estimated in double precision.
+    # Bounds of the prior's scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer
+    # MEMS; the tail of the Student prior allows for more. The lower bound is smaller for almost no
+    # noise, because an offset 1e6 times as large as the noise cannot be estimated in double
+    # precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 

@@ -66,7 +66,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     directions differ by less than 10 degrees.
     """
     cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
-    # A slow log has long gaps, because the end of a rest is found only to some twenty samples.
+    # A slow log has long gaps, because rests end at borders of cells, of 30 samples or more.
     longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]

@@ -258,7 +258,7 @@ def _is_determined(by_others: float, by_all: float) -> bool:
 
 
 def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
-    """Whether a fit without a position determines its drift; `root` as in `Posterior`."""
+    """Whether a fit without a position determines its drift (`rows`); `root`: see `Posterior`."""
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True
@@ -276,7 +276,7 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
 
 
 def _is_norm_determined(point: Point, posterior: Posterior, root: Floats, p: int) -> bool:
-    """Whether a fit without a position determines its norm; `root` as in `Posterior`."""
+    """Whether a fit without position `p` determines the norm of `p`; `root`: see `Posterior`."""
     if not point.regression.gravity:
         return False
     along = point.norms_by_unit[p]

@@ -333,7 +333,7 @@ class Regression(Equations):
         base = self.products(layout.used).base
         columns, at = np.unique(column, return_inverse=True)
         among, beside = self.products_of(columns, base)
-        # Derivative of the reading by a unit of a column's effect on the bias and on the scale.
+        # Derivatives of the reading by a column's contribution to the bias, and to the scale.
         acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
         acts /= sigma
         rows = point.tangent.of(self.at_starts(beside, state, base))[:, :, at]

@@ -29,7 +29,7 @@ from .regression import Posterior, Regression
 from .unknowns import InformativePrior, Prior, State
 from .windows import BEND, CURVE, PART, PART_SUMS, SET, ThermalWindows
 
-#: Smallest possible gain in log evidence of a group that is tried: odds of e^4 = 55 to one.
+#: A group is tried if its largest possible gain in log evidence exceeds this: odds of e^4 = 55:1.
 TRIAL_GAIN = 4.0
 #: Groups that are linear in a temperature difference.
 GRADIENT = 'gradient'

@@ -71,9 +71,11 @@ def rest_gradient_range(
     windows: ThermalWindows, lag_s: float, known: Calibration | None
 ) -> Range | None:
     """
-    Return the range of the first sensor's gradient without that of ramps; None without the sensor,
-    without ramps, which determine the lag, or for a range beyond 100 K, as in bags too short for a
-    rate.
+    Return the range of the first sensor's gradient, less the part of ramps, ``lag_s * rate``.
+
+    The range of a prior calibration, `known`, is included. Without that range the result is None
+    without the sensor, without ramps, which determine the lag, or for a range beyond 100 K, as in
+    bags that are too short for a rate.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0

@@ -117,7 +117,7 @@ class Model:
 
     @cached_property
     def part_curves(self) -> PartCurves:
-        """The curves over the temperatures of parts; none if parts or columns are not known."""
+        """Curves over the temperatures of parts; empty if parts or columns are not known."""
         parts = self.parts if self.sets.has_cubic else None
         return curves_of(parts or (), self.columns, len(self.sets.groups))
 

@@ -46,7 +46,7 @@ from .wire import Feed, decode_blocks
 
 _MAX_BYTES = 1 << 24
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
-#: Largest batch decoded at a time of a foreign file: messages, bytes, time [ns].
+#: Largest batch that is decoded at a time from a foreign file: messages, bytes, time [ns].
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 

@@ -45,7 +45,7 @@ STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a cell of slow s
 _LONGEST_CELL_NS = 86400e9  # a longer cell is due to wrong stamps [ns]
 MIN_SAMPLES = 30  # smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
-_WORD = 32768.0  # the middle of unsigned 16-bit words
+_WORD = 32768.0  # middle of the range of unsigned 16-bit numbers
 _LONGER = (23, 31)  # magnitude bits of 24- and 32-bit words
 _STUCK = 0.3  # ratio of noise to quantum below which a sensor mostly repeats one number
 
@@ -301,7 +301,7 @@ def still_runs(
     colour = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise: toggling between two adjacent
     # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
-    # variance is below its mean; for cells of 32 samples a factor of 1.3 covers the difference.
+    # variance times 1.3 is the mean for cells of 60 samples, and 0.9 of the mean for 32 samples.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))

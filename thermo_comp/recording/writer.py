@@ -33,7 +33,7 @@ _AUTO_FLUSH_BYTES = 1 << 26
 #: Format of a table by its suffix.
 TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}
 WriteRows = Callable[[Mapping[str, NDArray[Any]]], None]
-#: First index among a message's numbers, name, values, width.
+#: Column of a message: index of its first number in the message, name, values, count of numbers.
 _Column = tuple[int, str, ArrayLike, int]
 
 

@@ -27,7 +27,7 @@ class Program(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The name, and the rate of a ramp."""
+        """The name of the program; for a ramp also the rate."""
         return f'{self.name} at {abs(self.rate_k_min):g} K/min' if self.rate_k_min else self.name
 
 

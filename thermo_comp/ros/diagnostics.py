@@ -127,8 +127,8 @@ class Reporter:
         self._publisher.publish(array)
         if message.level != self._level:
             self._level, log = message.level, self._node.get_logger()
-            # rclpy allows one severity per call in the source, so each severity needs a separate
-            # call.
+            # rclpy refuses a line of source that logs with a second severity, so each severity has
+            # a separate line.
             if message.level == DiagnosticStatus.OK:
                 log.info(message.message)
             elif message.level == DiagnosticStatus.WARN:

@@ -68,7 +68,7 @@ class Sources:
         self._n_known = 0
         self._number: int | None = None
         self._n_in_row, self._since_ns = 0, 0
-        #: False only when a single publisher is proven.
+        #: Whether the messages may be from several publishers.
         self.is_contested = False
 
     def first_of_single_source(
@@ -174,7 +174,9 @@ class WaitLoop:
         self, message_type: Any, topic: str, qos: QoSProfile, *, wakes: bool = True
     ) -> RawSubscription:
         """
-        Subscribe in serialized form; the first subscription that `wakes` ends a wait at once.
+        Subscribe in serialized form.
+
+        While samples flow, only messages of the first subscription with `wakes` end a wait.
         """
         # rclpy needs a callback for each subscription, but without an executor never calls it.
         create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)

@@ -91,7 +91,8 @@ class FlowEffect(Effect):
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent`` times the deviation
     of `cold` to the `power`: 1.25 for convection in a gap, 1 for the load of a heat pump, 2 for
-    its losses. If the pump's supply is limited, the signal saturates at 1, ``x^e / (1 + x^e)``.
+    its losses. If `is_limited`, as by the supply of a heat pump, the signal saturates at 1:
+    ``x ** exponent / (1 + x ** exponent)``.
     The second signal is the first times the deviation of `cold`.
     """
 

@@ -192,7 +192,7 @@ def _demo(draw: Specimen) -> UnitModel:
     links.append(Link('board', 'head', 0.02))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
     drift = PartEffect('board', **tempcos(draw))
-    # A stress decays with the lag of the head; the load, a heat flow, has a large effect.
+    # `stress` follows the head's lag behind the board; `load`, by heat flow, is a large effect.
     stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
     load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
     return draw.triad(network, (drift, *loads(draw), load, stress))
@@ -228,7 +228,7 @@ _KINDS = {
     'thermostatted': (0, _thermostatted),
     'bare-quartz': (1, _bare_quartz),
     'mems': (2, _mems),
-    # The numbers 3 to 12 belong to the triads of benchmarks/triads.py.
+    # benchmarks/triads.py uses the streams of random numbers 3 to 12.
     'demo': (13, _demo),
 }
 UNIT_NAMES = tuple(_KINDS)

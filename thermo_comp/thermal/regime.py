@@ -26,8 +26,8 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state, in lags of the leading sensor
-# Margin for "the rate is below a limit", in sd of the rate. A margin of half a sd is sufficient:
-# in a soak most of the rate's variance allows for an onset that may begin.
+# Margin for "the rate is below a limit", in sd of the rate. Half a sd is sufficient: in a soak
+# most of the rate's variance is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
 OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
 FIRST_READINGS: Final = 20  # number of readings that correct a declared noise that is too small

@@ -123,10 +123,11 @@ class ThermalConfig:
     #: Time over which the two sets of coefficients are blended after a change of regime [s],
     #: longer if they differ much (`Correction.gentle_transition`); 0 = the paper's hard switch.
     transition_time_s: NotNegative = 30.0
-    #: Age of the board temperature after which nothing is published [s]; a sensor that took an
-    #: impossible step starts anew only after the same time.
+    #: Age of the board temperature after which nothing is published [s]; also the time for which
+    #: the readings after an impossible step of the board temperature are refused.
     temperature_timeout_s: Positive = 60.0
-    #: Age of the case temperature from which the board temperature decides the regime [s].
+    #: Age of the case temperature at which the board temperature decides the regime [s]; also the
+    #: time for which the readings of other sensors after an impossible step are refused.
     case_timeout_s: Positive = 30.0
 
     def __post_init__(self) -> None:

@@ -196,7 +196,7 @@ class ThermalTracker:
         return True
 
     def _begin_again(self, name: str, sensor: Thermometer) -> None:
-        """Forget a sensor's readings, which were wrong, and all that followed from them."""
+        """Forget the wrong readings of a sensor, and the lags, gradients and regime from them."""
         sensor.reset()
         self.memory.forget_input(name)
         self._rest_gradients.clear()
@@ -289,7 +289,7 @@ class ThermalTracker:
     def _gradient(
         self, name: str, stamp_ns: int, board: float, rate: float
     ) -> tuple[float, float]:
-        """Return a gradient and the variance of its sensor, given the board's temperature."""
+        """Return a sensor's gradient to the board's temperature, and the sensor's variance."""
         sensor = self.thermometers[name]
         if self.is_live(stamp_ns, sensor):
             celsius, _, variance = sensor.at(stamp_ns)

@@ -50,8 +50,8 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Lags of the bend columns [s]; smallest distance of their knees [K]; largest number of knees for
-#: a bank of lags, and for known lags of the parts.
+#: Lags of the bend columns [s]; smallest distance of the knees of bends [K]; largest number of
+#: knees for a bank of lags, and for known lags of the parts.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 

@@ -4,7 +4,7 @@
 Owns the covariance of a corrected sample as polynomials in the forces of the three axes.
 
 x, y, z are the specific forces along the axes, before the misalignment. A sample has nine errors
-u: of each axis a constant and a multiple of the axis' force, and of the three elements of the
+u: a constant error and a scale error of each axis, and the errors of the three elements of the
 misalignment M. To first order the error of the corrected force is ::
 
     e_x = u0 + x u1

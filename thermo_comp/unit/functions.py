@@ -229,7 +229,9 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 class Functions:
     """
-    Rows of functions of separate temperatures for each row; polynomials are joined for speed.
+    A table of functions of temperature; each row of the table has a separate temperature.
+
+    For speed, all polynomials are evaluated together.
     """
 
     def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
