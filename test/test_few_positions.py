@@ -66,7 +66,10 @@ def one_position():
 
 
 def turned(rng, ups, rest_s=20.0):
-    """Hold a triad with bias (0.1, -0.2, 0.3) m/s^2 in some attitudes, moved between them."""
+    """
+    Record a triad with bias (0.1, -0.2, 0.3) m/s^2: a rest in each attitude of `ups`, each before
+    a motion.
+    """
     n = round(100 * rest_s)
     parts = []
     for up in ups:
@@ -90,7 +93,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     for axis in calibration.static.axes():
         # Each power of the scale curve has a prior sd of 1e-4 at the RMS of its column.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
-    # The prior sd of a MEMS are 5 % of the scale and 1 % of misalignment.
+    # The prior sd of a MEMS are 5 % for the scale and 0.01 for the misalignment.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     for block in parameter_layout(calibration).scale:
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)

@@ -196,9 +196,9 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # The offsets of the starts add to the error, so their variance reduces the limit: the smaller
-    # of the model's variance, which an earlier disturbance increases, and that of the recent
-    # rests.
+    # The offsets of the starts add to the error, so their variance reduces the limit. An earlier
+    # disturbance increases the model's variance of the offsets, so the variance of the recent
+    # rests is used if it is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     scatter = min(
         scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)
@@ -259,7 +259,7 @@ def passage(
     for step in np.diff(times):
         if stays[-1] <= 1.0 - _QUANTILES[-1]:
             break
-        # Walks that are outside are left out from time to time.
+        # Remove the walks beyond the bound once they are more than a fifth.
         is_in = inside > 0.0
         if is_in.mean() < 0.8:
             error, speed, left, inside = error[is_in], speed[is_in], left[is_in], inside[is_in]

@@ -212,7 +212,7 @@ def _judge_positions(up: Floats) -> Finding:
             f'{n} positions determine bias and scale; the misalignment keeps its prior: it needs '
             f'{POSITIONS_FOR_MISALIGNMENT} well spread positions',
         )
-    advised = 18  # two positions for each of the nine constants
+    advised = 18  # number of positions: two for each of the nine constants
     if n < advised:
         return advice('positions', f'{n} positions; {advised} would reduce the uncertainty')
     return Finding('positions', 'good', f'{n} positions')

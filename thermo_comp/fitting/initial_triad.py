@@ -4,8 +4,8 @@
 Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
 
 The means of the positions lie on an ellipsoid, which is fitted without temperature by least
-squares on ``|f| - g``. The initial values of that fit follow from the extremes of the means on
-each axis.
+squares on ``|f| - g``. The initial values of the least-squares fit follow from the extremes of the
+means on each axis.
 """
 
 from __future__ import annotations

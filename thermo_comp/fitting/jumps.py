@@ -161,7 +161,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the sd of a mean / that under white noise of `sd`, for each axis, at least 1."""
+    """Return the ratio of the sd of a mean to that under white noise of `sd`, at least 1, (3,)."""
     # The variance of 40 pieces' means is multiplied by (1 + r) / (1 - r), r being their lag-1
     # correlation.
     size = max(len(residual) // 40, 1)

@@ -333,7 +333,7 @@ def fit_all(
     candidates: Candidates,
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
-    """Fit all columns; of several informative priors use that of the largest log evidence."""
+    """Fit all columns, with the informative prior of the largest log evidence if there are any."""
     posterior = settle(regression, state, prior, candidates)
     downweigh(regression, posterior)
     posterior = settle(regression, posterior.state, posterior.prior, candidates)

@@ -38,7 +38,7 @@ class SlowUncertainty:
         self._root = start_root(lags)
         edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = max(edges) - min(edges)
-        #: How far each lag's part is behind the board in a long ramp, per rate of the ramp [s].
+        #: Delay of each lag's part behind the board in a long ramp [s].
         self._behind_s = np.array([
             sum(share * tau for (name, tau), share in lag.singles.items() if name == BOARD_INPUT)
             for lag in lags
