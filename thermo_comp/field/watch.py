@@ -150,7 +150,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # If the last week is outside, its last two days are within: a day back within exists.
+        # The week may be outside only if its last two days are within, so a day within the limit
+        # follows.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -238,15 +239,16 @@ def passage(
     Return quantiles of the time [days] at which the norm of a random walk first exceeds a bound.
 
     The random walk begins at N(mean, covariance), (k,) and (k, k), and grows by `walk` (k, m)
-    times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of its
-    variance. The time is 0 if the norm exceeds the bound at the beginning, else at least 0.01.
+    times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of the
+    walk's variance. The time is 0 if the norm exceeds the bound at the beginning, else at least
+    0.01.
     """
     rng = np.random.default_rng(1)
     # Directions with less than a thousandth of the largest error are left out.
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # As many independent variables as directions, with the same covariance.
+    # Reduce the walk to as many independent variables as directions, with the same covariance.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -109,7 +109,7 @@ def _offsets_tried(scale: float, known_sd: float, *, has_turn_ons: bool) -> tupl
     Return values of the sd of the offsets of mountings [m/s^2], and their log prior density per
     step of the logarithm.
 
-    `scale`: that of the fit's prior, 3 times the noise in 1 Hz; `known_sd`: the sd by a prior
+    `scale`: scale of the fit's prior, 3 times the noise in 1 Hz; `known_sd`: the sd by a prior
     calibration, 0 for none; `has_turn_ons`: whether each mounting has a turn-on of its own
     """
     if known_sd:
@@ -117,8 +117,8 @@ def _offsets_tried(scale: float, known_sd: float, *, has_turn_ons: bool) -> tupl
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
     # By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg, those of MEMS within
-    # some mg: 10 to 20 times the scale. This ratio is smaller, so that nine positions of a unit
-    # whose turn-ons repeat perfectly do not claim more than 0.1 mg.
+    # some mg: 10 to 20 times the scale. The ratio `largest_usual` is smaller, so that nine
+    # positions of a unit whose turn-ons repeat perfectly do not claim more than 0.1 mg.
     largest_usual = 5.0 if has_turn_ons else 1.0
     # In steps of a third of a decade, over which the log evidence is smooth.
     ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)

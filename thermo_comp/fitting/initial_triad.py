@@ -134,8 +134,8 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     Return the windows' white noise of each axis [m/s^2], shape (3,), from second differences,
     which do not depend on a linear drift; 0 if no position has three windows.
 
-    In fast ramps the second differences contain the drift; then fourth or sixth differences are
-    much smaller, and taken.
+    In fast ramps the second differences contain the drift, and fourth or sixth differences are
+    much smaller; the noise then follows from the smaller differences.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):

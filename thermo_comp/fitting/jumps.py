@@ -162,8 +162,8 @@ def _examine(
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
     """Return the ratio of the sd of a mean to that under white noise of `sd`, at least 1, (3,)."""
-    # The variance of 40 pieces' means is multiplied by (1 + r) / (1 - r), r being their lag-1
-    # correlation.
+    # The variance of the means of 40 pieces is multiplied by (1 + r) / (1 - r), r being the lag-1
+    # correlation of the means.
     size = max(len(residual) // 40, 1)
     n = len(residual) // size
     means = residual[: n * size].reshape(n, size, 3).mean(axis=1)

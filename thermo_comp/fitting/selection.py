@@ -225,9 +225,9 @@ class Growth:
 def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose the fit that is better on left-out data: begun with a small or with a large prior sd of
-    mounting offsets. If neither is better, the large sd must be likelier by `TRIAL_GAIN`. Mounting
-    offsets and misalignments explain the norms of few positions equally well, but only
-    misalignments predict the norm of another position.
+    mounting offsets. If neither is better, the large sd is taken only if its log density is larger
+    by `TRIAL_GAIN`. Mounting offsets and misalignments explain the norms of few positions equally
+    well, but only misalignments predict the norm of another position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)

@@ -6,10 +6,10 @@ and |f| at rest, which must be gravity.
 
 A converter with noise does not repeat three numbers for seconds; three exact zeros indicate a dead
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
-calibration, or that of another unit, |f| differs from gravity by more than the claimed
-uncertainty, in windows of a second or longer that are still: the scatter is that of the sensor,
-and the mean that of the window before. A step of |f| from one rest to another is not a motion: the
-calibration is judged by the step within a second.
+calibration, or that of another unit, |f| at rest differs from gravity by more than the claimed
+uncertainty. |f| is averaged over still windows of a second or longer: their scatter is the
+sensor's noise, and their mean is that of the window before. A step of |f| from one rest to another
+is not a motion: the calibration is judged by the step within a second.
 """
 
 import math

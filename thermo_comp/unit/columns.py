@@ -194,7 +194,7 @@ def bank(
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
     of each sensor at rest [K], `span_k` the range of temperatures in the data, from the reference
-    [K]; with `parts`, the lags of the part of each axis, there are no other lags.
+    [K]. `parts` are the lags of the part of each axis; if given, there are no other lags.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)

@@ -6,9 +6,9 @@ by lags whose initial state is unknown), and hypothetical states: a soak and a r
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
-stop; in a soak (q = 0) all of them are 0. The gradient of the first sensor includes that by which
-the unit heats itself, `soak_gradient_k`. The static set applies in a soak, the dynamic set in a
-ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
+stop. In a soak (q = 0) gradients, lags and plays are 0. The gradient of the first sensor includes
+the gradient by self-heating, `soak_gradient_k`. The static set applies in a soak, the dynamic set
+in a ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
 """
 
 from collections.abc import Callable
