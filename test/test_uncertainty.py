@@ -15,9 +15,9 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def test_a_start_in_a_ramp_is_claimed():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error: a part lags the board
-    # by the rate times its time constant, 1 K here; after a start at rest its sd is 0.4 K. If the
-    # ramp ends soon after the start, the error remains.
+    # WHY: after a restart in a ramp the claimed sd was a third of the error. In a ramp a part lags
+    # the board by the rate times its time constant, 1 K here; after a start at rest the lag has an
+    # sd of 0.4 K. If the ramp ends soon after the start, the error remains.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):

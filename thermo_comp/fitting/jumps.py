@@ -5,9 +5,9 @@ Owns the detection of jumps: steps in the reading of a sensor at rest.
 
 The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
-a jump distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit: the
-noise beside the jump is normal; the norm of the reading changes, which is almost constant in a
-rotation; the gyroscope, if there is one, shows no rotation.
+a jump distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit. The
+noise beside the jump is normal. The norm of the reading, which is almost constant in a rotation,
+changes. The gyroscope, if there is one, shows no rotation.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
 hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares

@@ -87,9 +87,8 @@ class SlowUncertainty:
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # If the start was in a ramp, a part was behind the board by at most the lag in a long ramp
-        # at the largest rate since the start, and by at most the span of the calibrated
-        # temperatures.
+        # After a start in a ramp, a part was behind the board by at most the lag in a long ramp at
+        # the largest rate since the start, and by at most the span of the calibrated temperatures.
         behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
