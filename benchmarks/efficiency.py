@@ -47,11 +47,11 @@ def exact_unit(seed: int) -> UnitModel:
 
 def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) -> Floats:
     """
-    Cramer-Rao bound of bias [counts] and ln K at the reference, shape (2, 3), as sd.
+    Return the Cramer-Rao bounds of bias [counts] and ln K at the reference as sd, shape (2, 3).
 
-    Computed independently of the fit: window means of counts with white noise, unknown attitudes
-    (two angles each), M, and a quadratic of the true board temperature per axis; differentiated
-    numerically.
+    The bounds are computed without the fit, by numerical derivatives of window means of counts
+    with white noise. The unknowns are two angles of each attitude, M, and for each axis bias and
+    scale as quadratics of the true board temperature.
     """
     run = simulate(unit, parse_cyclogram(program), directions[0], rate_hz=1.0)
     truth = run.truth

@@ -5,12 +5,12 @@ Measures updates in the field against the best filter, on units that age (`field
 
     python benchmarks/field.py [--units 10] [--days 60] [--recordings ../shared/data]
 
-For each kind of platform, a vehicle level within 10 deg and a drone that is carried, units age for
-60 days: bias walk 15 ug and scale walk 10 ppm per root day, turn-on 20 ug, one shock of 300 ug a
+The platforms are vehicles, level within 10 deg, and drones that are carried. Units age for 60
+days: bias walk 15 ug and scale walk 10 ppm per root day, turn-on 20 ug, one shock of 300 ug per
 unit. On several days the calibration is updated with all rests so far, as in `thermo_comp update`,
-and judged on the rests of the next day; at the end its errors are compared with those of a Kalman
-filter that is given the process and the time of the shock. With --recordings FOLDER, the real
-recordings in FOLDER are cut into parts, and updates are judged on the next part.
+and judged on the rests of the next day. At the end the errors of the calibration are compared with
+those of a Kalman filter that is given the process and the time of the shock. With --recordings
+FOLDER, the real recordings in FOLDER are cut into parts, and updates are judged on the next part.
 """
 
 from __future__ import annotations

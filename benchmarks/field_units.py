@@ -146,7 +146,10 @@ def temperature(day: float, rng: np.random.Generator) -> float:
 
 
 def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
-    """Split a rest: a vehicle keeps its attitude, a drone changes it every 20 to 90 s."""
+    """
+    Split a rest into times of constant attitude [s]: the whole rest on a vehicle, 20 to 90 s each
+    on a drone.
+    """
     while seconds >= WINDOW_S:
         rest = seconds if kind in ('level', 'fixed') else min(seconds, rng.uniform(20.0, 90.0))
         yield rest

@@ -9,8 +9,8 @@ Units of five kinds of attitudes age by random walks of known sd and write rests
 tolerance of 200 ug. For each unit 200 futures are drawn: its random walk goes on until the RMS of
 |f| - g over the attitudes of use, with the scatter of the starts, exceeds the bound. The figures
 are the share of futures within the printed 10 to 90 % interval, and the median time divided by the
-printed median. Then the verdicts of level and carried units, half of which do not age, are taken
-every five days; the figures are the share of "outside", by classes of the true RMS.
+printed median. In a second part, the verdicts of level and carried units, half of which do not
+age, are taken every five days; the figures are the share of "outside", by classes of the true RMS.
 """
 
 from __future__ import annotations

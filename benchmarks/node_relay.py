@@ -6,15 +6,15 @@ Measures the node against a naive relay: CPU time per sample, loss and latency, 
     python benchmarks/node_relay.py [--quick] [--floor] [--core 1] [--sleep] [--rates 400]
 
 For each rate and reliability a source process publishes stamped samples at that rate and both
-temperatures at 10 Hz, a sink process receives the Imu messages, and between them runs either the
-node, with everything on, or the naive relay: an rclpy node that copies Vector3Stamped to Imu in a
-callback. The CPU time is that of the whole relay process, all its threads, from the first sample
-to the last; the latency runs from the source's publish call to the arrival in the sink's
-middleware, before any Python of the sink. Ratios hold on other machines, times do not. The node
-uses its profile for Fast DDS; source, sink and naive relay use the default profile. At the last
-rate the node is measured once more while its `calibration_file` is set twice a second. `--core`
-binds each relay to a core. `--floor` measures a third relay, too, which copies bytes with one wait
-set, one subscription and the node's profile, and computes nothing.
+temperatures at 10 Hz, and a sink process receives the Imu messages. Between source and sink runs
+either the node, with everything on, or the naive relay: an rclpy node that copies Vector3Stamped
+to Imu in a callback. The CPU time is that of all threads of the relay process, from the first
+sample to the last. The latency is the time from the source's publish call to the arrival in the
+sink's middleware, before any Python of the sink. Ratios hold on other machines, times do not. The
+node uses its profile for Fast DDS; source, sink and naive relay use the default profile. At the
+last rate the node is measured once more while its `calibration_file` is set twice a second.
+`--core` binds each relay to a core. `--floor` measures a third relay, too, which copies bytes with
+one wait set, one subscription and the node's profile, and computes nothing.
 
 The source keeps `--depth` samples to send lost samples again. With a reliable relay Fast DDS
 removes samples from the source's store 859 at a time; with 2000 kept samples the removal delays

@@ -4,9 +4,9 @@
 Owns the figures of docs/beyond_1g.md: nonlinear terms from centrifuge runs, against their truth.
 
 Run ``python benchmarks/nonlinearity.py``, or with fewer units: ``--units 4``. The runs come from
-the generator below, not from `thermo_comp.simulation`: 12 mountings, each in three soaks at 1 g
-and at 2, 4, 7 and 10 g, |f| stated with 1 ppm (1 sd), samples in m/s^2 of 5 ug/sqrt(Hz), bias and
-scale quadratic in the board's temperature.
+the generator below, not from `thermo_comp.simulation`. A test has 12 mountings, each in three
+soaks at 1 g and at 2, 4, 7 and 10 g. |f| is stated with 1 ppm (1 sd), the samples in m/s^2 have a
+noise of 5 ug/sqrt(Hz), and bias and scale are quadratic in the board's temperature.
 """
 
 from __future__ import annotations

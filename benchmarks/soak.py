@@ -165,7 +165,7 @@ class Soak:
                 raise SystemExit(f'{what} did not come; {self.account}; {self.process.said}')
 
     def meet(self) -> None:
-        """Publish samples until the node returns the first of them; count from there."""
+        """Publish samples until the node returns the first sample; count from this sample on."""
         deadline = time.monotonic() + TIMEOUT_S
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)

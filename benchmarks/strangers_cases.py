@@ -151,7 +151,7 @@ def positions(
     shifts: Floats | float = 0.0,
     **given: Any,
 ) -> tuple[Bag, ...]:
-    """Record a bag in each attitude, shape (n, 3); the programs of a tuple are used in turn."""
+    """Record a bag in each attitude, shape (n, 3); a tuple of programs is used in turn."""
     shifts = np.broadcast_to(shifts, (len(up), 3))
     programs = corners if isinstance(corners, tuple) else (corners,)
     return tuple(

@@ -27,8 +27,8 @@ from thermo_comp.simulation.unit import Stream, SwitchedLoad, UnitModel, generat
 from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G
 
-#: Kinds of triads, each with one kind of physics in addition to tempcos that lag. Their order
-#: numbers the streams of random numbers, after those of the instruments.
+#: Kinds of triads, each with one kind of physics in addition to tempcos that lag. The order of
+#: the kinds numbers the streams of random numbers, after those of the instruments.
 TRIAD_NAMES = (
     *('own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load'),
     *('paper', 'slow-noise', 'plain'),

@@ -85,8 +85,9 @@ the static set, free coefficients of its Fs, level of the dynamic set, free coef
 weights of the response in the order of the file); then the relative scale in the same order. A
 `nonlinearity` adds, for each axis, the coefficients of its terms, then their changes per kelvin. The
 last three parameters are `M[1][0]`, `M[2][0]` and `M[2][1]`. The covariance is
-`factor @ factor.T + diag(rest)`. The posterior of a `gyroscope` has the bias only, in rad/s and in the
-same order; the `gyroscope` uses the ranges, the reference temperature and the thermometers of the unit.
+`factor @ factor.T + diag(rest)`. The posterior of a `gyroscope` has only the
+parameters of the bias, in rad/s and in the order of the accelerometer's bias. The `gyroscope` uses
+the ranges, the reference temperature and the thermometers of the unit.
 """
 
 BOUNDS = """\
@@ -136,8 +137,9 @@ an output that is its input.
 
 ## Recording a test
 
-`thermo_comp record` is a separate node, `thermo_comp_record`: it subscribes to the node's inputs, and to every other
-`temperature/<name>`, once they have a publisher, as reliable if the publisher is. `thermo_comp_record` publishes nothing. See
+`thermo_comp record` is a separate node, `thermo_comp_record`. This node subscribes to the inputs of the compensating node
+and to every other `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is.
+`thermo_comp_record` publishes nothing. See
 [Recording](recording.md#recording).
 
 ## Parameters

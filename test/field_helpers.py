@@ -21,7 +21,10 @@ ZERO = np.zeros(3)
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
-    """Log 3 starts a day of 4 windows, at `rate` [K/s]; `error(day)` is a bias [m/s^2]."""
+    """
+    Log three starts per day, each with four windows, in a ramp of `rate` [K/s]; `error(day)` is
+    the error of the bias [m/s^2].
+    """
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
     M, logged = np.array(calibration.misalignment), []

@@ -137,7 +137,8 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
             r'^2\d % .* has no temperatures .* stick, or drop out\? bag\d: temperature/board '
             'reads nothing new for 20[01] s$',
         ),
-        # WHY: a soak before the first change of whole degrees ended in `... the same clock?`.
+        # WHY: a fit of readings in whole degrees, which first changed after a soak, was refused
+        # with `... the same clock?`.
         (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
         (in_kelvins, 'kelvins', r'^temperature/board reads 2\d+\S* .. \d+\S* degC: that looks'),
@@ -150,7 +151,8 @@ def test_likely_mistakes_are_refused_by_name(rng, spoil, name, text):
 
 
 def test_an_axis_that_is_dead_in_one_position_is_named(rng):
-    # WHY: y read exactly 3000 for hours, and its drift was attributed to all other positions.
+    # WHY: the y axis read exactly 3000 for hours, and its drift was attributed to all other
+    # positions.
     rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads \S+ to the bit for 0\.\d+ h: the axis is'):

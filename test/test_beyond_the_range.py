@@ -179,8 +179,8 @@ def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
 
 
 def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
-    # WHY: a difference of 10 K after bags with 0.1 K is 100 times too large, its square 10000
-    # times, and the claimed sd was that of a distance of 10000 half ranges: 0.1 g.
+    # WHY: a temperature difference of 10 K, after bags with 0.1 K, exceeds the range 100 times,
+    # and its square 10000 times. The claimed sd was that of 10000 half ranges: 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(Layout(correction.memory).width)

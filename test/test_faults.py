@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The fault table: each row through the compensator and the node's diagnostics, every number against
-the truth; rows about the order of arrival also over DDS into the node process, which must agree.
+The fault table: each row goes through the compensator and the node's diagnostics, and every number
+is compared with the truth. Rows about the order of arrival are also sent over DDS to the node
+process, whose output must be the same.
 """
 
 from dataclasses import asdict, fields

@@ -66,7 +66,10 @@ def one_position():
 
 
 def turned(rng, ups, rest_s=20.0):
-    """Hold a triad with bias (0.1, -0.2, 0.3) m/s^2 in some attitudes, moved between them."""
+    """
+    Record a triad with bias (0.1, -0.2, 0.3) m/s^2: a rest in each attitude of `ups`, each before
+    a motion.
+    """
     n = round(100 * rest_s)
     parts = []
     for up in ups:
@@ -90,7 +93,7 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     for axis in calibration.static.axes():
         # Each power of the scale curve has a prior sd of 1e-4 at the RMS of its column.
         assert np.abs(axis.scale_function.value(np.array([-4.0, 15.0])) - 1.0).max() < 5e-4
-    # The prior sd of a MEMS are 5 % of the scale and 1 % of misalignment.
+    # The prior sd of a MEMS are 5 % for the scale and 0.01 for the misalignment.
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     for block in parameter_layout(calibration).scale:
         assert sd[block.static] == pytest.approx(0.05, rel=0.3)
@@ -101,8 +104,8 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
 
 
 def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
-    # WHY: norms of one attitude do not separate bias and scale; the fit took the drift for that
-    # of the scale, and claimed 0 for the drift of the bias, which error it left on two axes.
+    # WHY: norms of one attitude do not separate bias and scale; the fit attributed the drift to
+    # the scale and claimed an sd of 0 for the drift of the bias, whose error was left on two axes.
     slope = 0.1 * SLOPE
     bags = []
     for celsius in (5.0, 20.0, 35.0):
@@ -137,7 +140,7 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in {finding.name for finding in result.findings}
     # Soaks do not show the lag of the sensor, whose effect is at most that of the slope: twice the
-    # claimed sd covers this effect, and the sd is not larger than it.
+    # claimed sd covers this effect, and the claimed sd is at most this effect.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -145,7 +148,7 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed(seed):
-    # WHY: if the drifts in the warm-ups gave the curve, it was 7 claimed sd off between the rests.
+    # WHY: a curve from the drifts in the warm-ups was wrong by 7 claimed sd between the rests.
     rng, slopes, bags = np.random.default_rng(seed), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
@@ -180,7 +183,7 @@ def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g this is 33 ppm/K of the scale factor, in the difference of two rests 47 ppm/K.
+    # At 0.03 g 1 ug/K is 33 ppm/K of the scale factor, in the difference of two rests 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -279,8 +282,9 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
 
 
 def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
-    # WHY: each of three recordings has a temperature of its own; their turn-ons were claimed as an
-    # error of their mean alone, and those of mountings as independent: 1.6, 1.8 and 1.9 variances.
+    # WHY: each of three recordings has a temperature of its own. The turn-ons were claimed as an
+    # error of their mean alone, and the offsets of mountings as independent: the claimed variance
+    # of the axes was 1.6, 1.8 and 1.9 times that of a turn-on.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -294,8 +298,9 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
         # The leverage of the curve at the ends is 5/6 if it is a line through three equidistant
-        # points, 1 if it is a parabola; the next turn-on adds its variance. The sd may also be
-        # that of mountings: of nine independent offsets bias and scale keep a third each.
+        # points, 1 if it is a parabola; the next turn-on adds its variance. The stated sd may also
+        # be that of mountings: bias and scale keep a third each of the variance of nine
+        # independent offsets.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()

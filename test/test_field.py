@@ -183,7 +183,7 @@ def test_the_present_sd_of_the_old_calibration_contains_its_ageing(rng):
     # One attitude does not separate bias from scale, so up to half the variance goes to the scale.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The rests determine the error of z to the turn-on of 20 ug.
+    # The rests determine the bias of z to two sd of a turn-on offset (sd 20 ug).
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -409,7 +409,7 @@ def with_shares(logged, share):
 
 
 def test_a_rest_differentiates_by_the_unknown_lags_of_its_start():
-    # The unknowns move the lags; the expected derivatives are finite differences of |f|.
+    # The unknowns are initial states of lags; the expected derivatives are differences of |f|.
     unit, share, step = rich_calibration(), 0.6, 1e-4
     logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
     series, layout = series_of(logged, unit), Layout(Correction(unit).memory)

@@ -156,7 +156,7 @@ def test_samples_lost_by_dds_are_repeated(peer, node_arguments, monkeypatch):
 
 def test_the_users_profile_replaces_that_of_the_node(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    # A profile that the user has set stays.
+    # The node keeps a DDS profile that the user has set.
     monkeypatch.setenv(VARIABLE, 'mine.xml')
     use_profile()
     assert os.environ[VARIABLE] == 'mine.xml'

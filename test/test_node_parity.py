@@ -123,7 +123,8 @@ def test_the_node_equals_the_replay_for_counts(tmp_path):
 
 
 def test_the_board_decides_the_regime_of_a_unit_without_a_case_sensor(tmp_path):
-    # WHY: nobody published `regime/dynamic`, and the table of a replay always said `unknown`.
+    # WHY: `regime/dynamic` was not published, and the regime in the table of a replay was always
+    # `unknown`.
     n = thermal_test(tmp_path / 'bag', has_case=False)
     unit = replace(rich_calibration(), unit=UNIT)
     assert run(unit, tmp_path / 'bag', tmp_path) == n

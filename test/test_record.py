@@ -83,7 +83,8 @@ def check_positions(result):
 
 def check_fit(result, cli, folder):
     """Run the printed command, and compare the calibration with the truth."""
-    # Fit the paper's model: only constants are compared; a response takes ten times as long.
+    # Fit the paper's model, as only constants are compared: a model with a response takes ten
+    # times as long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'

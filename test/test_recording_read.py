@@ -334,7 +334,8 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # No board topic is chosen by type if a name is given, two fit, or it is the case's.
+    # No board topic is chosen by type if the user names a topic, if two topics fit, or if the only
+    # topic is the case's.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):

@@ -15,9 +15,9 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def test_a_start_in_a_ramp_is_claimed():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error: a part lags the board
-    # by the rate times its time constant, 1 K here; after a start at rest its sd is 0.4 K. If the
-    # ramp ends soon after the start, the error remains.
+    # WHY: after a restart in a ramp the claimed sd was a third of the error. In a ramp a part lags
+    # the board by the rate times its time constant, 1 K here; after a start at rest the lag has an
+    # sd of 0.4 K. If the ramp ends soon after the start, the error remains.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
@@ -82,7 +82,8 @@ def test_beyond_1_g_the_covariance_has_an_unknown_square():
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
 def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fault):
     # WHY: the bias follows a part that lags the board by 10 min, so a lasting error of the board
-    # temperature changes the bias, but a sudden error does not. The sd contained only the latter.
+    # temperature changes the bias, but a sudden error does not. The claimed sd contained only
+    # sudden errors.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))

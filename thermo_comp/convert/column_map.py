@@ -5,7 +5,7 @@ Owns tables with a column map: the content and unit of each column, and the mess
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table of numbers alone, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: times rise; readings at rest are gravity, which gives the unit; an
+wz]`` as for imu_tk, is guessed. Times rise. Readings at rest are gravity, which gives the unit. An
 angular rate that would be faster in rad/s than any turn by hand is in deg/s.
 """
 

@@ -150,7 +150,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # If the last week is outside, its last two days are within: a day back within exists.
+        # The week may be outside only if its last two days are within, so a day within the limit
+        # follows.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -196,9 +197,9 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # The offsets of the starts add to the error, so their variance reduces the limit: the smaller
-    # of the model's variance, which an earlier disturbance increases, and that of the recent
-    # rests.
+    # The offsets of the starts add to the error, so their variance reduces the limit. An earlier
+    # disturbance increases the model's variance of the offsets, so the variance of the recent
+    # rests is used if it is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     scatter = min(
         scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)
@@ -238,15 +239,16 @@ def passage(
     Return quantiles of the time [days] at which the norm of a random walk first exceeds a bound.
 
     The random walk begins at N(mean, covariance), (k,) and (k, k), and grows by `walk` (k, m)
-    times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of its
-    variance. The time is 0 if the norm exceeds the bound at the beginning, else at least 0.01.
+    times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of the
+    walk's variance. The time is 0 if the norm exceeds the bound at the beginning, else at least
+    0.01.
     """
     rng = np.random.default_rng(1)
     # Directions with less than a thousandth of the largest error are left out.
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # As many independent variables as directions, with the same covariance.
+    # Reduce the walk to as many independent variables as directions, with the same covariance.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -259,7 +261,7 @@ def passage(
     for step in np.diff(times):
         if stays[-1] <= 1.0 - _QUANTILES[-1]:
             break
-        # Walks that are outside are left out from time to time.
+        # Remove the walks beyond the bound once they are more than a fifth.
         is_in = inside > 0.0
         if is_in.mean() < 0.8:
             error, speed, left, inside = error[is_in], speed[is_in], left[is_in], inside[is_in]

@@ -109,7 +109,7 @@ def _offsets_tried(scale: float, known_sd: float, *, has_turn_ons: bool) -> tupl
     Return values of the sd of the offsets of mountings [m/s^2], and their log prior density per
     step of the logarithm.
 
-    `scale`: that of the fit's prior, 3 times the noise in 1 Hz; `known_sd`: the sd by a prior
+    `scale`: scale of the fit's prior, 3 times the noise in 1 Hz; `known_sd`: the sd by a prior
     calibration, 0 for none; `has_turn_ons`: whether each mounting has a turn-on of its own
     """
     if known_sd:
@@ -117,8 +117,8 @@ def _offsets_tried(scale: float, known_sd: float, *, has_turn_ons: bool) -> tupl
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
     # By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg, those of MEMS within
-    # some mg: 10 to 20 times the scale. This ratio is smaller, so that nine positions of a unit
-    # whose turn-ons repeat perfectly do not claim more than 0.1 mg.
+    # some mg: 10 to 20 times the scale. The ratio `largest_usual` is smaller, so that nine
+    # positions of a unit whose turn-ons repeat perfectly do not claim more than 0.1 mg.
     largest_usual = 5.0 if has_turn_ons else 1.0
     # In steps of a third of a decade, over which the log evidence is smooth.
     ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)
@@ -203,9 +203,9 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
-        # The effect of a lag is that of the curve at a delayed temperature, so the largest slope
-        # of the curve limits it (RMS of the three axes), with the columns that the data do not
-        # exclude.
+        # A lag delays the curve. The prior sd of a lag's weight is therefore at most the largest
+        # slope of the curve (RMS of the three axes), which includes the columns that the data do
+        # not exclude.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
@@ -270,8 +270,8 @@ def _excess_over_priors(
     regression: Regression, posterior: Posterior, informative: Sequence[InformativePrior]
 ) -> Floats:
     """
-    Return the excess of two covariances: that of the mixture of fits over the ageing since the
-    prior calibration, less that of the fit of the most probable ageing. A few rests do not show
+    Return by how much the covariance of a mixture of fits exceeds that of the most probable fit.
+    The fits assume different ageings since the prior calibration, because a few rests do not show
     which constants have aged.
     """
     n = posterior.layout.n_unit
@@ -302,8 +302,8 @@ def _turn_on_sd(
     Return the sd of the bias offset of a turn-on [m/s^2], in addition to the sd of a mounting; 0
     if each mounting has a separate turn-on, whose offset is part of the mounting's offset.
 
-    The norms show how well turn-ons repeat only if there are several; for a single turn-on the sd
-    is that of the prior; `tried` and `log_density` as in `_over_mountings`.
+    The norms show how well turn-ons repeat only if there are several turn-ons; for a single
+    turn-on the sd is that of the prior. `tried` and `log_density` are as in `_over_mountings`.
     """
     windows = regression.windows
     if not regression.gravity or windows.n_turn_ons == windows.mounting[-1] + 1:

@@ -162,7 +162,7 @@ def best_rests(candidates: list[Floats]) -> int:
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """Fit constants to norms of rests; return their largest sd by the scatter of the norms [g]."""
+    """Fit constants to rests; return the largest sd of a constant by the scatter of norms [g]."""
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf

@@ -212,7 +212,7 @@ def _judge_positions(up: Floats) -> Finding:
             f'{n} positions determine bias and scale; the misalignment keeps its prior: it needs '
             f'{POSITIONS_FOR_MISALIGNMENT} well spread positions',
         )
-    advised = 18  # two positions for each of the nine constants
+    advised = 18  # number of positions: two for each of the nine constants
     if n < advised:
         return advice('positions', f'{n} positions; {advised} would reduce the uncertainty')
     return Finding('positions', 'good', f'{n} positions')
@@ -240,7 +240,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
     assumed = f'the uncertainty assumes {ug_text(offset_sd)}: state --mounting-sd'
-    # The bias of the first recording is that of the unit; those of three others show how well
+    # The first turn-on determines the bias of the unit; three further turn-ons show how well
     # turn-ons repeat.
     needed = 4
     if n_turn_ons < min(n, needed):
@@ -263,8 +263,9 @@ def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate M.
 
-    The limit is 6 for the sd of a parameter in units of the noise of one position: 18 well spread
-    positions give 1, nine give 3, the six faces held three times each by hand give 4.5 to 8.
+    The sd of a parameter, in units of the noise of one position, must be at most 6. The sd is 1
+    for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held three times each
+    by hand.
     """
     distinct = distinct_directions(up)
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:

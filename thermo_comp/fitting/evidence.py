@@ -156,8 +156,9 @@ def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupE
     """
     Return RMS contribution, effective parameters and log Bayes factor of each group in use.
 
-    The factor compares with a fit without the group, or, with an informative prior, with a fit in
-    which the group keeps the prior's mean: by the prior the group is not 0.
+    The Bayes factor compares the fit with a fit without the group. An informative prior has
+    weights that are not 0: the factor then compares with a fit in which the group keeps the
+    prior's mean.
     """
     names = np.array(regression.windows.groups)
     prior, state, layout = posterior.prior, posterior.state, posterior.layout

@@ -99,7 +99,7 @@ def _updated(
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
         # Three elements of M determine their sd poorly: the built-in prior counts as a fourth. The
-        # elements are used only if the data determine more than one of them.
+        # elements of M are used only if the data determine more than one of them.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
@@ -205,8 +205,8 @@ def with_slow_noise(
         return replace(fitted, prior=trial)
 
     # The parameters absorb a part of the noise, so residuals underestimate the noise; the log
-    # evidence does not. Search ratio and time in steps of a factor of 3, then of 3^(1/2) and
-    # 3^(1/4).
+    # evidence does not. Search the correlated noise (variance ratio and correlation time) in steps
+    # of a factor of 3, then of 3^(1/2) and 3^(1/4).
     best = with_noise(estimated)
     step = 3.0
     while step > 3.0**0.2:

@@ -4,8 +4,8 @@
 Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
 
 The means of the positions lie on an ellipsoid, which is fitted without temperature by least
-squares on ``|f| - g``. The initial values of that fit follow from the extremes of the means on
-each axis.
+squares on ``|f| - g``. The initial values of the least-squares fit follow from the extremes of the
+means on each axis.
 """
 
 from __future__ import annotations
@@ -134,8 +134,8 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     Return the windows' white noise of each axis [m/s^2], shape (3,), from second differences,
     which do not depend on a linear drift; 0 if no position has three windows.
 
-    In fast ramps the second differences contain the drift; then fourth or sixth differences are
-    much smaller, and taken.
+    In fast ramps the second differences contain the drift, and fourth or sixth differences are
+    much smaller; the noise then follows from the smaller differences.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):

@@ -34,9 +34,9 @@ from .windows import CURVE, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-#: Factor of the prior sd of the scale factor's slopes with two to eight attitudes: a tilt of
-#: the support then explains what the scale factor of an axis that is nearly level explains only
-#: by a slope of several hundred ppm/K.
+#: Factor of the prior sd of the scale factor's slopes with two to eight attitudes. A tilt of the
+#: support then explains a drift that the scale factor of a nearly level axis explains only by a
+#: slope of several hundred ppm/K.
 OF_FEW_ATTITUDES = 0.5
 
 

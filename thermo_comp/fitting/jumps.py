@@ -5,9 +5,9 @@ Owns the detection of jumps: steps in the reading of a sensor at rest.
 
 The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
-a jump distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit: the
-noise beside the jump is normal; the norm of the reading changes, which is almost constant in a
-rotation; the gyroscope, if there is one, shows no rotation.
+a jump distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit. The
+noise beside the jump is normal. The norm of the reading, which is almost constant in a rotation,
+changes. The gyroscope, if there is one, shows no rotation.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
 hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares
@@ -161,9 +161,9 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the sd of a mean / that under white noise of `sd`, for each axis, at least 1."""
-    # The variance of 40 pieces' means is multiplied by (1 + r) / (1 - r), r being their lag-1
-    # correlation.
+    """Return the ratio of the sd of a mean to that under white noise of `sd`, at least 1, (3,)."""
+    # The variance of the means of 40 pieces is multiplied by (1 + r) / (1 - r), r being the lag-1
+    # correlation of the means.
     size = max(len(residual) // 40, 1)
     n = len(residual) // size
     means = residual[: n * size].reshape(n, size, 3).mean(axis=1)

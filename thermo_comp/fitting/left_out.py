@@ -79,7 +79,7 @@ class Folds:
 
         There are two estimates: the mean over folds of their log ratios, robust to a few large
         folds, and the log ratio of the sums with its jackknife error, robust to small folds. The
-        more significant is returned if their signs are equal, else 0.
+        more significant estimate is returned if the signs of both are equal, else 0.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())

@@ -4,12 +4,13 @@
 Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
-temperature of one part of the unit: t is the board temperature less the reference temperature, and
-m = T - L(T + v g) the difference between the board temperature T and that of the part. The part
-lags a temperature between board and case: that of the board plus the share v of the gradient g.
-The lag has one stage or, for a part that is heated through another part, two stages in series.
-Without a case thermometer, what the part lags may lead the board's. The time constants, v and the
-lead minimise the RMS residual of a spline of the bias and a cubic of the scale factor, over x.
+temperature of one part of the unit. Here t is the board temperature T less the reference
+temperature, and m = T - L(T + v g) is the difference between T and the temperature of the part.
+The part lags a temperature between board and case: that of the board plus the share v of the
+gradient g. The lag has one stage or, for a part that is heated through another part, two stages in
+series. Without a case thermometer, the temperature that the part lags may lead that of the board.
+The time constants, v and the lead minimise the RMS residual of a spline of the bias and a cubic of
+the scale factor, over x.
 """
 
 from __future__ import annotations

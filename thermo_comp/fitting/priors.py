@@ -257,9 +257,9 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
     the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
-    behind a temperature between board and sensor, or with a lead is a sum of single lags; its
-    powers are approximated by the powers of one lag of the board that is the same time behind in a
-    long ramp.
+    a lag behind a temperature between board and sensor, and a lag with a lead are sums of single
+    lags. The powers of such a sum are approximated by the powers of one lag of the board that is
+    the same time behind in a long ramp.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE

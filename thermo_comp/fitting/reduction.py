@@ -178,8 +178,8 @@ def reduce_source(
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
     is chosen in the same way. Slow samples make cells so long that a bias which changes within
-    minutes looks like a motion, and that short rests are lost; they get shorter cells, of 10 or 5
-    samples, if these interrupt or lose fewer rests.
+    minutes looks like a motion, and that short rests are lost. Slow samples therefore get shorter
+    cells, of 10 or 5 samples, if shorter cells interrupt or lose fewer rests.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:

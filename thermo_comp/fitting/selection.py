@@ -225,9 +225,9 @@ class Growth:
 def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose the fit that is better on left-out data: begun with a small or with a large prior sd of
-    mounting offsets. If neither is better, the large sd must be likelier by `TRIAL_GAIN`. Mounting
-    offsets and misalignments explain the norms of few positions equally well, but only
-    misalignments predict the norm of another position.
+    mounting offsets. If neither is better, the large sd is taken only if its log density is larger
+    by `TRIAL_GAIN`. Mounting offsets and misalignments explain the norms of few positions equally
+    well, but only misalignments predict the norm of another position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
@@ -333,7 +333,7 @@ def fit_all(
     candidates: Candidates,
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
-    """Fit all columns; of several informative priors use that of the largest log evidence."""
+    """Fit all columns, with the informative prior of the largest log evidence if there are any."""
     posterior = settle(regression, state, prior, candidates)
     downweigh(regression, posterior)
     posterior = settle(regression, posterior.state, posterior.prior, candidates)

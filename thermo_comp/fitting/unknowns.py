@@ -28,7 +28,7 @@ MISALIGNMENT_SD = 1e-3
 def misalignment_scale(noise: float) -> float:
     """
     Return the built-in prior sd of an element of the misalignment [rad], by the noise in 1 Hz
-    [m/s^2]. It is 1 mrad for a noise up to 10 ug (navigation grade, machined faces) and
+    [m/s^2]. The sd is 1 mrad for a noise up to 10 ug (navigation grade, machined faces) and
     proportional to a larger noise, up to 10 mrad (cross-axis sensitivity of consumer MEMS).
     """
     return float(np.clip(10.0 * noise, MISALIGNMENT_SD, 1e-2))

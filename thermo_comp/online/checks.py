@@ -6,10 +6,10 @@ and |f| at rest, which must be gravity.
 
 A converter with noise does not repeat three numbers for seconds; three exact zeros indicate a dead
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
-calibration, or that of another unit, |f| differs from gravity by more than the claimed
-uncertainty, in windows of a second or longer that are still: the scatter is that of the sensor,
-and the mean that of the window before. A step of |f| from one rest to another is not a motion: the
-calibration is judged by the step within a second.
+calibration, or that of another unit, |f| at rest differs from gravity by more than the claimed
+uncertainty. |f| is averaged over still windows of a second or longer: their scatter is the
+sensor's noise, and their mean is that of the window before. A step of |f| from one rest to another
+is not a motion: the calibration is judged by the step within a second.
 """
 
 import math
@@ -110,7 +110,8 @@ class RateCheck:
     @property
     def noise_excess(self) -> float:
         """
-        Relative excess of the noise variance of a sample over its calibrated value, from the rate.
+        Excess of the noise variance of a sample over its calibrated value, as a share of the
+        calibrated value; it follows from the rate of samples.
         """
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
@@ -193,7 +194,10 @@ class GravityCheck:
     def _watch_step(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Refute the calibration by a step of |f| between rests, sooner than by windows."""
+        """
+        Refute the calibration if |f| steps from a rest out of the tolerance and stays there for
+        `STEP_NS`; a step refutes sooner than windows do.
+        """
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False

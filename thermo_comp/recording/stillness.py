@@ -244,7 +244,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Find a cell length [ns] of which a whole number fills the window, or some windows."""
+    """Find a cell length [ns] such that whole cells fill one window, or a few windows."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:

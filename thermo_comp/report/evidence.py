@@ -259,7 +259,7 @@ def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
 
 
 def _is_reservation(finding: Finding) -> bool:
-    # The advice to record more positions than needed is not a reservation.
+    # The finding `positions` is no reservation: it advises more positions than a fit needs.
     return finding.level == 'advice' and finding.name != 'positions'
 
 

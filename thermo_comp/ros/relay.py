@@ -196,7 +196,7 @@ class Relay:
         compensator = self.running.compensator
         last_ns = compensator.now_ns
         if last_ns is not None:
-            # The clock went on for at most `silence_ns` since the last sample was stamped.
+            # The clock advanced by at most `silence_ns` since the stamp of the last sample.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:

@@ -26,7 +26,7 @@ from ..thermal.state import Layout
 from ..typing import Floats, Stamps
 from .reader import LoadedCalibration
 
-#: Messages that are summed at a time, unless a report comes first.
+#: Number of messages in a summed block; a block is shorter if a report is due earlier.
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes 10 MB at most.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
@@ -37,7 +37,7 @@ _WAITING = 1000
 #: Stamps before 2000-01-01 [ns] are times since the start of a driver, no dates: rests with such
 #: stamps get the time of this computer.
 _EPOCH_NS = 946_684_800 * 10**9
-#: Backward step of the stamps [ns] from which a recording has begun anew.
+#: Smallest backward step of the stamps [ns] that begins a new recording.
 _JUMP_NS = 10**9
 # First bytes of a message in plain form (see `conversion`), and offsets from its end of counts,
 # force and angular rate.

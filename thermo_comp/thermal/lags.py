@@ -54,11 +54,11 @@ class _Lag(NamedTuple):
 
 class Lag(_Lag, Quantity):
     """
-    The board temperature less that of a part which lags it, or the lag of the gradient of a sensor
-    (`input`) [K], with the time constants of its two stages [s]; the second is shorter, or 0 for a
-    lag of one stage. A part may lag a temperature between board and sensor: that of the board plus
-    `sensor_share` of the gradient of `sensor`. `lead_s`: time by which the temperature that the
-    part lags leads the board thermometer [s].
+    The board temperature less that of a part which lags the board, or the lag of the gradient of a
+    sensor (`input`) [K]. The time constants are those of two stages [s]; the second is shorter, or
+    0 for a lag of one stage. A part may lag a temperature between board and sensor: that of the
+    board plus `sensor_share` of the gradient of `sensor`. `lead_s`: time by which the temperature
+    that the part lags leads the board thermometer [s].
     """
 
     @property

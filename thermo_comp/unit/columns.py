@@ -4,11 +4,11 @@
 Owns the columns of the thermal response: the regressors of bias and scale.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u the value of its kind (`unit.terms`), t the
-board temperature from the reference, and w the weight of the dynamic regime; u is held at the
-edges of the column's range and t at those of the calibrated temperatures. Beyond the calibrated
-temperatures the curves continue along their tangents, but the powers of t are constant: with power
-p the tangent of a product would be u p t^(p - 1), and no recording determines how a coefficient
-that changes with temperature continues.
+board temperature from the reference, and w the weight of the dynamic regime. u is held at the
+edges of the column's range, and t at the edges of the calibrated temperatures. Beyond the
+calibrated temperatures the curves continue along their tangents, but the powers of t are constant.
+With power p the tangent of a product would be u p t^(p - 1), and no recording determines how a
+coefficient that changes with temperature continues.
 
 Each group of the bank has the columns of the kind with the same name, except these groups:
 *product* has the kind board, and *gradient_x_temperature* the kinds gradient and gradient_lag,
@@ -194,7 +194,7 @@ def bank(
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
     of each sensor at rest [K], `span_k` the range of temperatures in the data, from the reference
-    [K]; with `parts`, the lags of the part of each axis, there are no other lags.
+    [K]. `parts` are the lags of the part of each axis; if given, there are no other lags.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)

@@ -157,7 +157,7 @@ class Curves:
 
     @cached_property
     def _families(self) -> list[int]:
-        """For each of the six biases and scales, the first with the same families of functions."""
+        """Index of the first bias or scale with equal families, for each of the six curves."""
         bases = [
             tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
             for functions in zip(*self._functions.rows, strict=True)

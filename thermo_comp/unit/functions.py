@@ -28,9 +28,9 @@ from ..typing import Floats
 #: One temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range, in spans of the range. At the end
-#: of the tangent a parabola is a sixteenth as far from the tangent as at the opposite end of the
-#: range.
+#: Length of the tangent that continues a curve beyond its range, in spans of the range. A parabola
+#: deviates from the tangent at an edge in proportion to the square of the distance: at the end of
+#: the tangent, by 1/16 of the deviation at the opposite end of the range.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9

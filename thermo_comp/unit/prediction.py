@@ -6,9 +6,9 @@ by lags whose initial state is unknown), and hypothetical states: a soak and a r
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
-stop; in a soak (q = 0) all of them are 0. The gradient of the first sensor includes that by which
-the unit heats itself, `soak_gradient_k`. The static set applies in a soak, the dynamic set in a
-ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
+stop. In a soak (q = 0) gradients, lags and plays are 0. The gradient of the first sensor includes
+the gradient by self-heating, `soak_gradient_k`. The static set applies in a soak, the dynamic set
+in a ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ class SlowUncertainty:
         self._root = start_root(lags)
         edges = [edge for part in calibration.regime_sets() for edge in part.temperature_range_c]
         self._span = max(edges) - min(edges)
-        #: How far each lag's part is behind the board in a long ramp, per rate of the ramp [s].
+        #: Delay of each lag's part behind the board in a long ramp [s].
         self._behind_s = np.array([
             sum(share * tau for (name, tau), share in lag.singles.items() if name == BOARD_INPUT)
             for lag in lags
@@ -87,9 +87,8 @@ class SlowUncertainty:
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # If the start was in a ramp, a part was behind the board by at most the lag in a long ramp
-        # at the largest rate since the start, and by at most the span of the calibrated
-        # temperatures.
+        # After a start in a ramp, a part was behind the board by at most the lag in a long ramp at
+        # the largest rate since the start, and by at most the span of the calibrated temperatures.
         behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
