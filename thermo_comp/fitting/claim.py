@@ -70,7 +70,8 @@ def claim_of(
     # All rests of a mounting share an offset, but the regression has an offset for each rest. The
     # mean of k offsets with k times the variance has the variance of a single offset.
     mounting = regression.windows.mounting
-    n_rests = len(mounting) / (mounting[-1] + 1)
+    n_mountings, n_turn_ons = int(mounting[-1]) + 1, regression.windows.n_turn_ons
+    n_rests = len(mounting) / n_mountings
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
     if prior.unseen_misalignment_sd:
         prior = replace(prior, misalignment_sd=prior.unseen_misalignment_sd)
@@ -78,10 +79,9 @@ def claim_of(
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
     # A stated sd is that of a mounting or of a turn-on: beside the independent offsets of m
     # mountings the covariance contains the offsets of n turn-ons with 1 - n / m of the variance.
-    n_turn_ons = regression.windows.n_turn_ons
-    shared_variance = offset_sd**2 * (1.0 - n_turn_ons / (mounting[-1] + 1))
+    shared_variance = offset_sd**2 * (1.0 - n_turn_ons / n_mountings)
     if prior.offset_scale > 0.0:
-        has_turn_ons = n_turn_ons == mounting[-1] + 1
+        has_turn_ons = n_turn_ons == n_mountings
         scale = prior.offset_scale
         tried = _offsets_tried(scale, known_offset_sd, has_turn_ons=has_turn_ons)
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
@@ -117,8 +117,8 @@ def _offsets_tried(scale: float, known_sd: float, *, has_turn_ons: bool) -> tupl
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
     # By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg, those of MEMS within
-    # some mg: 10 to 20 times the scale. The ratio `largest_usual` is smaller, so that nine
-    # positions of a unit whose turn-ons repeat perfectly do not claim more than 0.1 mg.
+    # some mg: 10 to 20 times the scale. The ratio `largest_usual` is a compromise between these
+    # units and units whose turn-ons repeat perfectly.
     largest_usual = 5.0 if has_turn_ons else 1.0
     # In steps of a third of a decade, over which the log evidence is smooth.
     ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)

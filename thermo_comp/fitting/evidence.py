@@ -77,7 +77,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     Return residuals of the steps of the model, and ``|f| - g`` in sample and the left-out error of
     each window [m/s^2], shape (n,).
     """
-    (windows, regression, selected), state = fit[:3], fit.posterior.state
+    windows, regression, selected, state = *fit[:3], fit.posterior.state
     steps = [
         replace(state, weights=np.zeros_like(state.weights)),
         *(_with_only(regression, fit.posterior, groups) for groups in ((CURVE,), (CURVE, SET))),
