@@ -39,6 +39,7 @@ HALF = program(20, 20, (35, 1, 45), (5, 1, 45), (20, 1, 5))
 FAST = program(20, 2, (5, 1.9, 5), (35, 2.3, 5), (20, 2, 2))
 WHOLE = program(20, 25, (35, 1, 60), (5, 1.5, 60), (20, 0.7, 20), (28, 1, 20))
 POSE = program(20, 40, (35, 1, 90), (5, 1, 100), (28, 0.5, 60), (12, 1.5, 70), (20, 1, 75))
+RETURNED = program(22, 20, (-12, 0.8, 40), (44, 0.8, 40), (22, 0.8, 20))
 OTHER = program(12, 25, (31, 0.7, 45), (17, 1.5, 50), (26, 0.6, 40), (7, 1, 45))
 HELD = (
     program(12, 20, (31, 0.7, 45), (17, 1.5, 40)),
@@ -182,6 +183,21 @@ def one_pose(number: int) -> Iterator[Study]:
     fit = positions(unit, POSE, up, rng)
     tests = {'own bag': fit, 'other program': positions(unit, OTHER, up, rng)}
     yield Study('', fit, tests, FULL_SCALE, is_drift=True)
+
+
+def returned(number: int) -> Iterator[Study]:
+    """Record rests of a MEMS unit at four temperatures, in one pose to 0.2 mrad."""
+    rng = rng_of('returned', number)
+    unit = consumer_grade(rng)
+    up = spread(1, rng)[0]
+    fit: tuple[Bag, ...] = ()
+    for celsius in (-15.0, 22.0, 45.0, 5.0):
+        turned = up + np.cross(2e-4 * rng.standard_normal(3), up)
+        # At 10 Hz the noise of a sample is a quantum, so that means resolve parts of a quantum.
+        fit += (record(unit, program(celsius, 30), turned / np.linalg.norm(turned), rng,
+                       name=f'{celsius:g} degC', rate_hz=10.0, is_cold=True),)  # fmt: skip
+    held = record(unit, RETURNED, up, rng, rate_hz=10.0)
+    yield Study('', fit, one_test((held,)), is_drift=True)
 
 
 def soaks(number: int) -> Iterator[Study]:
@@ -417,6 +433,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
 CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'plain': (plain, 3),
     'one-pose': (one_pose, 3),
+    'returned': (returned, 4),
     'soaks': (soaks, 6),
     'turn-on': (turn_on, 8),
     'mems': (mems, 8),

@@ -104,6 +104,18 @@ def test_the_offset_of_a_prior_is_used(rng, plain):
     np.testing.assert_allclose(constants(result)[0], 32768.0 + BIAS, atol=2.0)
 
 
+def test_drifts_and_rotations_of_one_pose_are_no_offset_code(rng):
+    # WHY: a sphere through the readings of four bags in one pose was taken for the sphere of an
+    # offset code: the corrected drift was off by 143 mg.
+    for up in (np.eye(3)[2], np.array([-0.06, -0.25, -0.97])):
+        for n in (4, 6, 8):
+            for _ in range(100):
+                celsius = rng.uniform(-15.0, 45.0, n)
+                drift = np.outer(celsius, 1e-4 * rng.standard_normal(3))
+                turned = up + 1e-3 * rng.standard_normal((n, 3)) + drift
+                assert not rough_centre(4e6 * turned).any()
+
+
 def test_an_offset_is_found_only_if_positions_determine_it(rng):
     ups = positions(12, 5)
     assert not rough_centre(4096.0 * ups + (800.0, -900.0, 700.0)).any()

@@ -111,6 +111,7 @@ def rough_centre(means: Floats) -> Floats:
 
     With offset binary codes the angles between raw vectors are meaningless. `means`: mean
     readings, shape (n, 3); with fewer than four readings, or all in a plane, the result is 0.
+    Readings of one pose, which differ by drifts and by small rotations, are no sphere.
     """
     zero = np.zeros(3)
     if len(means) < 4:
@@ -130,9 +131,14 @@ def rough_centre(means: Floats) -> Floats:
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
-    # The sphere is accepted if the distances from its centre vary by less than 10 %.
-    is_sphere = np.std(radii) < 0.1 * np.mean(radii)
-    return np.asarray(means.mean(axis=0) + centre) if is_sphere else zero
+    # The sphere is accepted if the distances from its centre vary by less than 10 %, and if the
+    # readings are spread over the sphere, not over a small part of it.
+    is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
+    # There is a sphere through any four readings. The code at zero force is the same for all axes
+    # of an analog sensor, to some 20 %, while the axes of a unit in one pose read differently.
+    centre = means.mean(axis=0) + centre
+    is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
+    return np.asarray(centre) if is_sphere and is_common else zero
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:

@@ -100,6 +100,7 @@ class Equations(Series):
             nonlinear=np.zeros((3, self.n_coefficients)),
             radius=np.zeros(1),
             stretch=np.zeros((len(up), 1)),
+            pose=_unit_vector(up.mean(axis=0)) if self.windows.is_one_pose else np.zeros(0),
         )
 
     def norms(self, state: State) -> Floats:
@@ -127,7 +128,8 @@ class Equations(Series):
             moved = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
             n_tilts, n_starts = self.windows.tilt.shape[1], self.start_root.shape[1] * moved
             self._layouts[key] = lay_out(
-                used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces
+                *(used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces),
+                is_one_pose=self.windows.is_one_pose,
             )
         return self._layouts[key]
 
@@ -168,6 +170,7 @@ class Equations(Series):
             self._by_coefficients(state, layout, base, scaled),
             ([by_force] * layout.radius.size, by_radius),
             ([by_force] * 3, self._by_misalignment(state)),
+            ([by_force] * layout.pose.size, by_rotation[..., : layout.pose.size]),
             ([base.size + 3 + n_starts], 1.0),
         ]
         place = np.array([k for at, _ in unknowns for k in at], dtype=np.int64)
@@ -282,6 +285,10 @@ class Equations(Series):
         # The prior of attitudes is flat, so its precision is 0. An angular rate does not depend on
         # the attitude, and a precision of 1 keeps its equations regular.
         result[layout.up] = 0.0 if self.gravity else 1.0
+        if layout.pose.size:
+            result[layout.up] = prior.pose_sd**-2
+            # The prior of the common pose is almost flat: its sd is 1 rad.
+            result[layout.pose] = 1.0
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
@@ -291,6 +298,8 @@ class Equations(Series):
             result[: layout.n_unit] -= prior.informative.mean
         else:
             result[layout.kappa] -= prior.scale_mean
+        if layout.pose.size:
+            result[layout.up] = state.from_pose
         return result
 
 
@@ -304,7 +313,7 @@ def _added(layout: Layout) -> list[str]:
 
 
 def as_vector(state: State, layout: Layout) -> Floats:
-    """Return the unknowns as a vector; its elements for attitudes, tangent steps, are 0."""
+    """Return the unknowns as a vector; its elements for rotations of attitudes are 0."""
     result = np.zeros(layout.n + 1)
     for name in _added(layout):
         result[getattr(layout, name)] = getattr(state, name)
@@ -323,7 +332,15 @@ def without_inactive(state: State, layout: Layout) -> State:
 def moved_by(state: State, step: Floats, layout: Layout) -> State:
     """Add a step to a state; inactive weights and coefficients are set to 0."""
     padded = np.append(step, 0.0)
-    up = state.up + np.einsum('pij,pj->pi', state.tangents, padded[layout.up])
+    turn, pose = padded[layout.up], state.pose
+    if layout.pose.size:
+        turn = turn + step[layout.pose]
+        pose = _unit_vector(pose + state.pose_tangents @ step[layout.pose])
+    up = _unit_vector(state.up + np.einsum('pij,pj->pi', state.tangents, turn))
     moved = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
-    up /= np.linalg.norm(up, axis=1, keepdims=True)
-    return without_inactive(replace(state, up=up, **moved), layout)
+    return without_inactive(replace(state, up=up, pose=pose, **moved), layout)
+
+
+def _unit_vector(vector: Floats) -> Floats:
+    """Scale vectors to length 1, shape (..., 3)."""
+    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))

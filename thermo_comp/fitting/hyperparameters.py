@@ -29,13 +29,15 @@ from .equations import as_vector
 from .gains import log_bayes_factors
 from .initial_triad import white_noise_of
 from .regression import Posterior, Regression
-from .unknowns import Noise, Prior, State
+from .unknowns import POSE_SD, Noise, Prior, State
 
 #: Degrees of freedom of the half-Student prior of the mounting's standard deviation; 4 as in [2]_.
 STUDENT_NU = 4.0
 #: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
 #: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
+#: Variance of the log-normal hyperpriors of the logarithm of an sd: the sd is a factor of ten.
+LOG_VARIANCE = float(np.log(10.0)) ** 2
 
 
 @dataclass(frozen=True)
@@ -77,10 +79,8 @@ def _updated(
     moves = (sd > 0.0) & ~candidates.fixed
     safe, centre = np.where(moves, sd, 1.0), np.where(moves, candidates.typical, 1.0)
     effective = posterior.effective_parameters
-    # Variance of the log-normal hyperprior of a column's prior sd: its sd is a factor of ten.
-    log_variance = float(np.log(10.0)) ** 2
-    slope = np.log(safe / centre) / log_variance
-    step = _toward(effective, np.sum(state.weights**2, axis=1), safe, slope, 1.0 / log_variance)
+    slope = np.log(safe / centre) / LOG_VARIANCE
+    step = _toward(effective, np.sum(state.weights**2, axis=1), safe, slope, 1.0 / LOG_VARIANCE)
     new = np.where(moves, np.minimum(safe * np.exp(step), candidates.largest), sd)
     is_informed = moves & (effective > 0.3)
     changes = [float(np.abs(np.log(np.where(is_informed, new / safe, 1.0))).max(initial=0.0))]
@@ -96,6 +96,13 @@ def _updated(
         step = _toward(effective, power, tilt_sd, square - 1.0, 2.0 * square)
         tilt_sd = float(tilt_sd * np.exp(step))
         changes.append(float(np.abs(step)) / 3.0)
+    pose_sd = prior.pose_sd
+    if layout.pose.size:
+        slope = np.log(pose_sd / POSE_SD) / LOG_VARIANCE
+        effective, power = determined[layout.up].sum(), np.sum(state.from_pose**2)
+        step = _toward(effective, power, pose_sd, slope, 1.0 / LOG_VARIANCE)
+        pose_sd = float(pose_sd * np.exp(step))
+        changes.append(float(np.abs(step)))
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
         # Three elements of M determine their sd poorly: the built-in prior counts as a fourth. The
@@ -121,6 +128,7 @@ def _updated(
         column_sd=new,
         offset_sd=offset_sd,
         tilt_sd=tilt_sd,
+        pose_sd=pose_sd,
         misalignment_sd=misalignment_sd,
         sigma=sigma,
         start_share=start_share,
@@ -161,12 +169,14 @@ def _offset_sd(posterior: Posterior) -> tuple[float, float]:
 
 
 def log_density(posterior: Posterior) -> float:
-    """Return the log evidence plus the log prior density of the sd of mounting offsets."""
-    prior = posterior.prior
-    if not prior.offset_scale:
-        return posterior.log_evidence
-    square = (prior.offset_sd / prior.offset_scale) ** 2
-    return posterior.log_evidence - (STUDENT_NU + 1.0) / 2.0 * float(np.log1p(square / STUDENT_NU))
+    """Return the log evidence plus the log prior density of the sd of mountings and poses."""
+    prior, result = posterior.prior, posterior.log_evidence
+    if prior.offset_scale:
+        square = (prior.offset_sd / prior.offset_scale) ** 2
+        result -= (STUDENT_NU + 1.0) / 2.0 * float(np.log1p(square / STUDENT_NU))
+    if posterior.layout.pose.size:
+        result -= 0.5 * float(np.log(prior.pose_sd / POSE_SD)) ** 2 / LOG_VARIANCE
+    return result
 
 
 def white_noise(regression: Regression, posterior: Posterior) -> Floats:

@@ -86,6 +86,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         # In one attitude a tilt of the support cannot be distinguished from a drift of the unit.
         # In the paper's model tilts would absorb errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
+    if n_directions == 1 and data.n_positions > 1 and known is None and data.forces is None:
+        data = replace(data, is_one_pose=True)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)

@@ -26,7 +26,7 @@ from .hyperparameters import (
 )
 from .left_out import Score, gain, is_better, is_near, is_undecided, score_of
 from .regression import Posterior, Regression
-from .unknowns import InformativePrior, Prior, State
+from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, PART, PART_SUMS, SET, ThermalWindows
 
 #: A group is tried if its largest possible gain in log evidence exceeds this: odds of e^4 = 55:1.
@@ -124,6 +124,11 @@ class Growth:
         initial_sd = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
         is_wanted = np.isin(self._names, groups)
         prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
+        if self.regression.windows.is_one_pose:
+            # A large sd would attribute the effect of the new columns to the rests: begin with
+            # small sd of attitudes and mountings, which the data increase.
+            least = float(min(prior.offset_sd, prior.sigma.mean()))
+            prior = replace(prior, pose_sd=0.1 * POSE_SD, offset_sd=least)
         posterior = settle(self.regression, state, prior, candidates, 6)
         posterior = pruned_fit(self.regression, posterior, candidates, 8)
         return Trial(groups, score_of(self.regression, posterior), posterior, typical)
@@ -215,8 +220,13 @@ class Growth:
         """
         regression, posterior = self.regression, chosen.posterior
         kelvins = regression.windows.kelvins
-        residual = regression.residual(posterior.state, posterior.layout)
-        slope = float(np.sqrt(np.mean(residual**2))) / (float(kelvins[0]) or 1.0)
+        state = posterior.state
+        square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
+        if state.pose.size:
+            # Attitudes and offsets of the rests of one pose absorb errors of an incomplete model.
+            turned = regression.gravity * state.from_pose
+            square += float(np.mean(state.offset**2) + np.mean(turned**2))
+        slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
         units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
         new = np.minimum(slope * units * kelvins, most)
         return np.where(np.isin(self._names, groups), new, chosen.typical)
@@ -277,7 +287,7 @@ def select(
     chosen, tried = _grown(growth, first, parts, progress)
     trials += tried
     if chosen is not constants and not is_better(constants.score, chosen.score):
-        more_evidence = chosen.posterior.log_evidence - constants.posterior.log_evidence
+        more_evidence = log_density(chosen.posterior) - log_density(constants.posterior)
         if not is_undecided(constants.score, chosen.score) or more_evidence < TRIAL_GAIN:
             chosen = constants
     candidates = replace(candidates, typical=chosen.typical)

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 BIAS_SD = 1.0
 #: Built-in prior sd of a relative scale factor.
 SCALE_SD = 0.05
+#: Typical sd of the attitude of a unit that is returned to a pose by hand [rad].
+POSE_SD = 1e-3
 #: Built-in prior sd of an element of the misalignment [rad] of a triad of single sensors.
 MISALIGNMENT_SD = 1e-3
 
@@ -59,6 +61,7 @@ class Windows:
         estimates them
     acts_on: axes that each column acts on, shape (m, 3); None for all
     turn_on: number of the turn-on of each bag, shape (n_bags,); None: each bag has one
+    is_one_pose: whether all bags were recorded in one pose, to which the unit was returned
     """
 
     position: Ints
@@ -79,6 +82,7 @@ class Windows:
     undisturbed: Floats | None = None
     acts_on: Bools | None = None
     turn_on: Ints | None = None
+    is_one_pose: bool = False
 
     @property
     def n_positions(self) -> int:
@@ -197,6 +201,8 @@ class Prior:
     unseen_misalignment_sd: sd of the elements of M in the covariance, if the positions do not show
         them; `misalignment_sd` is then constant and smaller [rad]; 0 else
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
+    pose_sd: sd of each position's attitude about the common pose [rad]; without a common pose the
+        prior of the attitudes is flat
     start_share: variance of the initial lag states / their variance in the node's prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive coefficient, shape (2 k,)
@@ -216,6 +222,7 @@ class Prior:
     misalignment_scale: float = MISALIGNMENT_SD
     unseen_misalignment_sd: float = 0.0
     tilt_sd: float = 1e-7
+    pose_sd: float = POSE_SD
     start_share: float = 1.0
     nonlinear_sd: Floats = field(default_factory=lambda: np.zeros(0))
     informative: InformativePrior | None = None
@@ -236,6 +243,7 @@ class State:
     nonlinear: nonlinear coefficients in the order of `Forces`, shape (3, 2 k)
     radius: relative error of the radius, shape (1,) or (0,)
     stretch: relative error of the known |f|, shape (n_positions, 1) or (n_positions, 0)
+    pose: the common pose of all positions, shape (3,), or (0,) without a common pose
     """
 
     kappa: Floats
@@ -249,6 +257,7 @@ class State:
     nonlinear: Floats = field(default_factory=lambda: np.zeros((3, 0)))
     radius: Floats = field(default_factory=lambda: np.zeros(0))
     stretch: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    pose: Floats = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def inverse(self) -> Floats:
@@ -257,8 +266,24 @@ class State:
 
     @cached_property
     def tangents(self) -> Floats:
-        """Two unit vectors perpendicular to each attitude, shape (n, 3, 2)."""
-        return tangent_basis(self.up)
+        """
+        Two unit vectors perpendicular to each attitude, shape (n, 3, 2). With a common pose they
+        are those of the pose, projected, so that equal steps turn all attitudes alike.
+        """
+        if not self.pose.size:
+            return tangent_basis(self.up)
+        along = self.up @ self.pose_tangents
+        return np.asarray(self.pose_tangents - self.up[:, :, None] * along[:, None])
+
+    @cached_property
+    def pose_tangents(self) -> Floats:
+        """Two unit vectors perpendicular to the common pose, shape (3, 2)."""
+        return tangent_basis(self.pose[None])[0]
+
+    @property
+    def from_pose(self) -> Floats:
+        """Rotation of each attitude from the common pose along its tangents, (n, 2) [rad]."""
+        return np.asarray((self.up - self.pose) @ self.pose_tangents)
 
 
 @dataclass(frozen=True)
@@ -283,6 +308,7 @@ class Layout:
     nonlinear: Ints
     radius: Ints
     stretch: Ints
+    pose: Ints
     own: Ints
     bag: Ints
     n_unit: int
@@ -300,8 +326,8 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Places of radius and misalignment, which the axes share; the unit's last places."""
-        return np.concatenate((self.radius, self.misalignment))
+        """Places of radius, misalignment and pose, which the axes share; the last of the unit."""
+        return np.concatenate((self.radius, self.misalignment, self.pose))
 
     @cached_property
     def columns(self) -> Ints:
@@ -355,6 +381,8 @@ def lay_out(
     n_starts: int,
     active: Bools,
     forces: Forces | None = None,
+    *,
+    is_one_pose: bool = False,
 ) -> Layout:
     """
     Assign a place to every unknown, given the active columns of bias and scale, shape (2, m), and
@@ -376,6 +404,7 @@ def lay_out(
     nonlinear[:, active] = axis[:, n_linear:]
     radius = take(int(forces is not None and forces.radius_sd > 0.0))
     misalignment = take(3)
+    pose = take(2 * is_one_pose)
     n_unit = n
     n_positions, n_bags = len(bag_of_position), int(bag_of_position.max()) + 1
     n_stretches = int(forces is not None and bool(forces.sd.any()))
@@ -388,7 +417,8 @@ def lay_out(
     up, stretch, offset, tilt = np.split(own, np.cumsum([2, n_stretches, 3]), axis=1)
     return Layout(
         *(axis, weights, misalignment, up, offset, tilt.reshape(n_positions, n_tilts, 2), start),
-        *(nonlinear, radius, stretch, own, bag_of_position, n_unit, n),
+        *(nonlinear, radius, stretch, pose),
+        *(own, bag_of_position, n_unit, n),
     )
 
 
