@@ -32,6 +32,7 @@ from .data_checks import Finding
 from .equations import as_vector
 from .evidence import ResidualRow, group_evidence
 from .lack_of_fit import lack_of_fit
+from .layout import Layout
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
@@ -43,7 +44,7 @@ from .thermal_ranges import (
     usable_board_lag,
     valid_range,
 )
-from .unknowns import Layout, State
+from .unknowns import State
 from .windows import PART, Model, ThermalWindows
 
 

@@ -28,9 +28,10 @@ from ..typing import Floats, Ints
 from .equations import as_vector
 from .hyperparameters import STUDENT_NU
 from .initial_triad import within_positions
+from .layout import Layout
 from .regression import Posterior, Regression
 from .selection import LAGS, TRIAL_GAIN
-from .unknowns import InformativePrior, Layout, Prior, State
+from .unknowns import InformativePrior, Prior, State
 from .windows import CURVE, PART
 
 

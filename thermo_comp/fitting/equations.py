@@ -24,9 +24,10 @@ from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 
 from ..typing import Bools, Floats, Ints
+from .layout import Layout, lay_out
 from .series import Base, Series
 from .tangent import Tangent
-from .unknowns import Layout, Prior, State, Windows, lay_out
+from .unknowns import Prior, State, Windows
 
 _Self = TypeVar('_Self')
 _Given = ParamSpec('_Given')

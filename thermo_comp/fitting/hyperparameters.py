@@ -86,23 +86,10 @@ def _updated(
     changes = [float(np.abs(np.log(np.where(is_informed, new / safe, 1.0))).max(initial=0.0))]
     offset_sd, change = _offset_sd(posterior)
     changes.append(change)
-    tilt_sd = prior.tilt_sd
-    if state.tilt.size:
-        # Scale of the half-normal prior of tilts: 15 urad/K, aluminium of 23 ppm/K heated
-        # unevenly, times the RMS of the board temperature about the reference, at least 1 K.
-        bound = 1.5e-5 * max(float(regression.windows.kelvins[0]), 1.0)
-        square = (tilt_sd / bound) ** 2
-        effective, power = determined[layout.tilt].sum(), np.sum(state.tilt**2)
-        step = _toward(effective, power, tilt_sd, square - 1.0, 2.0 * square)
-        tilt_sd = float(tilt_sd * np.exp(step))
-        changes.append(float(np.abs(step)) / 3.0)
-    pose_sd = prior.pose_sd
-    if layout.pose.size:
-        slope = np.log(pose_sd / POSE_SD) / LOG_VARIANCE
-        effective, power = determined[layout.up].sum(), np.sum(state.from_pose**2)
-        step = _toward(effective, power, pose_sd, slope, 1.0 / LOG_VARIANCE)
-        pose_sd = float(pose_sd * np.exp(step))
-        changes.append(float(np.abs(step)))
+    tilt_sd, change = _tilt_sd(posterior, float(regression.windows.kelvins[0]))
+    changes.append(change)
+    pose_sd, change = _pose_sd(posterior)
+    changes.append(change)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
         # Three elements of M determine their sd poorly: the built-in prior counts as a fourth. The
@@ -133,6 +120,39 @@ def _updated(
         sigma=sigma,
         start_share=start_share,
     ), max(changes)
+
+
+def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
+    """
+    Move the sd of the supports' tilts towards its mode; return also the change of its logarithm.
+
+    `kelvins`: RMS of the board temperature about the reference [K]
+    """
+    sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
+    if not tilt.size:
+        return sd, 0.0
+    # Scale of the half-normal prior of tilts: 15 urad/K, aluminium of 23 ppm/K heated unevenly,
+    # times the temperature, at least 1 K.
+    square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
+    effective = posterior.determined[posterior.layout.tilt].sum()
+    step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
+    # An sd of tilts that is off by 15 % hardly changes the fit, so a third of the change counts.
+    return float(sd * np.exp(step)), float(np.abs(step)) / 3.0
+
+
+def _pose_sd(posterior: Posterior) -> tuple[float, float]:
+    """
+    Move the sd of the attitudes about a common pose towards its mode; return also the change of
+    its logarithm.
+    """
+    sd, layout = posterior.prior.pose_sd, posterior.layout
+    if not layout.pose.size:
+        return sd, 0.0
+    effective = posterior.determined[layout.up].sum()
+    power = np.sum(posterior.state.from_pose**2)
+    slope = np.log(sd / POSE_SD) / LOG_VARIANCE
+    step = _toward(effective, power, sd, slope, 1.0 / LOG_VARIANCE)
+    return float(sd * np.exp(step)), float(np.abs(step))
 
 
 def _toward(

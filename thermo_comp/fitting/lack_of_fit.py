@@ -18,9 +18,10 @@ from ..typing import Bools, Floats
 from ..unit.calibration import LackOfFit
 from .claim import Claim
 from .initial_triad import within_positions
+from .layout import Layout
 from .regression import Regression
 from .selection import Fit
-from .unknowns import Layout, State
+from .unknowns import State
 
 
 def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:

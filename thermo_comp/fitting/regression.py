@@ -27,8 +27,9 @@ from ..typing import Bools, Floats, Ints
 from .elimination import Reduced, eliminate, factored, inverse_root, solved
 from .equations import Equations, last_result_kept, moved_by, without_inactive
 from .gains import Inactive
+from .layout import Layout
 from .tangent import Normal, Tangent
-from .unknowns import Layout, Prior, State
+from .unknowns import Prior, State
 
 
 @dataclass(frozen=True)

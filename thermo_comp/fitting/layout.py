@@ -1,0 +1,153 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Owns the places of the unknowns in the vector of parameters of the regression."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..typing import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from .nonlinear import Forces
+
+
+@dataclass(frozen=True)
+class Layout:
+    """
+    Places of the unknowns in the vector of parameters; the unknowns of the unit come first.
+
+    axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
+    weights, nonlinear: shapes (2, 3, m) and (3, 2 k); -1 for an inactive unknown
+    own: unknowns of each position: up, stretch, offset, tilt, shape (n_positions, k)
+    bag: bag of each position
+    n_unit, n: number of unknowns of the unit, and of all
+    """
+
+    axis: Ints
+    weights: Ints
+    misalignment: Ints
+    up: Ints
+    offset: Ints
+    tilt: Ints
+    start: Ints
+    nonlinear: Ints
+    radius: Ints
+    stretch: Ints
+    pose: Ints
+    own: Ints
+    bag: Ints
+    n_unit: int
+    n: int
+
+    @property
+    def kappa(self) -> Ints:
+        """Places of kappa, shape (3,)."""
+        return self.axis[:, 0]
+
+    @property
+    def bias(self) -> Ints:
+        """Places of the bias, shape (3,)."""
+        return self.axis[:, 1]
+
+    @cached_property
+    def shared(self) -> Ints:
+        """Places of radius, misalignment and pose, which the axes share; the last of the unit."""
+        return np.concatenate((self.radius, self.misalignment, self.pose))
+
+    @cached_property
+    def columns(self) -> Ints:
+        """
+        The unknowns of each axis in the order of `Tangent`, as columns of the equations of a
+        position: unknowns of the position, initial lag states, unknowns of the unit, residual;
+        shape (3, k).
+        """
+        n_own, r = self.own.shape[1], self.start.shape[1]
+        starts = np.tile(n_own + np.arange(r), (3, 1))
+        return np.hstack((self.of_axis, starts, n_own + r + self.unit))
+
+    @cached_property
+    def unit(self) -> Ints:
+        """The unknowns of the unit that each axis has, and the place after them, shape (3, k)."""
+        common = np.append(self.shared, self.n_unit)
+        return np.hstack((self.axis, np.tile(common, (3, 1))))
+
+    @property
+    def n_local(self) -> int:
+        """Number of unknowns of each axis that belong to positions and bags."""
+        return len(self.of_axis[0]) + len(self.start[0])
+
+    @cached_property
+    def of_axis(self) -> Ints:
+        """The unknowns of a position that each axis has, as places in `own`, shape (3, k)."""
+        first = self.up.shape[1] + self.stretch.shape[1]
+        before, after = range(first), range(first + 3, self.own.shape[1])
+        return np.array([[*before, first + axis, *after] for axis in range(3)])
+
+    @cached_property
+    def used(self) -> Bools:
+        """Active columns of bias and scale, shape (2, m)."""
+        return np.asarray(self.weights[:, 0] >= 0)
+
+    def by_weights(self, columns: Floats, force: Floats) -> Iterator[tuple[Floats, Ints]]:
+        """
+        Yield the derivatives of readings by the weights of each axis, and the weights' places,
+        given columns, shape (n, m), and the force along the axes, shape (n, 3) or (3,).
+        """
+        in_bias, in_scale = self.used
+        for axis in range(3):
+            along = np.hstack((columns[:, in_bias], force[..., [axis]] * columns[:, in_scale]))
+            yield along, self.axis[axis, 2 : 2 + along.shape[1]]
+
+
+def lay_out(
+    used: Bools,
+    bag_of_position: Ints,
+    n_tilts: int,
+    n_starts: int,
+    active: Bools,
+    forces: Forces | None = None,
+    *,
+    is_one_pose: bool = False,
+) -> Layout:
+    """
+    Assign a place to every unknown, given the active columns of bias and scale, shape (2, m), and
+    the active nonlinear coefficients, shape (2 k,).
+    """
+    n = 0
+
+    def take(*shape: int) -> Ints:
+        nonlocal n
+        size = int(np.prod(shape))
+        n += size
+        return np.arange(n - size, n).reshape(shape)
+
+    n_linear = 2 + int(used.sum())
+    axis = take(3, n_linear + int(active.sum()))
+    weights = np.full((2, 3, used.shape[1]), -1)
+    weights.transpose(1, 0, 2)[:, used] = axis[:, 2:n_linear]
+    nonlinear = np.full((3, len(active)), -1)
+    nonlinear[:, active] = axis[:, n_linear:]
+    radius = take(int(forces is not None and forces.radius_sd > 0.0))
+    misalignment = take(3)
+    pose = take(2 * is_one_pose)
+    n_unit = n
+    n_positions, n_bags = len(bag_of_position), int(bag_of_position.max()) + 1
+    n_stretches = int(forces is not None and bool(forces.sd.any()))
+    own = np.empty((n_positions, 2 + n_stretches + 3 + 2 * n_tilts), dtype=np.int64)
+    start = np.empty((n_bags, n_starts), dtype=np.int64)
+    for bag in range(n_bags):
+        for p in np.flatnonzero(bag_of_position == bag):
+            own[p] = take(own.shape[1])
+        start[bag] = take(n_starts)
+    up, stretch, offset, tilt = np.split(own, np.cumsum([2, n_stretches, 3]), axis=1)
+    return Layout(
+        *(axis, weights, misalignment, up, offset, tilt.reshape(n_positions, n_tilts, 2), start),
+        *(nonlinear, radius, stretch, pose),
+        *(own, bag_of_position, n_unit, n),
+    )
