@@ -415,6 +415,23 @@ def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
     assert not inactive.chosen(wide, asked, 1e9, 9).any()
 
 
+def test_inactive_columns_share_the_initial_lag_states_of_the_active_ones(solved):
+    # WHY: the prior on the sum of the initial lag states was left out, and S was too large by a
+    # factor of 50 for a scale factor whose bias has the same lag.
+    regression, prior, mode = solved
+    of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
+    without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))
+    posterior = regression.solve(mode.state, without, n_steps=2)
+    inactive = regression.inactive(posterior, np.isin(GROUPS, ('board',)))
+    assert inactive.part.tolist() == [1, 1]
+    wide = replace(without, column_sd=without.column_sd + 1e3 * of_scale)
+    fitted = regression.solve(posterior.state, wide, n_steps=0)
+    places = fitted.layout.weights[1, :, inactive.column].ravel()
+    expected = np.linalg.inv(fitted.covariance[np.ix_(places, places)])
+    sd = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(inactive.S / np.outer(sd, sd), expected / np.outer(sd, sd), atol=1e-3)
+
+
 def test_only_a_matrix_made_indefinite_by_rounding_gets_more_jitter(rng):
     root = rng.standard_normal((3, 3))
     good, bad = root @ root.T, np.ones((3, 3)) - 1e-10 * np.eye(3)

@@ -200,7 +200,13 @@ class Reduced:
         of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
         cross = unit.reshape(-1, 3 * m)
         cross -= _summed(turned[..., r:], of_positions) + _summed(self.bags.turned, of_bags)
-        return _square(of_positions, of_bags), cross
+        gone = _square(of_positions, of_bags)
+        if self.common is not None:
+            # The prior on the sum of the initial lag states adds information.
+            of_sum = self.common.root @ (np.swapaxes(self.bags.root, 1, 2) @ of_bags).sum(axis=0)
+            cross += _summed(self.common.turned, of_sum)
+            gone -= _square(of_sum)
+        return gone, cross
 
 
 def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floats) -> Reduced:

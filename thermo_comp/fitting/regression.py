@@ -333,7 +333,7 @@ class Regression(Equations):
             return Inactive(part, column, np.zeros((0, 0)), np.zeros(0))
         base = self.products(layout.used).base
         columns, at = np.unique(column, return_inverse=True)
-        among, beside = self.products_of(columns, base)
+        among, beside = self.products_of(columns, base, state)
         # Derivatives of the reading by a column's contribution to the bias, and to the scale.
         acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
         acts /= sigma

@@ -277,12 +277,15 @@ class Series:
             )
         return self._products
 
-    def products_of(self, columns: Ints, base: Base) -> tuple[Floats, Floats]:
+    def products_of(self, columns: Ints, base: Base, state: State) -> tuple[Floats, Floats]:
         """
-        Return the products of some columns with each other and with a base, in each position,
-        shapes (n_positions, k, k) and (n_positions, k, n_base).
+        Return the products of some columns, at the initial lag states of `state`, with each other
+        and with a base, in each position, shapes (n_positions, k, k) and (n_positions, k, n_base).
         """
-        series = np.hstack((self.columns[:, columns], self.of(base)))
+        values, lag = self.columns[:, columns], self.windows.lag[columns]
+        start = (state.start @ self.start_root.T)[self.windows.bag]
+        values[:, lag >= 0] += start[:, lag[lag >= 0]] * self._starts[:, columns[lag >= 0]]
+        series = np.hstack((values, self.of(base)))
         parts = np.split(self._whitened(series), self._first[1:])
         k = len(columns)
         products = np.stack([part[:, :k].T @ part for part in parts])
