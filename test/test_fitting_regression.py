@@ -429,7 +429,9 @@ def test_inactive_columns_share_the_initial_lag_states_of_the_active_ones(solved
     places = fitted.layout.weights[1, :, inactive.column].ravel()
     expected = np.linalg.inv(fitted.covariance[np.ix_(places, places)])
     sd = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(inactive.S / np.outer(sd, sd), expected / np.outer(sd, sd), atol=1e-3)
+    np.testing.assert_allclose(
+        inactive.S / np.outer(sd, sd), expected / np.outer(sd, sd), atol=1e-3
+    )
 
 
 def test_only_a_matrix_made_indefinite_by_rounding_gets_more_jitter(rng):

@@ -279,7 +279,9 @@ def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
         save_calibration(unit, files[-1])
     target = tmp_path / 'type.yaml'
     assert run(['prior', *map(str, files), '-o', str(target)]) == 0
-    assert 'prior from 3 units, 13 columns' in capsys.readouterr().out
-    assert load_calibration(target) == population(siblings())
+    prior = load_calibration(target)
+    assert prior == population(siblings())
+    expected = f'prior from 3 units, {len(prior.response)} columns'
+    assert expected in capsys.readouterr().out
     assert run(['prior', *map(str, files[:2]), '-o', str(target), '--force']) == 1
     assert 'need 3 for a population' in capsys.readouterr().err

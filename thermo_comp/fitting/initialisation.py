@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import FitError
+from ..thermal.state import VAR_BOARD
 from ..typing import Bools, Floats, Ints
 from .coverage import distinct_directions, norm_columns
 from .data_checks import POSITIONS_FOR_MISALIGNMENT, POSITIONS_NEEDED
@@ -27,9 +28,9 @@ from .options import FitOptions
 from .priors import informative_priors, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import Fit, fit_all, select
+from .selection import LAGS, Fit, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, Prior, State, Windows, misalignment_scale
-from .windows import CURVE, ThermalWindows
+from .windows import CURVE, PART, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
@@ -63,9 +64,14 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     If positions differ in temperature by more than their temperatures change, the curve is that
     of the positions' means, unless drifts within the positions improve it on left-out data.
     """
+    if problem.options.model != 'golovach':
+        windows = replace(windows, data=_constant_in(windows.data, _is_steady(windows)))
     if problem.options.prior is not None or not _is_constant(windows, windows.data.position):
         return _regress(windows, problem)
-    at_rest = replace(windows, data=_at_rest(windows.data))
+    # In a soak a lag of unknown size and the remaining drift of the temperature change the
+    # readings by similar amounts, so only the norms of the positions determine the curve.
+    data = _constant_in(windows.data, np.ones(windows.data.n_positions, dtype=bool))
+    at_rest = replace(windows, data=replace(data, start=np.zeros_like(data.start)))
     # A regression reports progress from 0.7 to 0.95; each of two regressions gets half the range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
@@ -82,7 +88,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     """Fit the windows; `is_at_rest`: whether columns are constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
-    if options.model == 'golovach' or n_directions < 2:
+    is_one_heated = len(distinct_directions(problem.up[_is_heated(windows)])) == 1
+    if options.model == 'golovach' or is_one_heated:
         # In one attitude a tilt of the support cannot be distinguished from a drift of the unit.
         # In the paper's model tilts would absorb errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
@@ -94,7 +101,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if n_directions >= POSITIONS_NEEDED:
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
-    candidates = _candidates(windows, steepness, options, n_directions)
+    candidates = _candidates(windows, steepness, options, n_directions, is_one_heated)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
         *others, widest = informative_priors(known, regression, state, windows.model, options)
@@ -134,15 +141,42 @@ def _is_constant(windows: ThermalWindows, part: Ints) -> bool:
     return bool(np.var(within) < np.var(t - within))
 
 
-def _at_rest(data: Windows) -> Windows:
-    """Return the windows with columns that are constant in each position."""
-    # In a soak a lag of unknown size and the remaining drift of the temperature change the
-    # readings by similar amounts, so only the norms of the positions determine the curve.
+def _is_steady(windows: ThermalWindows) -> Bools:
+    """
+    Return the positions whose temperatures change by less than three sd of the thermometers' noise
+    (RMS), shape (n_positions,).
+
+    The noise of the temperature would act as a change without a drift, as if the unit had no
+    thermal response in the attitudes of short rests.
+    """
+    data, model = windows.data, windows.model
+    lags = [column.group in LAGS and not column.power for column in model.columns]
+    celsius = np.column_stack((windows.temperature, windows.raw[:, lags]))
+    square = within_positions(celsius, data.position) ** 2
+    change = np.array([part.mean(axis=0).max() for part in np.split(square, data.edges[1:-1])])
+    noise = np.array([np.median(track.states[:, VAR_BOARD]) for track in windows.tracks])
+    return np.asarray(change < 9.0 * noise[data.bag_of_position])
+
+
+def _is_heated(windows: ThermalWindows) -> Bools:
+    """
+    Return the positions that show an effect of temperature, shape (n_positions,): with a change of
+    temperature, or with a mean temperature more than a tenth of the span from the median.
+    """
+    mean = position_means(replace(windows.data, mean=windows.temperature[:, None]))[:, 0]
+    is_apart = np.abs(mean - np.median(mean)) > 0.1 * np.ptp(windows.temperature)
+    is_heated = is_apart | ~_is_steady(windows)
+    return np.asarray(is_heated | ~is_heated.any())
+
+
+def _constant_in(data: Windows, position: Bools) -> Windows:
+    """Return the windows with columns that are constant in some positions, (n_positions,)."""
+    is_constant = position[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
-    columns = means[data.position]
+    columns = np.where(is_constant, means[data.position], data.columns)
     square, of_means = (np.mean(values**2, axis=0) for values in (data.columns, columns))
     kelvins = data.kelvins * np.sqrt(of_means / np.where(square > 0.0, square, 1.0))
-    return replace(data, columns=columns, kelvins=kelvins, start=np.zeros_like(data.start))
+    return replace(data, columns=columns, kelvins=kelvins)
 
 
 def initial_state(regression: Regression, start: ConstantCalibration, up: Floats) -> State:
@@ -247,9 +281,17 @@ def _mounting_scale(noise: float) -> float:
 
 
 def _candidates(
-    windows: ThermalWindows, steepness: float, options: FitOptions, n_directions: int
+    windows: ThermalWindows,
+    steepness: float,
+    options: FitOptions,
+    n_directions: int,
+    is_one_heated: bool,
 ) -> Candidates:
-    """Return the columns that may take part, with the typical and largest sd of their weights."""
+    """
+    Return the columns that may take part, with the typical and largest sd of their weights.
+
+    `is_one_heated`: whether only one attitude shows an effect of temperature, see `_is_heated`
+    """
     data = windows.data
     groups = np.array(data.groups)
     allowed = {*data.groups} if options.groups is None else {*options.groups, *options.forced}
@@ -259,9 +301,9 @@ def _candidates(
     steepest = _steepest(n_directions)
     slopes = _typical_slopes(steepness, steepest, options)
     fixed = np.zeros(parts.shape, dtype=bool)
-    if n_directions == 1:
+    if is_one_heated:
         # One attitude cannot separate scale and bias: the curve of the scale keeps its prior.
-        parts[1] &= groups == CURVE
+        parts[1] &= np.isin(groups, (CURVE, PART))
         fixed[1] = parts[1]
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
