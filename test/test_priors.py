@@ -49,12 +49,12 @@ test_of.__test__ = False
 
 
 @cache
-def fitted(number, mounting_sd=None):
+def fitted(number):
     """
     Fit a sibling on nine of its twelve positions, which determine everything but how well
-    mountings repeat.
+    mountings repeat: it is stated.
     """
-    options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=mounting_sd)
+    options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
 
 
@@ -173,7 +173,7 @@ def test_new_rests_improve_an_old_calibration():
 def test_rests_at_one_temperature_correct_ageing_and_keep_the_response():
     # An hour at one temperature determines a bias change of 200 ug without --ageing-bias.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
-    old = fitted(9, mounting_sd=1e-6 * STANDARD_GRAVITY).calibration
+    old = fitted(9).calibration
 
     def aged(record):
         by = np.rint(moved * np.array([axis.scale_factor for axis in old.axes]))
