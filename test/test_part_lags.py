@@ -14,7 +14,6 @@ from strangers_baselines import minutes
 from strangers_cases import (
     FULL_SCALE,
     HALF,
-    HELD,
     Study,
     consumer_grade,
     gradient,
@@ -38,6 +37,8 @@ HEADER = 'time_s,accel_x,accel_y,accel_z,temperature_board,temperature_case'
 PARTS_S = np.array([520.0, 910.0, 1400.0])
 MEMS_SCALE = {'full_scale': 32767.0}
 FACES = np.vstack((np.eye(3), -np.eye(3)))
+#: Held-out ramps of strangers_cases.py, with soaks of 15 and 30 min instead of 40 to 50 min.
+HELD = program(12, 20, (31, 0.7, 30), (17, 1.5, 15)), program(30, 20, (8, 1.2, 30), (24, 0.6, 15))
 SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
