@@ -3,7 +3,6 @@
 """Noise of series, and the end of the dynamic regime, are estimated, not assumed."""
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from thermo_comp.thermal.state import WEIGHT
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
-Closes = Literal['board', 'case']
 #: Soaks long enough for the board to settle.
 PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
 #: Difference of the dynamic set in each axis, far above the 2 ug of a window.

@@ -20,13 +20,9 @@ from thermo_comp.unit.calibration_file import parse_calibration
 pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
 
 
-def only_unit(folder):
-    (unit,) = find_units(Storage(str(folder)))
-    return unit
-
-
 def processed(folder, **keys):
-    outcome = process_unit(only_unit(folder), str(folder), replace(OPTIONS, **keys))
+    (unit,) = find_units(Storage(str(folder)))
+    outcome = process_unit(unit, str(folder), replace(OPTIONS, **keys))
     assert list(outcome.row) == [column.name for column in COLUMNS]
     return outcome
 

@@ -4,6 +4,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -51,9 +52,8 @@ def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
     keys, options = ({'rate_hz': 10.0}, MEMS_SCALE) if is_mems else ({}, FULL_SCALE)
     up = spread(up, rng) if isinstance(up, int) else up
     bags = positions(unit, corners, up, rng, **keys)
-    return unit, Study(
-        '', bags, one_test(positions(unit, held, spread(2, rng), rng, **keys)), options
-    )
+    test = one_test(positions(unit, held, spread(2, rng), rng, **keys))
+    return unit, Study('', bags, test, options)
 
 
 @pytest.fixture(scope='module')
@@ -73,10 +73,10 @@ def parts(tmp_path_factory, cli, equal_fits_once):
     return unit, study, load_calibration(folder / 'unit.yaml'), printed
 
 
-@pytest.fixture(scope='module')
-def soaked():
-    """Fit a unit of navigation grade to soaks in 18 positions; also score the fit in ramps."""
-    unit, study = study_of('rests', 0, up=18, corners=SOAKS)
+@cache
+def soaked(grade):
+    """Fit a unit to soaks in 18 positions; also score the fit in ramps."""
+    unit, study = study_of('rests', 0, up=18, corners=SOAKS, grade=grade)
     return unit, study, judged(strangers.fitted(study), study)
 
 
@@ -246,25 +246,14 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
         assert any(tau == taus and second == seconds for tau, second in stages)
 
 
-def beside_constants(score, study):
-    """Return the error of the norm / that of the best constants."""
+@pytest.mark.parametrize('grade', [consumer_grade, navigation])
+def test_soaks_determine_the_curve_by_their_norms(grade):
+    # The board drifts by 0.01 K within a soak; 26 K between the soaks move the norms by milli-g.
+    _, study, score = soaked(grade)
     means = [minutes(bag) for bag in study.tests['']]
     forces = [strangers.scipy_baselines(study)['constants'](mean) for mean in means]
-    return score.norm / strangers.error_of(forces, means, is_drift=False).norm
-
-
-def test_soaks_determine_the_curve_by_their_norms(soaked):
-    # The board drifts by 0.01 K within a soak; 26 K between the soaks move the norms by milli-g.
     # A part of the error remains, because soaks do not determine the lags in held-out ramps.
-    _, study, score = soaked
-    assert beside_constants(score, study) < 0.5
-    assert score.ratio < 1.5
-
-
-def test_soaks_determine_the_curve_of_a_mems():
-    _, study = study_of('rests', 0, up=18, corners=SOAKS, grade=consumer_grade)
-    score = judged(strangers.fitted(study), study)
-    assert beside_constants(score, study) < 0.5
+    assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
 
@@ -295,9 +284,9 @@ def test_a_curve_that_the_soaks_do_not_show_is_claimed():
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
 
-def test_one_bag_of_ramps_beside_soaks_determines_the_lags(soaked):
+def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
     # WHY: left-out soaks do not contain lags, so their score rejected the columns of lags.
-    unit, alone, score = soaked
+    unit, alone, score = soaked(navigation)
     rng = rng_of('soaks and a ramp')
     (ramps,) = positions(unit, HALF, spread(1, rng), rng)
     study = replace(alone, bags=(*alone.bags, replace(ramps, name='ramps')))

@@ -150,17 +150,13 @@ def test_siblings_improve_the_fit_of_one_position():
     few = [source(record) for record in test_of(9, 0, 1)]
     alone = fit(few, replace(OPTIONS, serial='unit-9')).calibration
     truth = sibling(KIND, 9, 0.15)
-    errors = []
+    errors, known = [], fitted(9).calibration.static.z.scale_function
     for result in (alone, helped()[0]):
         relative = [axis.scale_factor for axis in result.axes]
         errors.append(np.abs(np.array(relative) / truth.scale_factor - 1.0).max())
         curve = result.static.z.scale_function
-        errors[-1] += abs(curve.value(10.0) - fitted_curve(9).value(10.0))
+        errors[-1] += abs(curve.value(10.0) - known.value(10.0))
     assert errors[1] < errors[0]
-
-
-def fitted_curve(number):
-    return fitted(number).calibration.static.z.scale_function
 
 
 def test_new_rests_improve_an_old_calibration():
