@@ -50,7 +50,7 @@ class Rest:
         self.time = np.arange(n) / self.rate_hz
         self.accel = np.array(self.level) + self.sd * self.rng.standard_normal((n, 3))
         self.gyro = 0.002 * self.rng.standard_normal((n, 3))
-        self.board_time = np.arange(0.0, self.duration_s, 0.5)
+        self.board_time = np.arange(0.0, self.duration_s, 1.0)
 
     def temperature(self, time):
         return self.warm - self.fall * (1.0 - np.exp(-time / self.pace_s))

@@ -24,11 +24,6 @@ def noiseless(unit):
     return replace(unit.with_thermometers(noise_sd=0.0), noise_density=(0.0, 0.0, 0.0))
 
 
-def rates_k_min(program):
-    """Return the rate of each line between points, shape (n - 1,), K/min; 0 in a soak."""
-    return np.diff(program.temperature_c) / np.diff(program.time_s) * 60.0
-
-
 def rippled(program, seed=1, amplitude=0.1, period=300.0):
     """Return a program with the ripple of a chamber's control: a sine with a random-walk phase."""
     # A period has twelve points, and changes the phase by an sd of half a radian.

@@ -76,7 +76,7 @@ def test_a_rate_that_goes_up_twentyfold_and_back_loses_no_sample(peer, tmp_path)
         now_ns, sent = START_NS, []
         driver.temperatures(now_ns - 1, 20.0, 20.0)
         peer.poll(lambda: len(node._relay._readings) == 2, 'the first readings')
-        for round_number in range(6):
+        for round_number in range(4):
             step_ns = 10**7 if round_number % 2 == 0 else 5 * 10**5
             for k in range(1000):
                 if k % 50 == 0:

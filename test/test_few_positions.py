@@ -3,6 +3,7 @@
 """Few positions: parameters that they determine are right, other parameters stay at the prior."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,32 @@ def turned(rng, ups, rest_s=20.0):
     return source_of(stamp_ns, accel, name='turned')
 
 
+@cache
+def tumbled(n):
+    """Fit one recording of n attitudes, with the noise of the fixture `rng`."""
+    return fit([turned(np.random.default_rng(20161), positions(n, 3))], OPTIONS)
+
+
+def pulls_of(calibration, low, high, slopes):
+    """Return the error of each axis' drift between two temperatures / its claimed sd."""
+    covariance, layout, pulls = (
+        calibration.posterior.covariance(),
+        parameter_layout(calibration),
+        [],
+    )
+    for axis, block, slope in zip(calibration.static.axes(), layout.bias, slopes, strict=True):
+        family = axis.bias_function
+        along = np.subtract(family.basis(high), family.basis(low))
+        at = block.static + 1 + np.arange(family.n_free)
+        sd = np.sqrt(along @ covariance[np.ix_(at, at)] @ along)
+        pulls.append((family.value(high) - family.value(low) - (high - low) * slope) / sd)
+    return np.abs(pulls)
+
+
+def names_of(result):
+    return {finding.name for finding in result.findings}
+
+
 def test_one_position_gives_bias_over_temperature_on_three_axes(one_position):
     at = np.array([-3.0, 12.0])
     for axis, slope in zip(one_position.calibration.static.axes(), SLOPE, strict=True):
@@ -113,15 +140,8 @@ def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
         rest = Rest(rng, level=tuple(GRAVITY * UP), sd=0.1 * MG, warm=celsius, fall=0.0)
         rest.accel += (celsius - 20.0) * MG * slope
         bags.append(rest.source(name=f'{celsius:g}'))
-    calibration = fit(bags, OPTIONS).calibration
-    covariance = calibration.posterior.covariance()
-    curves = zip(calibration.static.axes(), parameter_layout(calibration).bias, strict=True)
-    for (axis, block), drift in zip(curves, 10.0 * MG * slope, strict=True):
-        family = axis.bias_function
-        along = np.subtract(family.basis(15.0), family.basis(5.0))
-        at = block.static + 1 + np.arange(family.n_free)
-        sd = np.sqrt(along @ covariance[np.ix_(at, at)] @ along)
-        assert abs(drift - (family.value(15.0) - family.value(5.0))) < 3.0 * sd
+    pulls = pulls_of(fit(bags, OPTIONS).calibration, 5.0, 15.0, MG * slope)
+    assert (pulls < 3.0).all()
 
 
 def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_each_rest(rng):
@@ -129,7 +149,7 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
     # differences between the norms of 36 rests were taken for mountings that do not repeat.
     bags = []
     for celsius in (5.0, 20.0, 35.0):
-        for up in positions(12, 3):
+        for up in positions(8, 3):
             rest = Rest(rng, level=tuple(GRAVITY * up), sd=0.1 * MG, warm=celsius, fall=-1.0)
             rest.accel += (celsius - 20.0) * 0.1 * MG * SLOPE
             bags.append(rest.source(name=f'{len(bags)}'))
@@ -137,9 +157,9 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
     calibration, at = result.calibration, np.array([6.0, 36.0])
     curves = [axis.bias_function for axis in calibration.static.axes()]
     slopes = np.array([np.diff(curve.value(at))[0] / 30.0 for curve in curves])
-    # 36 norms with a noise of 1 ug: the warm-up, 1 K in 600 s, limits the temperature to 0.1 K.
+    # 24 norms with a noise of 1 ug: the warm-up, 1 K in 600 s, limits the temperature to 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
-    assert 'misfit' not in {finding.name for finding in result.findings}
+    assert 'misfit' not in names_of(result)
     # Soaks do not show the lag of the sensor, whose effect is at most that of the slope: twice the
     # claimed sd covers this effect, and the claimed sd is at most this effect.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
@@ -147,10 +167,10 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3])
-def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed(seed):
+def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
     # WHY: a curve from the drifts in the warm-ups was wrong by 7 claimed sd between the rests.
-    rng, slopes, bags = np.random.default_rng(seed), 0.1 * MG * SLOPE, []
+    # With this seed the error exceeds the claim of the drifts alone.
+    rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
             rest = Rest(rng, level=tuple(GRAVITY * up), sd=0.1 * MG, warm=celsius, fall=-1.0)
@@ -159,16 +179,8 @@ def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed(seed)
             # Turn-ons of 0.1 mg leave the curve to the drifts.
             rest.accel += rng.normal(0.0, 0.1 * MG, 3)
             bags.append(rest.source(name=f'{len(bags)}'))
-    calibration = fit(bags, OPTIONS).calibration
-    covariance = calibration.posterior.covariance()
-    curves = zip(calibration.static.axes(), parameter_layout(calibration).bias, strict=True)
-    for (axis, block), slope in zip(curves, slopes, strict=True):
-        family = axis.bias_function
-        along = np.subtract(family.basis(15.0), family.basis(-15.0))
-        at = block.static + 1 + np.arange(family.n_free)
-        sd = np.sqrt(along @ covariance[np.ix_(at, at)] @ along)
-        error = family.value(15.0) - family.value(-15.0) - 30.0 * slope
-        assert abs(error) < 3.0 * sd
+    pulls = pulls_of(fit(bags, OPTIONS).calibration, -15.0, 15.0, slopes)
+    assert (pulls < 3.0).all()
 
 
 @pytest.mark.parametrize('unit', [1, 2])
@@ -253,15 +265,15 @@ def test_one_position_becomes_parameters_of_an_autopilot(one_position):
         assert np.diff(offset)[0] / 15.0 / MG == pytest.approx(slope, abs=0.2)
 
 
-def test_positions_without_temperature(rng):
-    result = fit([turned(rng, positions(12, 3))], OPTIONS)
+def test_positions_without_temperature():
+    result = tumbled(12)
     calibration = result.calibration
     axes = calibration.axes
     # The noise of 2 mg a sample averages to 50 ug over 12 rests of 20 s.
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.005)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.001)
     assert calibration.response == ()
-    assert 'temperature' in {finding.name for finding in result.findings}
+    assert 'temperature' in names_of(result)
     # Temperature effects stay at their prior: no slope, sd 5 mm/s^2 and 200 ppm per K.
     assert not calibration.needs_temperature
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
@@ -280,16 +292,14 @@ def test_positions_without_temperature(rng):
 
 
 def test_the_assumed_repeatability_of_the_bias_is_said(rng):
-    def names(n, options, n_bags=1):
-        parts = np.array_split(positions(n, 3), n_bags)
-        return {finding.name for finding in fit([turned(rng, p) for p in parts], options).findings}
-
     # Nine constants explain nine norms, for any offsets of the mountings.
-    assert 'mountings' in names(9, OPTIONS)
-    assert 'mountings' not in names(9, replace(OPTIONS, mounting_sd=1e-3))
+    assert 'mountings' in names_of(tumbled(9))
+    stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
+    assert 'mountings' not in names_of(stated)
     # Twelve positions show how well mountings repeat, but one recording has one turn-on.
-    assert 'mountings' in names(12, OPTIONS)
-    assert 'mountings' not in names(12, OPTIONS, n_bags=12)
+    assert 'mountings' in names_of(tumbled(12))
+    twelve = fit([turned(rng, [up]) for up in positions(12, 3)], OPTIONS)
+    assert 'mountings' not in names_of(twelve)
 
 
 def test_counts_of_32_bits_are_fitted(rng):
@@ -305,10 +315,11 @@ def test_counts_of_32_bits_are_fitted(rng):
 def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
     # WHY: positions of one recording have the same turn-on: the claimed sd was 1/6 of the error.
     offsets = 5e-3 * rng.standard_normal((8, 3))
-    ups = positions(18, 3)
+    ups = positions(12, 3)
     # The prior of a MEMS with a noise of 0.02 m/s^2 in a sample at 100 Hz, and a stated sd.
-    for options, least in ((OPTIONS, 1e-3), (replace(OPTIONS, mounting_sd=5e-3), 5e-3)):
-        calibration = fit([turned(rng, ups)], options).calibration
+    stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
+    for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
+        calibration = result.calibration
         sd = np.sqrt(np.diag(calibration.posterior.covariance()))
         bias = [block.static for block in parameter_layout(calibration).bias]
         assert (sd[bias] > 0.9 * least).all()
@@ -345,13 +356,11 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     # WHY: with positions cut into several rests, the sd of the offset was 1/20 of the true sd.
-    whole, cut = (
-        fit([turned(rng, np.repeat(positions(9, 3), n, axis=0))], OPTIONS) for n in (1, 5)
-    )
+    whole, cut = tumbled(9), fit([turned(rng, np.repeat(positions(9, 3), 5, axis=0))], OPTIONS)
     sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, cut))
     # Nine norms do not determine the sd, which stays at its prior in both fits.
     assert sd_cut == pytest.approx(sd, rel=0.1)
-    assert {'mountings'} <= {finding.name for finding in cut.findings}
+    assert 'mountings' in names_of(cut)
     # The rests of a mounting are left out together.
     assert len(cut.fit.selected.score.norms.square) == 9
 
@@ -368,7 +377,7 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
 
     # The second bag begins in the middle of the fifth position.
     source = turned(rng, positions(9, 3))
-    whole = fit([source], OPTIONS)
+    whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
     n_turn_ons = [one.fit.windows.data.n_turn_ons for one in (whole, parts, others)]
     assert n_turn_ons == [1, 1, 2]
@@ -381,7 +390,7 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
 def test_a_calibration_has_the_date_of_its_test(rng):
     # WHY: a calibration fitted today to old bags had the date of today, and no ageing.
     source = turned(rng, positions(9, 3))
-    provenance = fit([source], OPTIONS).calibration.provenance
+    provenance = tumbled(9).calibration.provenance
     assert provenance.date == provenance.tested == '2023-11-14T22:16:28Z'
     assert provenance.created > provenance.tested
     # Seconds since the start of a computer are not a date.
@@ -410,7 +419,7 @@ def test_three_positions_do_not_show_which_constants_have_aged(rng):
     scale, bias = 1.0 + 2e-3 * rng.standard_normal(3), 1e-2 * rng.standard_normal(3)
     corners = positions(60, 5)
     ratios = []
-    for seed in range(4):
+    for seed in range(2):
         ups = positions(3, 10 + seed) * scale + bias / GRAVITY
         few = replace(OPTIONS, serial='1', prior=known, allow=('prior',))
         aged = fit([turned(rng, ups)], few).calibration
@@ -475,8 +484,7 @@ def test_six_attitudes_that_hardly_determine_the_scale_factors_leave_them_near_e
 
 def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
     source = turned(rng, positions(12, 3))
-    findings = {finding.name: finding for finding in fit([source], OPTIONS).findings}
-    assert 'dropped' not in findings
+    assert 'dropped' not in names_of(tumbled(12))
     (block,) = source.blocks()
     stamps = block.accel_stamp_ns
     # After half of the recording the clock is set back by a quarter of the recording.

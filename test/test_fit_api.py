@@ -10,8 +10,8 @@ G = 9.80665
 MICRO_G = 1e-6 * G
 KNEE_C, SLOPE = 21.3, 20.0  # [degC], [ug/K]
 BIAS = 1e-3 * G
-#: Sd of the samples [m/s^2]: 0.4 ug in the mean of a minute at 1 Hz.
-NOISE = 3.0 * MICRO_G
+#: Sd of the samples [m/s^2]: 0.4 ug in the mean of a minute at 0.5 Hz.
+NOISE = 2.0 * MICRO_G
 UPS = np.array(
     [[1, 0, 0], [-1, 0.1, 0], [0, 1, 0.1], [0.1, -1, 0], [0, 0.1, 1], [0, 0, -1],
      [1, 1, 0], [0, 1, 1], [1, 0, 1], [1, -1, 1], [-1, 1, 1], [1, 1, -1]]
@@ -20,7 +20,7 @@ UPS = np.array(
 
 def recording(up, rng, slope=None):
     """Simulate times, m/s^2 and board temperatures of two hours, 10 to 32 degC and back."""
-    time_s = np.arange(0.0, 7200.0)
+    time_s = np.arange(0.0, 7200.0, 2.0)
     board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
     bias = (SLOPE if slope is None else slope) * MICRO_G * np.maximum(board - KNEE_C, 0.0)
     force = G * up / np.linalg.norm(up) + bias[:, None] * (1.0, -1.0, 0.5) + BIAS
@@ -38,8 +38,8 @@ def left_by(groups):
     up = np.array([0.3, -0.5, 0.8])
     time_s, force, board = recording(up, rng)
     specific_force = unit.correct(time_s, force, board=(time_s[::5], board[::5])).specific_force
-    error = specific_force[600:] - G * up / np.linalg.norm(up)
-    minutes = error.reshape(-1, 60, 3).mean(axis=1)
+    error = specific_force[300:] - G * up / np.linalg.norm(up)
+    minutes = error.reshape(-1, 30, 3).mean(axis=1)
     return unit, float(np.sqrt(np.mean(minutes**2)) / MICRO_G)
 
 

@@ -29,8 +29,6 @@ from thermo_comp.unit.functions import Polynomial
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.metrics import residual_statistics
 
-LINE = Polynomial((0.0, 1.0))
-
 
 def findings_of(windows, up, *, has_case=True, prior=None):
     return {finding.name: finding for finding in judge_windows(windows, up, has_case, prior)}

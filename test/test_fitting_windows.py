@@ -41,7 +41,7 @@ def sources(n, seed=1):
 
 @pytest.fixture(scope='module')
 def all_bags():
-    return [reduce_bag(source, OPTIONS) for source in sources(9)]
+    return [reduce_bag(source, OPTIONS) for source in sources(6)]
 
 
 @pytest.fixture(scope='module')

@@ -20,13 +20,9 @@ from thermo_comp.unit.calibration_file import parse_calibration
 pytest.importorskip('fsspec', reason='fsspec is not installed: the extra `fleet`')
 
 
-def only_unit(folder):
-    (unit,) = find_units(Storage(str(folder)))
-    return unit
-
-
 def processed(folder, **keys):
-    outcome = process_unit(only_unit(folder), str(folder), replace(OPTIONS, **keys))
+    (unit,) = find_units(Storage(str(folder)))
+    outcome = process_unit(unit, str(folder), replace(OPTIONS, **keys))
     assert list(outcome.row) == [column.name for column in COLUMNS]
     return outcome
 
@@ -109,16 +105,16 @@ class TestRow:
         json.dumps(row, allow_nan=False)
 
     def test_a_corrupt_bag_is_left_out_and_a_torn_bag_is_read_up_to_the_cut(self, tmp_path):
-        paths = write_unit(tmp_path / 'u', 2, 8)
+        paths = write_unit(tmp_path / 'u', 2, 6)
         paths[2].write_bytes(paths[2].read_bytes()[:-300])
         damage(paths[3])
         row = processed(tmp_path).row
         assert row['verdict'].startswith('valid')
-        assert (row['n_bags'], row['n_left_out'], row['n_torn']) == (8, 1, 1)
+        assert (row['n_bags'], row['n_left_out'], row['n_torn']) == (6, 1, 1)
         assert row['left_out'].startswith('u/04.mcap: damaged: ')
-        assert '1 of 8 bags are left out: u/04.mcap' in row['reservations']
+        assert '1 of 6 bags are left out: u/04.mcap' in row['reservations']
         assert '03.mcap: the file is cut off at byte' in row['reservations']
-        assert row['n_positions'] == 7
+        assert row['n_positions'] == 5
 
     def test_bags_of_two_units_in_one_folder_are_refused(self, tmp_path):
         write_unit(tmp_path / 'u', 1, 1)
@@ -143,7 +139,7 @@ class TestRow:
 
     def test_the_lag_of_a_board_that_leads_is_negative(self, tmp_path):
         # WHY: without a measured lag the file has the usual 900 s, not the unit's lag.
-        write_unit(tmp_path / 'u', 1, 6, is_exchanged=True)
+        write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
         allowed = replace(OPTIONS.fit, allow=('swapped',))
         outcome = processed(tmp_path, fit=allowed)
         assert outcome.row['board_lag_s'] < -100.0

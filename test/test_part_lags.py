@@ -4,6 +4,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from strangers_baselines import minutes
 from strangers_cases import (
     FULL_SCALE,
     HALF,
-    HELD,
     Study,
     consumer_grade,
     gradient,
@@ -30,27 +30,54 @@ from strangers_units import GRAVITY, UG, rng_of, spread
 from thermo_comp.fitting.priors import population
 from thermo_comp.fitting.windows import Model, Sets
 from thermo_comp.thermal.settings import DetectorSettings
+from thermo_comp.unit.calibration_file import load_calibration
 from thermo_comp.unit.columns import FINE_TAUS, Part, bank
 from thermo_comp.unit.functions import Polynomial
 
 HEADER = 'time_s,accel_x,accel_y,accel_z,temperature_board,temperature_case'
 PARTS_S = np.array([520.0, 910.0, 1400.0])
+MEMS_SCALE = {'full_scale': 32767.0}
+FACES = np.vstack((np.eye(3), -np.eye(3)))
+#: Held-out ramps of strangers_cases.py, with soaks of 15 and 30 min instead of 40 to 50 min.
+HELD = program(12, 20, (31, 0.7, 30), (17, 1.5, 15)), program(30, 20, (8, 1.2, 30), (24, 0.6, 15))
 SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
-def study_of(name, n=9, corners=HALF, **given):
-    """Record a unit of navigation grade in n positions, and two other positions to judge it."""
-    rng = rng_of(name)
-    unit = navigation(rng, **given)
-    bags = positions(unit, corners, spread(n, rng), rng)
-    return unit, Study('', bags, one_test(positions(unit, HELD, spread(2, rng), rng)), FULL_SCALE)
+def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
+    """Record a unit in positions, a number or directions, and two other positions to judge it."""
+    rng = rng_of(*name)
+    unit = grade(rng, **given)
+    is_mems = grade is not navigation
+    # At 10 Hz the noise of a MEMS is as large as a count, so that rounding leaves no bias.
+    keys, options = ({'rate_hz': 10.0}, MEMS_SCALE) if is_mems else ({}, FULL_SCALE)
+    up = spread(up, rng) if isinstance(up, int) else up
+    bags = positions(unit, corners, up, rng, **keys)
+    test = one_test(positions(unit, held, spread(2, rng), rng, **keys))
+    return unit, Study('', bags, test, options)
 
 
 @pytest.fixture(scope='module')
-def parts():
-    """Fit a unit with a part of another time constant on each axis."""
+def parts(tmp_path_factory, cli, equal_fits_once):
+    """Fit files of a unit with a part of another time constant on each axis, by the command."""
     unit, study = study_of('parts', part_s=PARTS_S)
-    return unit, study, strangers.fitted(study)
+    folder, tables = tmp_path_factory.mktemp('parts'), []
+    for bag in study.bags:
+        celsius = [np.interp(bag.time_s, *bag.temperatures[name]) for name in ('board', 'case')]
+        tables.append(folder / f'{bag.name}.csv')
+        np.savetxt(
+            tables[-1], np.column_stack((bag.time_s, bag.samples, *celsius)), '%.4f', ',',
+            header=HEADER, comments='',
+        )  # fmt: skip
+    asked = ('fit', *tables, '--gravity', GRAVITY, '-o', folder / 'unit.yaml', '--force')
+    printed = [cli(*asked, *more).stdout for more in ((), ('--json',))]
+    return unit, study, load_calibration(folder / 'unit.yaml'), printed
+
+
+@cache
+def soaked(grade):
+    """Fit a unit to soaks in 18 positions; also score the fit in ramps."""
+    unit, study = study_of('rests', 0, up=18, corners=SOAKS, grade=grade)
+    return unit, study, judged(strangers.fitted(study), study)
 
 
 def taus_of(calibration):
@@ -67,7 +94,7 @@ def judged(calibration, study):
 
 
 def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
-    unit, study, calibration = parts
+    unit, study, calibration, _ = parts
     # An error of 1 % of a time constant is 1 ug (10 ug/K, lag of 10 K).
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # 0.65 ug is the noise of a mean of a minute.
@@ -93,7 +120,7 @@ def test_thermometers_that_lag_board_and_case(sensors):
     # WHY: lags of parts alone left 1.2 times the noise, so that a bank of time constants was
     # chosen, which failed in another program: 57 ug, the claimed sd 2 ug.
     given = {'part_s': PARTS_S, 'thermometer_s': 60.0, 'sensors': sensors}
-    unit, study = study_of('slow thermometer', 12, **given)
+    unit, study = study_of('slow thermometer', **given)
     calibration = strangers.fitted(study)
     # 0.65 ug is the noise of a mean of a minute.
     assert judged(calibration, study).norm < 2.0
@@ -110,12 +137,10 @@ def test_thermometers_that_lag_board_and_case(sensors):
 
 def test_bags_that_only_warm_up_predict_a_cool_down():
     # WHY: lags were valid only in the direction of the bags' ramps, and left 180 ug.
-    rng = rng_of('only warm')
-    unit = navigation(rng, part_s=PARTS_S / 2.0)
-    bags = positions(unit, program(5, 20, (35, 0.8, 40)), spread(10, rng), rng)
-    held = positions(unit, program(33, 20, (10, 0.8, 40)), spread(2, rng), rng)
-    assert judged(strangers.fitted(Study('', bags, {}, FULL_SCALE)),
-                  Study('', (), one_test(held), FULL_SCALE)).norm < 2.0  # fmt: skip
+    warm, cool = program(5, 20, (35, 0.8, 40)), program(33, 20, (10, 0.8, 40))
+    given = {'corners': warm, 'held': cool, 'part_s': PARTS_S / 2.0}
+    _, study = study_of('only warm', up=10, **given)
+    assert judged(strangers.fitted(study), study).norm < 2.0
 
 
 def test_a_noisy_sensor_in_one_warm_up():
@@ -133,11 +158,8 @@ def test_a_noisy_sensor_in_one_warm_up():
 def test_bags_of_one_warm_up_predict_another():
     # All bags have the same thaw, so the lags are functions of the board temperature.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
-    rng = rng_of('thaw')
-    unit = navigation(rng, part_s=PARTS_S / 4.0)
-    bags = positions(unit, thaw, spread(10, rng), rng)
-    held = positions(unit, program(-15.0, 10.0, (20.0, 20.0, 90.0)), spread(2, rng), rng)
-    study = Study('', bags, one_test(held), FULL_SCALE)
+    given = {'held': program(-15.0, 10.0, (20.0, 20.0, 90.0)), 'part_s': PARTS_S / 4.0}
+    _, study = study_of('thaw', up=10, corners=thaw, **given)
     calibration = strangers.fitted(study)
     assert {one.group for one in calibration.response if any(one.bias)} == {'part'}
     # 0.65 ug is the noise of a mean of a minute.
@@ -164,7 +186,7 @@ def test_a_curve_over_a_part_is_a_sum_of_columns():
 
 
 def test_one_thermometer_is_sufficient():
-    unit, study = study_of('parts', n=12, part_s=PARTS_S, sensors=('board',))
+    unit, study = study_of('parts', up=12, part_s=PARTS_S, sensors=('board',))
     calibration = strangers.fitted(study)
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     assert judged(calibration, study).norm < 2.0
@@ -188,8 +210,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 
 def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
-    bump = np.array([450.0, -400.0, 500.0])
-    _, study = study_of('bump', bump=bump, bump_c=17.0)
+    _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
     # The groups that a fit of all groups chooses take a third of its time.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
@@ -210,8 +231,10 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
                                      soaked_s=21600.0, soaked_c=20.0)  # fmt: skip
     for record in (*records, *tests):
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
-            setattr(record, name, getattr(record, name)[::5])
-    result = fit_and_correct(records, tests, full_scale=second_simulator.FULL_SCALE)
+            setattr(record, name, getattr(record, name)[::10])
+    # The groups of the unit's physics halve the time.
+    groups = ('curve', 'board', 'part', 'product', 'square')
+    result = fit_and_correct(records, tests, full_scale=FULL_SCALE['full_scale'], groups=groups)
     least, _ = second_simulator.floor_of(tests)
     assert errors(result.specific_force, result.sd, tests).norm < 2.0 * least
     stages = {(one.tau_s, one.second_tau_s) for one in result.calibration.response if one.tau_s}
@@ -223,85 +246,79 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
         assert any(tau == taus and second == seconds for tau, second in stages)
 
 
-@pytest.mark.parametrize(
-    ('grade', 'rate_hz', 'full_scale'),
-    [(consumer_grade, 10.0, 32767.0), (navigation, 0.5, 8388607.0)],
-)
-def test_soaks_determine_the_curve_by_their_norms(grade, rate_hz, full_scale):
+@pytest.mark.parametrize('grade', [consumer_grade, navigation])
+def test_soaks_determine_the_curve_by_their_norms(grade):
     # The board drifts by 0.01 K within a soak; 26 K between the soaks move the norms by milli-g.
-    rng = rng_of('rests', 0)
-    unit = grade(rng)
-    bags = positions(unit, SOAKS, spread(18, rng), rng, rate_hz=rate_hz)
-    held = positions(unit, HELD, spread(2, rng), rng, rate_hz=rate_hz)
-    study = Study('', bags, one_test(held), {'full_scale': full_scale})
-    score = judged(strangers.fitted(study), study)
-    means = [minutes(bag) for bag in held]
+    _, study, score = soaked(grade)
+    means = [minutes(bag) for bag in study.tests['']]
     forces = [strangers.scipy_baselines(study)['constants'](mean) for mean in means]
     # A part of the error remains, because soaks do not determine the lags in held-out ramps.
     assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
 
-@pytest.mark.parametrize('given', [{}, {'mounting_sd': 3e-4}])
-def test_six_faces_in_three_soaks(given):
+def test_six_faces_in_three_soaks():
     # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
     # unit with drifts of 10 mg left 40 mg. With a stated repeatability the fit divided by zero.
-    rng = rng_of('faces in soaks', 1)
-    unit = replace(consumer_grade(rng), misalignment=np.zeros(3))
-    faces = np.vstack((np.eye(3), -np.eye(3))).repeat(3, axis=0)
-    bags = positions(unit, SOAKS, faces, rng, rate_hz=10.0)
-    held = positions(unit, program(19.0, 90.0), spread(2, rng), rng, rate_hz=10.0)
-    study = Study('', bags, one_test(held), {'full_scale': 32767.0, **given})
-    # Means of 25 min have a noise of 4 ug; quanta of 0.5 mg add errors of some 40 ug.
-    assert judged(strangers.fitted(study), study).vector < 100.0
+    _, study = study_of(
+        'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
+        grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
+    )  # fmt: skip
+    for stated in ({}, {'mounting_sd': 3e-4}):
+        # Means of 25 min have a noise of 4 ug; quanta of 0.5 mg add errors of some 40 ug.
+        calibration = strangers.fitted(study, **stated)
+        assert judged(calibration, study).vector < 100.0
 
 
 def test_a_curve_between_two_soaks_is_claimed():
     # WHY: two soaks do not determine the powers of t; without these powers in the covariance the
     # claimed sd was 1/8 of the error.
-    rng = rng_of('two soaks')
-    unit = consumer_grade(rng)
-    bags = positions(unit, SOAKS[::2], spread(18, rng), rng, rate_hz=10.0)
-    held = positions(unit, program(19.0, 90.0), spread(3, rng), rng, rate_hz=10.0)
-    study = Study('', bags, one_test(held), {'full_scale': 32767.0})
+    given = {'held': program(19.0, 90.0), 'grade': consumer_grade}
+    _, study = study_of('two soaks', up=18, corners=SOAKS[::2], **given)
     assert judged(strangers.fitted(study), study).ratio < 2.0
 
 
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
     # WHY: with each axis vertical at a different temperature the error was 15 claimed sd.
-    rng = rng_of('confounded soaks')
-    unit = navigation(rng)
-    faces = np.vstack((np.eye(3), -np.eye(3), np.eye(3)))
-    bags = positions(unit, SOAKS, faces, rng)
-    held = positions(unit, HELD, spread(2, rng), rng)
-    study = Study('', bags, one_test(held), FULL_SCALE)
+    _, study = study_of('confounded soaks', up=np.vstack((FACES, np.eye(3))), corners=SOAKS)
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
 
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
     # WHY: left-out soaks do not contain lags, so their score rejected the columns of lags.
+    unit, alone, score = soaked(navigation)
     rng = rng_of('soaks and a ramp')
-    unit = navigation(rng)
-    ramps = positions(unit, HALF, spread(1, rng), rng)
-    soaked = positions(unit, SOAKS, spread(18, rng), rng)
-    held = positions(unit, HELD, spread(2, rng), rng)
-    alone = Study('', soaked, one_test(held), FULL_SCALE)
-    study = replace(alone, bags=(*soaked, replace(*ramps, name='ramps')))
+    (ramps,) = positions(unit, HALF, spread(1, rng), rng)
+    study = replace(alone, bags=(*alone.bags, replace(ramps, name='ramps')))
     calibration = strangers.fitted(study)
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.02)
-    assert judged(calibration, study).norm < 0.5 * judged(strangers.fitted(alone), alone).norm
+    assert judged(calibration, study).norm < 0.5 * score.norm
 
 
-@pytest.mark.parametrize('case', [soaks, third_node])
-def test_without_parts_or_ramps_the_fit_has_a_bank_of_lags(case):
-    # Soaks determine no time constant; a hidden node makes no axis a curve of one part.
-    study = next(case(0))
-    calibration = strangers.fitted(replace(study, bags=study.bags[:8]))
-    assert {term.tau_s for term in calibration.response if term.kind == 'board'} <= {*FINE_TAUS}
+def lags_of(calibration):
+    return {term.tau_s for term in calibration.response if term.kind == 'board'}
+
+
+def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
+    # A hidden node makes no axis a curve of one part.
+    study = next(third_node(0))
+    # The groups that a fit of all groups chooses take two thirds of its time.
+    groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
+    calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
+    assert lags_of(calibration) <= {*FINE_TAUS}
+
+
+def test_soaks_alone_do_not_tell_lags_or_a_loose_thermometer():
+    # Soaks determine no time constant. Nor do they show the lag of the board, so the gradient of
+    # a ramp does not indicate a fault.
+    study = next(soaks(1))
+    calibration = strangers.fitted(replace(study, bags=study.bags[:9]))
+    assert lags_of(calibration) <= {*FINE_TAUS}
+    assert calibration.rest_gradient_range_k is None
 
 
 def test_units_of_a_type_share_the_lags_of_the_bank(parts):
-    _, study, calibration = parts
+    _, study, calibration, _ = parts
 
     def sibling(k, ratio):
         terms = tuple(replace(term, tau_s=ratio * term.tau_s) for term in calibration.response)
@@ -311,34 +328,17 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     units = [sibling(k, ratio) for k, ratio in enumerate((0.93, 0.98, 1.02, 1.07))]
     mean = population(units)
     assert {term.tau_s for term in mean.response if term.tau_s} <= {*FINE_TAUS}
-    (bags,) = study.tests.values()
-    for bag in bags:
-        off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
-        # Lags of 10 K at 20 ug/K, 200 ug, differ by up to 7 % between the units.
-        assert np.sqrt(np.mean(off**2)) < 5.0 * UG
+    bag = study.tests[''][0]
+    off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
+    # Lags of 10 K at 20 ug/K, 200 ug, differ by up to 7 % between the units.
+    assert np.sqrt(np.mean(off**2)) < 5.0 * UG
 
 
-@pytest.mark.usefixtures('equal_fits_once')
-def test_fit_says_how_far_the_parts_lag(parts, tmp_path, cli):
-    unit, study, _ = parts
-    tables = []
-    for bag in study.bags:
-        celsius = [np.interp(bag.time_s, *bag.temperatures[name]) for name in ('board', 'case')]
-        tables.append(tmp_path / f'{bag.name}.csv')
-        np.savetxt(
-            tables[-1], np.column_stack((bag.time_s, bag.samples, *celsius)), '%.4f', ',',
-            header=HEADER, comments='',
-        )  # fmt: skip
-    asked = ('fit', *tables, '--gravity', GRAVITY, '-o', tmp_path / 'unit.yaml', '--force')
-    (line,) = (text for text in cli(*asked).stdout.splitlines() if 'its part' in text)
+def test_fit_says_how_far_the_parts_lag(parts):
+    unit, *_, (text, content) = parts
+    (line,) = (line for line in text.splitlines() if 'its part' in line)
     printed = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
-    content = json.loads(cli(*asked, '--json').stdout)
+    content = json.loads(content)
     assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
     assert printed == pytest.approx(content['part_lags_s'], abs=0.5)
     assert content['part_case_shares'] == [0.0, 0.0, 0.0]
-
-
-def test_soaks_alone_do_not_tell_a_loose_thermometer():
-    # Soaks do not show the lag of the board, so the gradient of a ramp does not indicate a fault.
-    study = next(soaks(1))
-    assert strangers.fitted(replace(study, bags=study.bags[:9])).rest_gradient_range_k is None

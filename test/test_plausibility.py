@@ -153,7 +153,7 @@ def in_its_chamber(preset, sensor):
     """Simulate a unit; return its readings as (stamp, whether of the case, degC)."""
     settings = SENSORS[sensor]
     unit = unit_preset(preset, 1).with_thermometers(
-        noise_sd=settings.noise_sd_c, quantum=settings.quantum_c
+        noise_sd=settings.noise_sd_c, quantum=settings.quantum_c, rate_hz=0.5
     )
     run = simulate(unit, rippled(parse_cyclogram('fast')), (0.0, 0.0, 1.0), rate_hz=0.02, seed=1)
     readings = [(int(s), 0, float(v)) for s, v in zip(run.board_stamp_ns, run.board, strict=True)]

@@ -4,8 +4,8 @@
 The detector on short runs: early, few false alarms, no missed ramps; long runs are in
 benchmarks/regime.py.
 
-All runs are seeded. The limits allow for the scatter of medians: that of 24 delays at 1 mK
-scatters by 1 s, that of 12 delays with coarse steps by 4 s.
+All runs are seeded. The limits allow for the scatter of medians: that of 12 delays at 1 mK
+scatters by 1.4 s, with coarse steps by 4 s.
 """
 
 import math
@@ -67,7 +67,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
 def headline():
     """Run the ramp of the requirement: 0.5 K/min behind 15 min, 1 Hz, after a soak."""
     return {
-        name: onsets(*sensor, 0.5, LAG_S, 12 if sensor[1] else 24, end_s=300.0, soak_s=1800.0)
+        name: onsets(*sensor, 0.5, LAG_S, 12, end_s=300.0, soak_s=1800.0)
         for name, sensor in SENSORS.items()
     }
 
@@ -134,10 +134,10 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_have_no_false_switches(sensor):
-    # At 0.05 switches an hour, two per opening, more than 2 openings in 15 h have p < 0.01.
+    # At 0.05 switches an hour, two per opening, more than 1 opening in 10 h has p < 0.03.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng([seed, 3])
         t = np.arange(0.0, 5.0 * 3600.0)
         drift = 0.01 / 60.0 * 5400.0 * (1.0 - np.exp(-t / 5400.0))
@@ -152,18 +152,18 @@ def test_soaks_have_no_false_switches(sensor):
         assert changes[0][1] == STATIC
         assert changes[0][0] < 2400.0
         n_openings += sum(regime == DYNAMIC for _, regime, _ in changes)
-    assert n_openings <= 2
+    assert n_openings <= 1
 
 
 def test_the_rate_of_false_alarms_is_that_of_the_setting():
     # The signal is noise without ripple, and 20 alarms an hour are permitted. Rice's formula
     # counts crossings, which come in groups and coincide between the filters, so it is an upper
-    # bound of separate alarms: 2000 in 100 h. The lower limit of the alarms shows that the
+    # bound of separate alarms: 1000 in 50 h. The lower limit of the alarms shows that the
     # detector is active.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
-    n = 100 * 3600
+    n = 50 * 3600
     sensor = Thermometer(settings)
     sensor.update(0, 20.0)
     sensor.update(1, 20.0)
@@ -175,7 +175,7 @@ def test_the_rate_of_false_alarms_is_that_of_the_setting():
         if test.update((k + 1) * SECOND_NS, sensor, 1.0) and k >= quiet_from:
             n_departures += 1
             quiet_from = k + 60
-    assert 100 < n_departures < 2000
+    assert 50 < n_departures < 1000
 
 
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])

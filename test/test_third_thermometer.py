@@ -71,7 +71,7 @@ def fitted(bags):
 def runs():
     unit = unit_with_a_lid()
     return [
-        simulate(unit, PROGRAM, up, rate_hz=2.0, temperature_rate_hz=0.5, seed=number)
+        simulate(unit, PROGRAM, up, rate_hz=2.0, temperature_rate_hz=0.25, seed=number)
         for number, up in enumerate(positions(4, 1))
     ]
 

@@ -41,15 +41,15 @@ def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
     unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
     compensator = Compensator(unit, UNCHECKED)
     corrected = []
-    for second in range(3000):
+    for second in range(2000):
         stamp = 10**12 + second * SECOND_NS
         # Readings scatter by a few mK: constant readings are those of a faulty thermometer.
         compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
-        if second < 2000:
+        if second < 1500:
             compensator.push('case', stamp, 19.0 + 2e-3 * (second % 5))
         corrected.append(compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2))
     # The gradient has an sd of 0.1 K, which is 3 counts, at 300 counts per m/s^2.
-    assert corrected[-1][0] == pytest.approx(corrected[1999][0], abs=0.01)
+    assert corrected[-1][0] == pytest.approx(corrected[1499][0], abs=0.01)
 
 
 def test_without_its_sensor_from_the_start_the_gradient_is_that_of_the_fit():
@@ -105,6 +105,8 @@ def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fa
             readings = {'board': 24.0, 'case': 25.0}
         for name, celsius in readings.items():
             compensator.push(name, stamp, celsius)
+        if second % 4:
+            continue
         row = compensator.process(stamp, per_kelvin * (of_part - 20.0), 0.0, 2943.0)
         if second >= 1800:
             errors.append(row[0])
