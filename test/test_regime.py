@@ -134,10 +134,10 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
 
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_soaks_have_no_false_switches(sensor):
-    # At 0.05 switches an hour, two per opening, more than 1 opening in 10 h has p < 0.03.
+    # At 0.05 switches an hour, two per opening, more than 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
-    for seed in range(2):
+    for seed in range(3):
         rng = np.random.default_rng([seed, 3])
         t = np.arange(0.0, 5.0 * 3600.0)
         drift = 0.01 / 60.0 * 5400.0 * (1.0 - np.exp(-t / 5400.0))
@@ -152,7 +152,7 @@ def test_soaks_have_no_false_switches(sensor):
         assert changes[0][1] == STATIC
         assert changes[0][0] < 2400.0
         n_openings += sum(regime == DYNAMIC for _, regime, _ in changes)
-    assert n_openings <= 1
+    assert n_openings <= 2
 
 
 def test_the_rate_of_false_alarms_is_that_of_the_setting():
