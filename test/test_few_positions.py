@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import strangers
-import strangers_cases
 from builders import source_of
 from position_helpers import GRAVITY, MG, START_NS, Rest
 from strangers_cases import HALF, Study, consumer_grade
@@ -181,42 +180,6 @@ def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
             bags.append(rest.source(name=f'{len(bags)}'))
     pulls = pulls_of(fit(bags, OPTIONS).calibration, -15.0, 15.0, slopes)
     assert (pulls < 3.0).all()
-
-
-@pytest.mark.parametrize('unit', [1, 2])
-def test_rests_in_one_pose_at_four_temperatures_show_the_drift_of_the_level_axes(unit):
-    # WHY: with a free attitude in each rest, the curve came from the warm-ups of the board, which
-    # the sensor follows with a lag: errors of 1 to 4 mg between the rests.
-    (study,) = strangers_cases.returned(unit)
-    calibration = strangers.fitted(study)
-    (held,) = study.tests['']
-    force = strangers.corrected(calibration, held).force
-    drift = force - strangers.minutes(held).force
-    drift -= np.nanmean(drift, axis=0)
-    # The rests are turned by 0.2 mrad RMS, 0.2 mg along each level axis; a curve through them is
-    # off by about as much. Tolerance: two standard deviations.
-    assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
-
-
-@pytest.mark.parametrize('unit', [3, 4])
-def test_rests_at_one_temperature_do_not_separate_the_slopes_of_bias_and_scale(unit):
-    # WHY: the thermometer's noise in rests at constant temperature looked like changes without an
-    # effect, and the drift of the one ramp went to the scale factors: 470 ppm/K instead of -36.
-    rng = strangers_cases.rng_of('bench beside a ramp', unit)
-    imu = consumer_grade(rng)
-    bench = strangers_cases.program(22.0, 5.0)
-    ups = [*strangers_cases.spread(14, rng), *strangers_cases.spread(3, rng)]
-    programs = [bench] * 14 + [strangers_cases.RETURNED] * 3
-    bags = [
-        record(imu, program, up, rng, name=f'{k}', rate_hz=10.0)
-        for k, (program, up) in enumerate(zip(programs, ups, strict=True))
-    ]
-    study = Study('', tuple(bags[:15]), strangers_cases.one_test(tuple(bags[15:])))
-    tests = {'': [strangers.minutes(bag) for bag in bags[15:]]}
-    score = strangers.scored(study, strangers.fitted(study), tests)['']
-    # One attitude leaves the slopes of the scale factors at their prior, so the error is that of
-    # three unknown slopes: its RMS in sd exceeds 1.9 in 1 % of all units.
-    assert score.ratio < 1.9
 
 
 def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
