@@ -64,9 +64,11 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     If positions differ in temperature by more than their temperatures change, the curve is that
     of the positions' means, unless drifts within the positions improve it on left-out data.
     """
+    if problem.options.prior is not None:
+        return _regress(windows, problem)
     if problem.options.model != 'golovach':
         windows = replace(windows, data=_constant_in(windows.data, _is_steady(windows)))
-    if problem.options.prior is not None or not _is_constant(windows, windows.data.position):
+    if not _is_constant(windows, windows.data.position):
         return _regress(windows, problem)
     # In a soak a lag of unknown size and the remaining drift of the temperature change the
     # readings by similar amounts, so only the norms of the positions determine the curve.
@@ -88,7 +90,9 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     """Fit the windows; `is_at_rest`: whether columns are constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
-    is_one_heated = len(distinct_directions(problem.up[_is_heated(windows)])) == 1
+    # A prior separates the drifts of bias and scale, also in one attitude.
+    is_heated = _is_heated(windows) if known is None else np.ones(len(problem.up), dtype=bool)
+    is_one_heated = len(distinct_directions(problem.up[is_heated])) == 1
     if options.model == 'golovach' or is_one_heated:
         # In one attitude a tilt of the support cannot be distinguished from a drift of the unit.
         # In the paper's model tilts would absorb errors of its two sets.

@@ -17,6 +17,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -255,7 +256,10 @@ class Point:
             is_nonlinear[places] = True
         for share in (1.0, 0.25, 0.06, 0.015, 0.004, 0.001):
             turned = self.moved(np.where(is_nonlinear, share * step, 0.0))
-            result = turned.moved(np.where(is_nonlinear, 0.0, turned.linear_step()))
+            # With an almost singular prior, as of many siblings, rounding can make the damped
+            # equations indefinite: then no fraction of the step is better.
+            with suppress(np.linalg.LinAlgError):
+                result = turned.moved(np.where(is_nonlinear, 0.0, turned.linear_step()))
             if result.energy <= energy:
                 break
         return result
