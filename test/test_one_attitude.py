@@ -24,6 +24,14 @@ def test_rests_in_one_pose_at_four_temperatures_show_the_drift_of_the_level_axes
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
 
 
+def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
+    # WHY: the fit of rests in one pose began with a smaller sd, at which a stated sd stayed.
+    (study,) = returned(1)
+    calibration = strangers.fitted(study, mounting_sd=0.01)
+    for axis in calibration.static.axes():
+        assert axis.residual_sd_m_s2 == pytest.approx(0.01)
+
+
 @pytest.mark.parametrize('unit', [3, 4])
 def test_rests_at_one_temperature_do_not_separate_the_slopes_of_bias_and_scale(unit):
     # WHY: the thermometer's noise in rests at constant temperature looked like changes without an

@@ -132,10 +132,12 @@ def rough_centre(means: Floats) -> Floats:
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
     # The sphere is accepted if the distances from its centre vary by less than 10 %, and if the
-    # readings are spread over the sphere, not over a small part of it.
+    # readings are spread over the sphere: their RMS distance from the mean is at least half of the
+    # radius (it is the radius for six faces, and 0.1 of it for readings within 6 degrees).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # There is a sphere through any four readings. The code at zero force is the same for all axes
-    # of an analog sensor, to some 20 %, while the axes of a unit in one pose read differently.
+    # There is a sphere through any four readings. The codes at zero force of an analog sensor's
+    # axes agree within 20 % of their mean (ADXL335 data sheet: 1.2 to 1.8 V), while the axes of a
+    # unit in one pose read differently.
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero

@@ -17,6 +17,7 @@ from .data_checks import POSITIONS_FOR_MISALIGNMENT, POSITIONS_NEEDED
 from .hyperparameters import Candidates
 from .initial_triad import (
     ConstantCalibration,
+    block_means,
     constant_calibration,
     position_means,
     white_noise_of,
@@ -151,7 +152,8 @@ def _is_steady(windows: ThermalWindows) -> Bools:
     (RMS), shape (n_positions,).
 
     The noise of the temperature would act as a change without a drift, as if the unit had no
-    thermal response in the attitudes of short rests.
+    thermal response in the attitudes of short rests. At three sd a ninth of the apparent change is
+    noise, and a slope would be that much too small.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]
@@ -165,9 +167,11 @@ def _is_steady(windows: ThermalWindows) -> Bools:
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
     Return the positions that show an effect of temperature, shape (n_positions,): with a change of
-    temperature, or with a mean temperature more than a tenth of the span from the median.
+    temperature, or with a mean temperature more than a tenth of the span from the median, so that
+    rests of a tumble in a room, whose temperature varies by some kelvins, do not count.
     """
-    mean = position_means(replace(windows.data, mean=windows.temperature[:, None]))[:, 0]
+    data = windows.data
+    mean = block_means(windows.temperature[:, None], data.weight, data.edges[:-1])[:, 0]
     is_apart = np.abs(mean - np.median(mean)) > 0.1 * np.ptp(windows.temperature)
     is_heated = is_apart | ~_is_steady(windows)
     return np.asarray(is_heated | ~is_heated.any())

@@ -256,8 +256,8 @@ class Point:
             is_nonlinear[places] = True
         for share in (1.0, 0.25, 0.06, 0.015, 0.004, 0.001):
             turned = self.moved(np.where(is_nonlinear, share * step, 0.0))
-            # With an almost singular prior, as of many siblings, rounding can make the damped
-            # equations indefinite: then no fraction of the step is better.
+            # With the prior of many siblings the damped equations are almost singular, and
+            # rounding can make them indefinite: then this fraction of the step is not tried.
             with suppress(np.linalg.LinAlgError):
                 result = turned.moved(np.where(is_nonlinear, 0.0, turned.linear_step()))
             if result.energy <= energy:

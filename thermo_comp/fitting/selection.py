@@ -126,9 +126,11 @@ class Growth:
         prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
         if self.regression.windows.is_one_pose:
             # A large sd would attribute the effect of the new columns to the rests: begin with
-            # small sd of attitudes and mountings, which the data increase.
-            least = float(min(prior.offset_sd, prior.sigma.mean()))
-            prior = replace(prior, pose_sd=0.1 * POSE_SD, offset_sd=least)
+            # small sd of attitudes and of mountings (unless it is stated), which the data increase.
+            prior = replace(prior, pose_sd=0.1 * POSE_SD)
+            if prior.offset_scale > 0.0:
+                least = float(min(prior.offset_sd, prior.sigma.mean()))
+                prior = replace(prior, offset_sd=least)
         posterior = settle(self.regression, state, prior, candidates, 6)
         posterior = pruned_fit(self.regression, posterior, candidates, 8)
         return Trial(groups, score_of(self.regression, posterior), posterior, typical)
