@@ -126,7 +126,7 @@ class Growth:
         prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
         if self.regression.windows.is_one_pose:
             # A large sd would attribute the effect of the new columns to the rests: begin with
-            # small sd of attitudes and of mountings (unless it is stated), which the data increase.
+            # small sd, which the data increase, of attitudes and, unless stated, of mountings.
             prior = replace(prior, pose_sd=0.1 * POSE_SD)
             if prior.offset_scale > 0.0:
                 least = float(min(prior.offset_sd, prior.sigma.mean()))
