@@ -227,8 +227,16 @@ def _scatter(deviations: Floats, layout: ParameterLayout) -> Floats:
 
     The constants of a unit are taken as independent of each other and of the curves. With the
     correlations by chance between few units, one position would determine all constants. The
-    correlations of the curves are multiplied by 1 - share [1]_.
+    correlations of the curves are multiplied by 1 - share [1]_. A dynamic curve counts as its
+    difference from the static curve: most units have one curve for both sets, and smaller
+    correlations between two equal curves would make them two different curves.
     """
+    to_differences = np.eye(deviations.shape[1])
+    for block in (*layout.bias, *layout.scale):
+        n_common = min(block.dynamic - block.static, block.response - block.dynamic)
+        for coefficient in range(1, n_common):
+            to_differences[block.dynamic + coefficient, block.static + coefficient] = -1.0
+    deviations = deviations @ to_differences.T
     kind = np.zeros(deviations.shape[1], np.int64)
     levels = [[block.static, block.dynamic] for block in (*layout.bias, *layout.scale)]
     for number, places in enumerate((*levels, *range(layout.misalignment, len(kind))), 1):
@@ -243,7 +251,8 @@ def _scatter(deviations: Floats, layout: ParameterLayout) -> Floats:
     share = np.sum(variance, where=others) / max(np.sum(correlation**2, where=others), 1e-300)
     is_pair = (kind == 0) & ~np.eye(len(kind), dtype=bool)
     scatter[is_pair] *= 1.0 - np.clip(share, LEAST_SHARE, 1.0)
-    return scatter
+    to_curves = 2.0 * np.eye(len(kind)) - to_differences
+    return np.asarray(to_curves @ scatter @ to_curves.T)
 
 
 def _without_range(column: Column) -> Column:

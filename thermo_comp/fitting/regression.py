@@ -17,7 +17,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -256,10 +255,7 @@ class Point:
             is_nonlinear[places] = True
         for share in (1.0, 0.25, 0.06, 0.015, 0.004, 0.001):
             turned = self.moved(np.where(is_nonlinear, share * step, 0.0))
-            # With the prior of many siblings the damped equations are almost singular, and
-            # rounding can make them indefinite: then this fraction of the step is not tried.
-            with suppress(np.linalg.LinAlgError):
-                result = turned.moved(np.where(is_nonlinear, 0.0, turned.linear_step()))
+            result = turned.moved(np.where(is_nonlinear, 0.0, turned.linear_step()))
             if result.energy <= energy:
                 break
         return result
