@@ -186,18 +186,21 @@ def one_pose(number: int) -> Iterator[Study]:
 
 
 def returned(number: int) -> Iterator[Study]:
-    """Record rests of a MEMS unit at four temperatures, in one pose to 0.2 mrad."""
-    rng = rng_of('returned', number)
-    unit = consumer_grade(rng)
-    up = spread(1, rng)[0]
-    fit: tuple[Bag, ...] = ()
-    for celsius in (-15.0, 22.0, 45.0, 5.0):
-        turned = up + np.cross(2e-4 * rng.standard_normal(3), up)
-        # At 10 Hz the noise of a sample is a quantum, so that means resolve parts of a quantum.
-        fit += (record(unit, program(celsius, 30), turned / np.linalg.norm(turned), rng,
-                       name=f'{celsius:g} degC', rate_hz=10.0, is_cold=True),)  # fmt: skip
-    held = record(unit, RETURNED, up, rng, rate_hz=10.0)
-    yield Study('', fit, one_test((held,)), is_drift=True)
+    """Record rests of a MEMS unit at four temperatures, in one or two poses to 0.2 mrad."""
+    for label, poses in (('one pose', 1), ('two poses', 2)):
+        rng = rng_of('returned', number)
+        unit = consumer_grade(rng)
+        ups = [spread(1, rng)[0] for _ in range(poses)]
+        fit: tuple[Bag, ...] = ()
+        for celsius in (-15.0, 22.0, 45.0, 5.0):
+            for number_of_pose, up in enumerate(ups, 1):
+                turned = up + np.cross(2e-4 * rng.standard_normal(3), up)
+                # At 10 Hz the noise of a sample is a quantum: means resolve parts of a quantum.
+                fit += (record(unit, program(celsius, 30), turned / np.linalg.norm(turned), rng,
+                               name=f'{celsius:g} degC, pose {number_of_pose}', rate_hz=10.0,
+                               is_cold=True),)  # fmt: skip
+        held = record(unit, RETURNED, ups[0], rng, rate_hz=10.0)
+        yield Study(label, fit, one_test((held,)), is_drift=True)
 
 
 def soaks(number: int) -> Iterator[Study]:

@@ -34,9 +34,10 @@ from thermo_comp.fitting.unknowns import Noise, State, inverse_misalignment, tan
 POSE_SD = 1e-4
 
 
-def returned(n, rng):
-    """Draw attitudes about one pose whose three components are nearly equal, shape (n, 3)."""
-    up = np.array([0.577, 0.577, 0.578]) + POSE_SD * rng.standard_normal((n, 3))
+def returned(pose, rng):
+    """Draw attitudes about poses whose components are nearly equal in size, shape (n, 3)."""
+    poses = np.array([[0.577, 0.577, 0.578], [-0.577, 0.578, 0.577], [0.578, -0.577, 0.577]])
+    up = poses[pose] + POSE_SD * rng.standard_normal((len(pose), 3))
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
@@ -59,19 +60,20 @@ class Dense:
         """Add x to the mode found by `Regression`."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
-        pose = at.pose
+        pose, pose_of = at.pose, at.pose_of
+        up = at.up + np.einsum('pij,pj->pi', tangent_basis(at.up), x[layout.up])
         if len(pose):
-            basis = tangent_basis(pose[None])[0]
-            pose = pose + basis @ x[layout.pose]
-            pose = pose / np.linalg.norm(pose)
-            up = at.up + (x[layout.up] + x[layout.pose]) @ basis.T
-        else:
-            up = at.up + np.einsum('pij,pj->pi', tangent_basis(at.up), x[layout.up])
+            basis = tangent_basis(pose)
+            pose = pose + np.einsum('kij,kj->ki', basis, x[layout.pose])
+            pose = pose / np.linalg.norm(pose, axis=1, keepdims=True)
+            turn = x[layout.up] + x[layout.pose][pose_of]
+            turned = at.up + np.einsum('pij,pj->pi', basis[pose_of], turn)
+            up = np.where(pose_of[:, None] < 0, up, turned)
         return State(
             at.kappa + x[layout.kappa], at.bias + x[layout.bias],
             at.weights + padded[layout.weights], at.misalignment + x[layout.misalignment],
             up / np.linalg.norm(up, axis=1, keepdims=True), at.offset + x[layout.offset],
-            at.tilt + x[layout.tilt], at.start + x[layout.start], pose=pose,
+            at.tilt + x[layout.tilt], at.start + x[layout.start], pose=pose, pose_of=pose_of,
         )  # fmt: skip
 
     def residual(self, x):
@@ -102,9 +104,12 @@ class Dense:
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
         ]
         if len(state.pose):
-            from_pose = (state.up - state.pose) @ tangent_basis(self.at.state.pose[None])[0]
-            # The common pose has a prior sd of 1 rad about the mode.
-            parts += [from_pose.ravel() / prior.pose_sd, x[self.at.layout.pose]]
+            posed = state.pose_of[state.pose_of >= 0]
+            basis = tangent_basis(self.at.state.pose)[posed]
+            change = state.up[state.pose_of >= 0] - state.pose[posed]
+            from_pose = np.einsum('pi,pij->pj', change, basis)
+            # Each pose has a prior sd of 1 rad about the mode.
+            parts += [from_pose.ravel() / prior.pose_sd, x[self.at.layout.pose].ravel()]
         for weights, sd in zip(state.weights, prior.column_sd, strict=True):
             parts.append((weights[:, sd > 0.0] / sd[sd > 0.0]).ravel())
         return np.concatenate(parts)
@@ -122,28 +127,29 @@ class Dense:
 
 @pytest.fixture(
     scope='module',
-    params=[(1, False), (4, False), (1, True)],
-    ids=['a position per bag', 'up to 4', 'one pose'],
+    params=[(1, ()), (4, ()), (1, (0,) * 10), (1, (0,) * 5 + (1,) * 4 + (-1,))],
+    ids=['a position per bag', 'up to 4', 'one pose', 'two poses'],
 )
 def solved(request):
-    n_positions, is_one_pose = request.param
+    n_positions, pose_of = request.param
     rng = np.random.default_rng(5)
     # The table draws an initial state per position; positions of one bag share one state, here 0.
     truth = Truth(
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
-        offset_sd=2.0 * MICRO, tilt_sd=5e-7 if is_one_pose else 5e-6,
+        offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
     )  # fmt: skip
-    up = returned(10, rng) if is_one_pose else None
+    pose = np.array(pose_of) if pose_of else None
+    up = None if pose is None else returned(pose, rng)
     windows, up = table_of(truth, 10, rng, n_windows=12, step_s=400.0, up=up)
     weight = rng.uniform(0.3, 1.0, len(windows.time))
     bag = windows.position // n_positions
-    windows = replace(windows, weight=weight, bag=bag, is_one_pose=is_one_pose)
+    windows = replace(windows, weight=weight, bag=bag, pose=pose)
     regression, state = begin(windows, up)
-    # One pose does not determine the triad. A narrow prior of its scale and misalignment, and
-    # small tilts, keep their products small, which the regression omits from the derivatives.
+    # Two poses do not determine the triad. A narrow prior of its scale and misalignment, and small
+    # tilts, keep their products small, which the regression omits from the derivatives.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
-    narrow = narrow if is_one_pose else {}
+    narrow = narrow if pose_of else {}
     prior = prior_of(truth, start_share=0.7, pose_sd=POSE_SD, **narrow)
     return regression, prior, mode_of(regression, state, prior)
 

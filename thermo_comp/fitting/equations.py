@@ -101,7 +101,8 @@ class Equations(Series):
             nonlinear=np.zeros((3, self.n_coefficients)),
             radius=np.zeros(1),
             stretch=np.zeros((len(up), 1)),
-            pose=_unit_vector(up.mean(axis=0)) if self.windows.is_one_pose else np.zeros(0),
+            pose=_poses(up, self.windows.pose, self.windows.n_poses),
+            pose_of=np.zeros(0, np.int64) if self.windows.pose is None else self.windows.pose,
         )
 
     def norms(self, state: State) -> Floats:
@@ -130,7 +131,7 @@ class Equations(Series):
             n_tilts, n_starts = self.windows.tilt.shape[1], self.start_root.shape[1] * moved
             self._layouts[key] = lay_out(
                 *(used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces),
-                is_one_pose=self.windows.is_one_pose,
+                pose_of=self.windows.pose,
             )
         return self._layouts[key]
 
@@ -171,7 +172,7 @@ class Equations(Series):
             self._by_coefficients(state, layout, base, scaled),
             ([by_force] * layout.radius.size, by_radius),
             ([by_force] * 3, self._by_misalignment(state)),
-            ([by_force] * layout.pose.size, by_rotation[..., : layout.pose.size]),
+            ([by_force] * layout.pose.size, _by_poses(by_rotation, layout)),
             ([base.size + 3 + n_starts], 1.0),
         ]
         place = np.array([k for at, _ in unknowns for k in at], dtype=np.int64)
@@ -286,10 +287,9 @@ class Equations(Series):
         # The prior of attitudes is flat, so its precision is 0. An angular rate does not depend on
         # the attitude, and a precision of 1 keeps its equations regular.
         result[layout.up] = 0.0 if self.gravity else 1.0
-        if layout.pose.size:
-            result[layout.up] = prior.pose_sd**-2
-            # The prior of the common pose is almost flat: its sd is 1 rad.
-            result[layout.pose] = 1.0
+        result[layout.posed] = prior.pose_sd**-2
+        # The prior of a pose is almost flat: its sd is 1 rad.
+        result[layout.pose] = 1.0
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
@@ -300,7 +300,7 @@ class Equations(Series):
         else:
             result[layout.kappa] -= prior.scale_mean
         if layout.pose.size:
-            result[layout.up] = state.from_pose
+            result[layout.posed] = state.from_pose
         return result
 
 
@@ -335,11 +335,26 @@ def moved_by(state: State, step: Floats, layout: Layout) -> State:
     padded = np.append(step, 0.0)
     turn, pose = padded[layout.up], state.pose
     if layout.pose.size:
-        turn = turn + step[layout.pose]
-        pose = _unit_vector(pose + state.pose_tangents @ step[layout.pose])
+        is_posed = layout.pose_of >= 0
+        turn[is_posed] += step[layout.pose[layout.pose_of[is_posed]]]
+        turned = np.einsum('kij,kj->ki', state.pose_tangents, step[layout.pose])
+        pose = _unit_vector(pose + turned)
     up = _unit_vector(state.up + np.einsum('pij,pj->pi', state.tangents, turn))
     moved = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
     return without_inactive(replace(state, up=up, pose=pose, **moved), layout)
+
+
+def _poses(up: Floats, pose_of: Ints | None, n_poses: int) -> Floats:
+    """Return the mean attitude of the positions of each pose, shape (n_poses, 3)."""
+    means = [up[pose_of == k].mean(axis=0) for k in range(n_poses)]
+    return _unit_vector(np.array(means).reshape(-1, 3))
+
+
+def _by_poses(by_rotation: Floats, layout: Layout) -> Floats:
+    """Return the derivatives by rotations of the poses, shape (n_positions, 3, 2 n_poses)."""
+    is_in = layout.pose_of[:, None] == np.arange(len(layout.pose))
+    each = by_rotation[:, :, None, :] * is_in[:, None, :, None]
+    return np.asarray(each.reshape(*by_rotation.shape[:2], -1))
 
 
 def _unit_vector(vector: Floats) -> Floats:

@@ -142,13 +142,13 @@ def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
 
 def _pose_sd(posterior: Posterior) -> tuple[float, float]:
     """
-    Move the sd of the attitudes about a common pose towards its mode; return also the change of
+    Move the sd of the attitudes about their poses towards its mode; return also the change of
     its logarithm.
     """
     sd, layout = posterior.prior.pose_sd, posterior.layout
     if not layout.pose.size:
         return sd, 0.0
-    effective = posterior.determined[layout.up].sum()
+    effective = posterior.determined[layout.posed].sum()
     power = np.sum(posterior.state.from_pose**2)
     slope = np.log(sd / POSE_SD) / LOG_VARIANCE
     step = _toward(effective, power, sd, slope, 1.0 / LOG_VARIANCE)

@@ -94,12 +94,14 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     # A prior separates the drifts of bias and scale, also in one attitude.
     is_heated = _is_heated(windows) if known is None else np.ones(len(problem.up), dtype=bool)
     is_one_heated = len(distinct_directions(problem.up[is_heated])) == 1
-    if options.model == 'golovach' or is_one_heated:
-        # In one attitude a tilt of the support cannot be distinguished from a drift of the unit.
-        # In the paper's model tilts would absorb errors of its two sets.
+    has_poses = n_directions < POSITIONS_NEEDED and _is_constant(windows, data.position)
+    if (has_poses or n_directions == 1) and known is None and data.forces is None:
+        data = replace(data, pose=_poses_of(data, problem.up))
+    if options.model == 'golovach' or is_one_heated or data.n_poses:
+        # In one attitude a tilt of the support cannot be distinguished from a drift of the unit,
+        # and in a pose to which the unit is returned not from an error of the next attitude. In
+        # the paper's model tilts would absorb errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
-    if n_directions == 1 and data.n_positions > 1 and known is None and data.forces is None:
-        data = replace(data, is_one_pose=True)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
@@ -144,6 +146,24 @@ def _is_constant(windows: ThermalWindows, part: Ints) -> bool:
     t = windows.temperature
     within = within_positions(t[:, None], part)[:, 0]
     return bool(np.var(within) < np.var(t - within))
+
+
+def _poses_of(data: Windows, up: Floats) -> Ints | None:
+    """
+    Return the number of the pose of each position, -1 for a position without a pose, shape
+    (n_positions,); None if no position has a pose.
+
+    Positions of at least two turn-ons are in one pose if their attitudes `up`, shape
+    (n_positions, 3), are equal, or if the bags have only one attitude.
+    """
+    directions, result = distinct_directions(up), np.full(len(up), -1)
+    nearest = np.argmax(up @ directions.T, axis=1)
+    for k in range(len(directions)):
+        is_near = nearest == k
+        n_returns = len(np.unique(data.turn_on_of_position[is_near]))
+        if n_returns > 1 or (is_near.all() and len(up) > 1):
+            result[is_near] = result.max() + 1
+    return result if result.max() >= 0 else None
 
 
 def _is_steady(windows: ThermalWindows) -> Bools:

@@ -25,6 +25,7 @@ class Layout:
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
     weights, nonlinear: shapes (2, 3, m) and (3, 2 k); -1 for an inactive unknown
     own: unknowns of each position: up, stretch, offset, tilt, shape (n_positions, k)
+    pose_of: pose of each position, -1 for none
     bag: bag of each position
     n_unit, n: number of unknowns of the unit, and of all
     """
@@ -40,6 +41,7 @@ class Layout:
     radius: Ints
     stretch: Ints
     pose: Ints
+    pose_of: Ints
     own: Ints
     bag: Ints
     n_unit: int
@@ -57,8 +59,13 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Places of radius, misalignment and pose, which the axes share; the last of the unit."""
-        return np.concatenate((self.radius, self.misalignment, self.pose))
+        """Places of radius, misalignment and poses, which the axes share; the last of the unit."""
+        return np.concatenate((self.radius, self.misalignment, self.pose.ravel()))
+
+    @property
+    def posed(self) -> Ints:
+        """Places of the attitudes of the positions in a pose, shape (k, 2)."""
+        return self.up[self.pose_of >= 0]
 
     @cached_property
     def columns(self) -> Ints:
@@ -113,7 +120,7 @@ def lay_out(
     active: Bools,
     forces: Forces | None = None,
     *,
-    is_one_pose: bool = False,
+    pose_of: Ints | None = None,
 ) -> Layout:
     """
     Assign a place to every unknown, given the active columns of bias and scale, shape (2, m), and
@@ -135,7 +142,8 @@ def lay_out(
     nonlinear[:, active] = axis[:, n_linear:]
     radius = take(int(forces is not None and forces.radius_sd > 0.0))
     misalignment = take(3)
-    pose = take(2 * is_one_pose)
+    pose_of = np.full(len(bag_of_position), -1) if pose_of is None else pose_of
+    pose = take(int(pose_of.max()) + 1, 2)
     n_unit = n
     n_positions, n_bags = len(bag_of_position), int(bag_of_position.max()) + 1
     n_stretches = int(forces is not None and bool(forces.sd.any()))
@@ -148,6 +156,6 @@ def lay_out(
     up, stretch, offset, tilt = np.split(own, np.cumsum([2, n_stretches, 3]), axis=1)
     return Layout(
         *(axis, weights, misalignment, up, offset, tilt.reshape(n_positions, n_tilts, 2), start),
-        *(nonlinear, radius, stretch, pose),
+        *(nonlinear, radius, stretch, pose, pose_of),
         *(own, bag_of_position, n_unit, n),
     )

@@ -124,7 +124,7 @@ class Growth:
         initial_sd = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
         is_wanted = np.isin(self._names, groups)
         prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
-        if self.regression.windows.is_one_pose:
+        if self.regression.windows.n_poses:
             # A large sd would attribute the effect of the new columns to the rests: begin with
             # small sd, which the data increase, of attitudes and, unless stated, of mountings.
             prior = replace(prior, pose_sd=0.1 * POSE_SD)
@@ -225,7 +225,7 @@ class Growth:
         state = posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
-            # Attitudes and offsets of the rests of one pose absorb errors of an incomplete model.
+            # Attitudes and offsets of the rests in a pose absorb errors of an incomplete model.
             turned = regression.gravity * state.from_pose
             square += float(np.mean(state.offset**2) + np.mean(turned**2))
         slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)

@@ -60,7 +60,8 @@ class Windows:
         estimates them
     acts_on: axes that each column acts on, shape (m, 3); None for all
     turn_on: number of the turn-on of each bag, shape (n_bags,); None: each bag has one
-    is_one_pose: whether all bags were recorded in one pose, to which the unit was returned
+    pose: number of the pose to which the unit was returned in each position, -1 for none, shape
+        (n_positions,); None without such poses
     """
 
     position: Ints
@@ -81,7 +82,7 @@ class Windows:
     undisturbed: Floats | None = None
     acts_on: Bools | None = None
     turn_on: Ints | None = None
-    is_one_pose: bool = False
+    pose: Ints | None = None
 
     @property
     def n_positions(self) -> int:
@@ -134,6 +135,11 @@ class Windows:
         """Turn-on of each position."""
         bag = self.bag_of_position
         return bag if self.turn_on is None else self.turn_on[bag]
+
+    @property
+    def n_poses(self) -> int:
+        """Number of the poses to which the unit was returned."""
+        return 0 if self.pose is None else int(self.pose.max()) + 1
 
     @property
     def n_turn_ons(self) -> int:
@@ -200,8 +206,8 @@ class Prior:
     unseen_misalignment_sd: sd of the elements of M in the covariance, if the positions do not show
         them; `misalignment_sd` is then constant and smaller [rad]; 0 else
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
-    pose_sd: sd of each position's attitude about the common pose [rad]; without a common pose the
-        prior of the attitudes is flat
+    pose_sd: sd of the attitude of a position about its pose [rad]; the prior of other attitudes is
+        flat
     start_share: variance of the initial lag states / their variance in the node's prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive coefficient, shape (2 k,)
@@ -242,7 +248,8 @@ class State:
     nonlinear: nonlinear coefficients in the order of `Forces`, shape (3, 2 k)
     radius: relative error of the radius, shape (1,) or (0,)
     stretch: relative error of the known |f|, shape (n_positions, 1) or (n_positions, 0)
-    pose: the common pose of all positions, shape (3,), or (0,) without a common pose
+    pose: the poses to which the unit was returned, shape (n_poses, 3)
+    pose_of: pose of each position, -1 for none, shape (n_positions,); (0,) without poses
     """
 
     kappa: Floats
@@ -256,7 +263,8 @@ class State:
     nonlinear: Floats = field(default_factory=lambda: np.zeros((3, 0)))
     radius: Floats = field(default_factory=lambda: np.zeros(0))
     stretch: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    pose: Floats = field(default_factory=lambda: np.zeros(0))
+    pose: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    pose_of: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @cached_property
     def inverse(self) -> Floats:
@@ -266,23 +274,27 @@ class State:
     @cached_property
     def tangents(self) -> Floats:
         """
-        Two unit vectors perpendicular to each attitude, shape (n, 3, 2). With a common pose they
-        are those of the pose, projected, so that equal steps turn all attitudes alike.
+        Two unit vectors perpendicular to each attitude, shape (n, 3, 2). In a pose they are those
+        of the pose, projected, so that equal steps turn the pose and its attitudes alike.
         """
-        if not self.pose.size:
-            return tangent_basis(self.up)
-        along = self.up @ self.pose_tangents
-        return np.asarray(self.pose_tangents - self.up[:, :, None] * along[:, None])
+        result = tangent_basis(self.up)
+        if self.pose.size:
+            is_posed = self.pose_of >= 0
+            up, basis = self.up[is_posed], self.pose_tangents[self.pose_of[is_posed]]
+            result[is_posed] = basis - up[:, :, None] * np.einsum('pi,pij->pj', up, basis)[:, None]
+        return result
 
     @cached_property
     def pose_tangents(self) -> Floats:
-        """Two unit vectors perpendicular to the common pose, shape (3, 2)."""
-        return np.asarray(tangent_basis(self.pose[None])[0])
+        """Two unit vectors perpendicular to each pose, shape (n_poses, 3, 2)."""
+        return tangent_basis(self.pose)
 
     @property
     def from_pose(self) -> Floats:
-        """Rotation of each attitude from the common pose along its tangents, (n, 2) [rad]."""
-        return np.asarray((self.up - self.pose) @ self.pose_tangents)
+        """Rotation of each attitude in a pose from the pose, along its tangents, (k, 2) [rad]."""
+        posed = self.pose_of[self.pose_of >= 0]
+        change = self.up[self.pose_of >= 0] - self.pose[posed]
+        return np.asarray(np.einsum('pi,pij->pj', change, self.pose_tangents[posed]))
 
 
 def tangent_basis(up: Floats) -> Floats:
