@@ -51,12 +51,13 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 #: The longest test files, in order of duration, with which `make test` begins.
 _LONG = (
-    *('part_lags', 'cli_demo', 'fleet_run', 'gyroscope', 'fitting', 'faults', 'priors'),
-    *('fault_process', 'real_data', 'cli_help', 'report', 'few_positions', 'fit_api', 'record'),
-    *('regime', 'attacks', 'degenerate', 'correction', 'fault_files', 'docs', 'fitting_closing'),
-    *('node_parity', 'fitting_windows', 'api', 'fitting_change', 'judging', 'fitting_selection'),
-    *('judging_history', 'node_defence', 'node_startup', 'fitting_regression'),
-    *('third_thermometer', 'replay', 'allow', 'drivers', 'node_sources', 'player'),
+    *('part_lags', 'fleet_run', 'faults', 'few_positions', 'priors', 'fitting', 'cli_demo'),
+    *('cli_help', 'real_data', 'record', 'regime', 'report', 'gyroscope', 'one_attitude'),
+    *('drift_watch', 'drivers', 'docs', 'fault_process', 'field', 'fault_files', 'fleet_unit'),
+    *('degenerate', 'node_defence', 'fitting_selection', 'fitting_windows', 'node_parity'),
+    *('fit_api', 'fitting_closing', 'player', 'judging', 'attacks', 'node_sources', 'middleware'),
+    *('api', 'replay', 'properties', 'fitting_change', 'correction', 'acquisition', 'allow'),
+    *('fitting_regression', 'node_startup', 'third_thermometer', 'judging_history'),
 )
 
 
