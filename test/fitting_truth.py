@@ -3,6 +3,7 @@
 """Owns window tables with known truth for tests of the regression, without samples or sensors."""
 
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
     up = positions(n_positions, 3) if up is None else up
     time = step_s * (np.arange(n_windows) + 0.5)
     # The temperature goes up and down once in each bag, slightly different each time.
-    shapes = [_columns(time, step_s, 0.7 + 0.05 * p) for p in range(n_positions)]
+    shapes = [_columns(n_windows, step_s, 0.7 + 0.05 * p) for p in range(n_positions)]
     share = np.zeros((n_windows, len(GROUPS)))
     share[:, 2:4] = np.exp(-time[:, None] / TAUS)
     A = np.eye(3)
@@ -104,7 +105,9 @@ def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
     return windows, up
 
 
-def _columns(time, step_s, turns):
+@cache
+def _columns(n_windows, step_s, turns):
+    time = step_s * (np.arange(n_windows) + 0.5)
     end = time[-1] + 0.5 * step_s
     fine = np.linspace(0.0, end, 2000)
     t = 15.0 * np.sin(2.0 * np.pi * turns * fine / end)

@@ -6,7 +6,9 @@ is compared with the truth. Rows about the order of arrival are also sent over D
 process, whose output must be the same.
 """
 
+from copy import deepcopy
 from dataclasses import asdict, fields
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,26 +36,55 @@ OVER_DDS = (
 )
 
 
-def direct(events):
-    compensator = Compensator(unit(), CONFIG)
-    loaded = LoadedCalibration(compensator.calibration, 'unit.yaml', '')
-    before = dict.fromkeys((field.name for field in fields(Traffic)), 0)
-    before |= {'n_in': 0, 'n_failures': 0, **asdict(compensator.counters)}
-    before_ns, parts, reports = None, [], []
-    for lot in lots(events):
-        parts.append(corrected(lot, compensator))
+class Direct:
+    """A compensator with the node's findings, without DDS, which takes one lot after another."""
+
+    def __init__(self):
+        self.compensator = Compensator(unit(), CONFIG)
+        self.before = dict.fromkeys((field.name for field in fields(Traffic)), 0)
+        self.before |= {'n_in': 0, 'n_failures': 0, **asdict(self.compensator.counters)}
+        self.before_ns, self.parts, self.reports = None, [], []
+
+    def take(self, lot):
+        compensator, before = self.compensator, self.before
+        loaded = LoadedCalibration(compensator.calibration, 'unit.yaml', '')
+        self.parts.append(corrected(lot, compensator))
         counters, status = compensator.counters, compensator.status()
         counts = {**before, 'n_in': counters.n_in, **asdict(counters)}
         new = {name: n - before[name] for name, n in counts.items()}
         rate = None
-        if before_ns is not None and status.stamp_ns > before_ns and new['n_in']:
-            rate = new['n_in'] / (1e-9 * (status.stamp_ns - before_ns))
-        before, before_ns = counts, status.stamp_ns
+        if self.before_ns is not None and status.stamp_ns > self.before_ns and new['n_in']:
+            rate = new['n_in'] / (1e-9 * (status.stamp_ns - self.before_ns))
+        self.before, self.before_ns = counts, status.stamp_ns
         notes = list(findings_of(loaded, status, new, rate, silence_s=0.0))
-        reports.append((max((one for one, _ in notes), default=0), '; '.join(t for _, t in notes)))
-    stamps, table = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    covariance = table[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
-    return Heard(stamps, table[:, :3], covariance, reports)
+        texts = '; '.join(text for _, text in notes)
+        self.reports.append((max((level for level, _ in notes), default=0), texts))
+
+    def heard(self):
+        stamps, table = (np.concatenate(columns) for columns in zip(*self.parts, strict=True))
+        covariance = table[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
+        return Heard(stamps, table[:, :3], covariance, self.reports)
+
+
+@cache
+def undisturbed():
+    """Return each lot of the undisturbed bag with a copy of the run before it, then the end."""
+    run, result = Direct(), []
+    for lot in (*lots(bag()), []):
+        result.append((lot, deepcopy(run)))
+        if lot:
+            run.take(lot)
+    return result
+
+
+def direct(events):
+    """Run events; the run before the first lot with a fault is that of the undisturbed bag."""
+    given, known = list(lots(events)), undisturbed()
+    n = next((k for k, lot in enumerate(given) if lot != known[k][0]), len(given))
+    run = deepcopy(known[n][1])
+    for lot in given[n:]:
+        run.take(lot)
+    return run.heard()
 
 
 def wrong(row, heard):

@@ -60,9 +60,9 @@ def claimed(calibration):
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
 
-# A reading every four seconds suffices: a ramp of 1.5 K/min changes the board by 0.1 K in 4 s.
+# A reading every eight seconds suffices: a ramp of 1.5 K/min changes the board by 0.2 K in 8 s.
 OWN_LAGS, PAPER, PLAIN = (
-    triad(name, 1).with_thermometers(rate_hz=0.25) for name in ('own-lags', 'paper', 'plain')
+    triad(name, 1).with_thermometers(rate_hz=0.125) for name in ('own-lags', 'paper', 'plain')
 )
 
 

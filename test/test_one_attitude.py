@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import strangers
 from strangers_cases import RETURNED, Study, consumer_grade, one_test, returned
+from strangers_helpers import slow
 from strangers_units import GRAVITY, program, record, rng_of, spread
 
 
@@ -16,7 +17,7 @@ def test_rests_in_a_pose_at_four_temperatures_show_the_drift_of_the_level_axes(u
     # the sensor follows with a lag: errors of 1 to 4 mg between the rests.
     study = list(returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
-    (held,) = study.tests['']
+    (held,) = map(slow, study.tests[''])
     force = strangers.corrected(calibration, held).force
     drift = force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
@@ -46,8 +47,9 @@ def test_rests_at_one_temperature_do_not_separate_the_slopes_of_bias_and_scale(u
         record(imu, program, up, rng, name=f'{k}', rate_hz=10.0)
         for k, (program, up) in enumerate(zip(programs, ups, strict=True))
     ]
-    study = Study('', tuple(bags[:15]), one_test(tuple(bags[15:])))
-    tests = {'': [strangers.minutes(bag) for bag in bags[15:]]}
+    held = tuple(map(slow, bags[15:]))
+    study = Study('', tuple(bags[:15]), one_test(held))
+    tests = {'': [strangers.minutes(bag) for bag in held]}
     score = strangers.scored(study, strangers.fitted(study), tests)['']
     # One attitude leaves the slopes of the scale factors at their prior, so the error is that of
     # three unknown slopes: its RMS in sd exceeds 1.9 in 1 % of all units.

@@ -82,9 +82,8 @@ class Correction:
         self.K = np.array(K)[:, np.newaxis]
         self._full_scale = calibration.unit.full_scale
         self._gravity = calibration.gravity_m_s2
-        response, gyroscope = calibration.response, calibration.gyroscope
-        columns = (*response, *(gyroscope.response if gyroscope else ()))
-        self.memory = memory or memory_of(columns, calibration.sensors)
+        response = calibration.response
+        self.memory = memory or memory_of_unit(calibration)
         self.table = ColumnTable(
             response, self.memory, calibration.reference_temperature_c, self._span
         )
@@ -324,6 +323,13 @@ class Correction:
         parts[:, :, 1] = 2.0 * variance * bias * scale
         parts[:, :, 2] = variance * scale * scale
         return in_order(parts, 0)
+
+
+def memory_of_unit(calibration: Calibration) -> MemorySpec:
+    """Return the memory that the corrections of force and angular rate need."""
+    gyroscope = calibration.gyroscope
+    columns = (*calibration.response, *(gyroscope.response if gyroscope else ()))
+    return memory_of(columns, calibration.sensors)
 
 
 def is_sound(line: Floats) -> npt.NDArray[np.bool_]:

@@ -18,12 +18,13 @@ row for each pair in `BETWEEN`.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Final, TypeVar
 
 import numpy as np
 
-from ..typing import Floats
+from ..typing import Floats, Ints
 from .functions import in_order
 
 # Type of a quantity: the value of one sample, or an array of many samples.
@@ -52,30 +53,36 @@ class CovarianceMap:
 
     def __init__(self, misalignment: Sequence[float]) -> None:
         yx, zx, zy = misalignment
-        # Derivative of the force by the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
-        J = np.zeros((3, 4, 9))
-        J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0
-        J[2] += zx * J[0] + zy * J[1]
-        J[1] += yx * J[0]
-        J[1, 1, 6] = J[2, 1, 7] = J[2, 2, 8] = 1.0
-        sums = np.zeros((N_COEFFICIENTS, 9, 9))
-        elements = zip(combinations_with_replacement(range(3), 2), _TERMS, strict=True)
-        places = [(*axes, *term) for axes, terms in elements for term in terms]
-        for place, (k, m, i, j) in enumerate(places):
-            products = np.outer(J[k, i], J[m, j]) + np.outer(J[k, j], J[m, i]) * (i != j)
-            sums[place] = products + np.tril(products, -1).T
-        u, w = np.array([*_OF_AXES, *BETWEEN]).T
-        factors = sums[:, u, w]
-        # The row b of an axis is twice the covariance of its two errors.
-        factors[:, 1:9:3] /= 2.0
-        # Few rows have a factor in a sum: keep their places and factors only.
-        n = int((factors != 0.0).sum(axis=1).max())
-        self._places = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
-        self._factors = np.take_along_axis(factors, self._places, axis=1)[:, :, np.newaxis]
+        self._places, self._factors = _sums(yx, zx, zy)
 
     def coefficients(self, rows: Floats) -> Floats:
         """Return the coefficients of the elements, (40, n), for rows of shape (45, n)."""
         return in_order(self._factors * rows[self._places], 1)
+
+
+@lru_cache(maxsize=16)
+def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
+    """Return the places of the rows in the sum of each coefficient, and the rows' factors."""
+    # Derivative of the force by the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
+    J = np.zeros((3, 4, 9))
+    J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0
+    J[2] += zx * J[0] + zy * J[1]
+    J[1] += yx * J[0]
+    J[1, 1, 6] = J[2, 1, 7] = J[2, 2, 8] = 1.0
+    sums = np.zeros((N_COEFFICIENTS, 9, 9))
+    elements = zip(combinations_with_replacement(range(3), 2), _TERMS, strict=True)
+    places = [(*axes, *term) for axes, terms in elements for term in terms]
+    for place, (k, m, i, j) in enumerate(places):
+        products = np.outer(J[k, i], J[m, j]) + np.outer(J[k, j], J[m, i]) * (i != j)
+        sums[place] = products + np.tril(products, -1).T
+    u, w = np.array([*_OF_AXES, *BETWEEN]).T
+    factors = sums[:, u, w]
+    # The row b of an axis is twice the covariance of its two errors.
+    factors[:, 1:9:3] /= 2.0
+    # Few rows have a factor in a sum: keep their places and factors only.
+    n = int((factors != 0.0).sum(axis=1).max())
+    used = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
+    return used, np.take_along_axis(factors, used, axis=1)[:, :, np.newaxis]
 
 
 def grown(between: Floats, growth: Floats) -> Floats:
