@@ -276,7 +276,9 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
     """
     layout, prior, covariance = posterior.layout, posterior.prior, posterior.covariance.copy()
     mode = as_vector(posterior.state, layout)[: layout.n_unit]
-    is_kept = candidates.fixed | candidates.forced
+    # A column of the scale with a fixed sd can explain the drift of a column of the bias, so the
+    # evidence would drop the column of the bias.
+    is_kept = candidates.fixed | candidates.forced | candidates.fixed[1]
     droppable = np.argwhere((prior.column_sd > 0.0) & ~is_kept).tolist()
     column_sd, weight_sd = prior.column_sd.copy(), regression.weight_sd(prior)
     while droppable:

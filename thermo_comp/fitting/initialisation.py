@@ -108,7 +108,9 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if n_directions >= POSITIONS_NEEDED:
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
-    candidates = _candidates(windows, steepness, options, n_directions, is_one_heated)
+    candidates = _candidates(
+        windows, steepness, options, n_directions, is_bench=is_one_heated and n_directions > 1
+    )
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
         *others, widest = informative_priors(known, regression, state, windows.model, options)
@@ -186,14 +188,15 @@ def _is_steady(windows: ThermalWindows) -> Bools:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return the positions that show an effect of temperature, shape (n_positions,): with a change of
-    temperature, or with a mean temperature more than a tenth of the span from the median, so that
-    rests of a tumble in a room, whose temperature varies by some kelvins, do not count.
+    Return the positions that show an effect of temperature, shape (n_positions,): a position whose
+    temperature changes by more than a tenth of the span of all temperatures, or whose mean is this
+    far from the median. Rests of a tumble in a room, in which the room or the unit warms up by
+    some kelvins, do not count: their short drifts hardly separate bias and scale factor.
     """
-    data = windows.data
-    mean = block_means(windows.temperature[:, None], data.weight, data.edges[:-1])[:, 0]
-    is_apart = np.abs(mean - np.median(mean)) > 0.1 * np.ptp(windows.temperature)
-    is_heated = is_apart | ~_is_steady(windows)
+    t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
+    mean = block_means(t[:, None], weight, edges)[:, 0]
+    change = np.maximum.reduceat(t, edges) - np.minimum.reduceat(t, edges)
+    is_heated = np.maximum(np.abs(mean - np.median(mean)), change) > 0.1 * np.ptp(t)
     return np.asarray(is_heated | ~is_heated.any())
 
 
@@ -313,12 +316,13 @@ def _candidates(
     steepness: float,
     options: FitOptions,
     n_directions: int,
-    is_one_heated: bool,
+    *,
+    is_bench: bool,
 ) -> Candidates:
     """
     Return the columns that may take part, with the typical and largest sd of their weights.
 
-    `is_one_heated`: whether only one attitude shows an effect of temperature, see `_is_heated`
+    `is_bench`: whether one attitude of several shows an effect of temperature, see `_is_heated`
     """
     data = windows.data
     groups = np.array(data.groups)
@@ -329,10 +333,9 @@ def _candidates(
     steepest = _steepest(n_directions)
     slopes = _typical_slopes(steepness, steepest, options)
     fixed = np.zeros(parts.shape, dtype=bool)
-    if is_one_heated:
+    if is_bench:
         # One attitude cannot separate scale and bias: the curve of the scale keeps its prior.
-        parts[1] &= np.isin(groups, (CURVE, PART))
-        fixed[1] = parts[1]
+        fixed[1] = parts[1] & np.isin(groups, (CURVE, PART))
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
         # All columns of the paper's sets are kept; ten times the largest sd is a flat prior.
