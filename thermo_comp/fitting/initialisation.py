@@ -96,7 +96,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     is_one_heated = len(distinct_directions(problem.up[is_heated])) == 1
     has_poses = n_directions < POSITIONS_NEEDED and _is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
-        data = replace(data, pose=_poses_of(data, problem.up))
+        data = replace(data, pose=_poses_of(windows, problem.up))
     if options.model == 'golovach' or is_one_heated or data.n_poses:
         # In one attitude a tilt of the support cannot be distinguished from a drift of the unit,
         # and in a pose to which the unit is returned not from an error of the next attitude. In
@@ -150,21 +150,23 @@ def _is_constant(windows: ThermalWindows, part: Ints) -> bool:
     return bool(np.var(within) < np.var(t - within))
 
 
-def _poses_of(data: Windows, up: Floats) -> Ints | None:
+def _poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
     """
     Return the number of the pose of each position, -1 for a position without a pose, shape
     (n_positions,); None if no position has a pose.
 
-    Positions of at least two turn-ons are in one pose if their attitudes `up`, shape
-    (n_positions, 3), are equal, or if the bags have only one attitude.
+    `up`: attitudes, shape (n_positions, 3). The positions of an attitude are in one pose if the
+    unit was returned from another attitude between them, or if there is no other attitude.
     """
+    if len(up) == 1:
+        return None
     directions, result = distinct_directions(up), np.full(len(up), -1)
-    nearest = np.argmax(up @ directions.T, axis=1)
+    attitude = np.argmax(up @ directions.T, axis=1)
+    order = np.argsort([bag.start_ns for bag, _ in windows.rests], kind='stable')
     for k in range(len(directions)):
-        is_near = nearest == k
-        n_returns = len(np.unique(data.turn_on_of_position[is_near]))
-        if n_returns > 1 or (is_near.all() and len(up) > 1):
-            result[is_near] = result.max() + 1
+        n_visits = np.sum(np.diff((attitude[order] == k).astype(int), prepend=0) > 0)
+        if len(directions) == 1 or n_visits > 1:
+            result[attitude == k] = result.max() + 1
     return result if result.max() >= 0 else None
 
 
