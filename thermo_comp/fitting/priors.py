@@ -13,6 +13,7 @@ References
 ----------
 .. [1] J. Schaefer, K. Strimmer, "A shrinkage approach to large-scale covariance matrix estimation
    and implications for functional genomics", Stat. Appl. Genet. Mol. Biol. 4(1), 2005.
+.. [2] A. Gelman et al., "Bayesian Data Analysis", 3rd ed., CRC Press 2013, section 3.2.
 
 """
 
@@ -215,15 +216,16 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     vectors = np.array([vector for vector, _ in units])
     mean = vectors.mean(axis=0)
     deviations = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
-    scatter = (1.0 + 1.0 / len(vectors)) * _scatter(deviations, parameter_layout(template))
+    scatter = (1.0 + 1.0 / len(vectors)) * _scatter(deviations, parameter_layout(template), mean_K)
     # Parameters that none of the units determined keep the uncertainty of their own prior.
     scatter += np.mean([covariance for _, covariance in units], axis=0)
     return with_parameters(template, mean_K, mean, scatter)
 
 
-def _scatter(deviations: Floats, layout: ParameterLayout) -> Floats:
+def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     """
-    Return the covariance of units from their distances to the mean / sqrt(n - 1), (n, p).
+    Return the covariance of units from their distances to the mean / sqrt(n - 1), (n, p); `K`:
+    scale factors of the axes.
 
     The constants of a unit are taken as independent of each other and of the curves. With the
     correlations by chance between few units, one position would determine all constants. The
@@ -236,7 +238,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout) -> Floats:
         n_common = min(block.dynamic - block.static, block.response - block.dynamic)
         for coefficient in range(1, n_common):
             to_differences[block.dynamic + coefficient, block.static + coefficient] = -1.0
-    deviations = deviations @ to_differences.T
+    deviations = _with_common_scatter(deviations @ to_differences.T, layout, K)
     kind = np.zeros(deviations.shape[1], np.int64)
     levels = [[block.static, block.dynamic] for block in (*layout.bias, *layout.scale)]
     for number, places in enumerate((*levels, *range(layout.misalignment, len(kind))), 1):
@@ -253,6 +255,29 @@ def _scatter(deviations: Floats, layout: ParameterLayout) -> Floats:
     scatter[is_pair] *= 1.0 - np.clip(share, LEAST_SHARE, 1.0)
     to_curves = 2.0 * np.eye(len(kind)) - to_differences
     return np.asarray(to_curves @ scatter @ to_curves.T)
+
+
+def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
+    """
+    Return the deviations, multiplied so that each kind of parameter, such as a slope of the bias,
+    has the same scatter on all axes on which any unit has it. The scatter is that of the next unit
+    by Student's distribution [2]_, because three units can be alike by chance.
+    """
+    size = deviations.shape[1]
+    units, kinds = np.ones(size), [[*range(layout.misalignment, size)]]
+    for block, scale_factor in zip(layout.bias, np.abs(K), strict=True):
+        units[block.rows] = scale_factor
+    for blocks in (layout.bias, layout.scale):
+        kinds += map(list, zip(*(range(block.static, block.end) for block in blocks), strict=True))
+    result: Floats = deviations.copy()
+    for kind in kinds:
+        used = [place for place in kind if deviations[:, place].any()]
+        square = np.sum((deviations[:, used] / units[used]) ** 2, axis=0)
+        freedom = (len(deviations) - 1.0) * len(used)
+        if used:
+            growth = freedom / max(freedom - 2.0, 1.0)
+            result[:, used] *= np.sqrt(growth * square.mean() / square)
+    return result
 
 
 def _without_range(column: Column) -> Column:

@@ -354,11 +354,15 @@ class Regression(Equations):
 
 
 def _damped(normal: Normal, layout: Layout) -> Normal:
-    """Damp the nonlinear unknowns of normal equations by a factor on their diagonal."""
+    """
+    Hold the nonlinear unknowns of normal equations to a millionth of their step, by a factor on
+    their diagonal. With a prior, which correlates the unknowns, a larger factor would exceed the
+    range of double precision.
+    """
     local, unit = normal.local.copy(), normal.unit.copy()
     at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
-    local[..., at, at] *= 1e9
+    local[..., at, at] *= 1e6
     end = unit.shape[-1] - 1
     at = [0, *range(end - len(layout.shared), end)]
-    unit[..., at, at] *= 1e9
+    unit[..., at, at] *= 1e6
     return Normal(local, unit)
