@@ -10,14 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import FitError
-from ..thermal.state import VAR_BOARD
-from ..typing import Bools, Floats, Ints
+from ..typing import Bools, Floats
+from . import rests
 from .coverage import distinct_directions, norm_columns
 from .data_checks import POSITIONS_FOR_MISALIGNMENT, POSITIONS_NEEDED
 from .hyperparameters import Candidates
 from .initial_triad import (
     ConstantCalibration,
-    block_means,
     constant_calibration,
     position_means,
     white_noise_of,
@@ -29,8 +28,8 @@ from .options import FitOptions
 from .priors import informative_priors, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import LAGS, Fit, fit_all, select
-from .unknowns import BIAS_SD, SCALE_SD, Prior, State, Windows, misalignment_scale
+from .selection import Fit, fit_all, select
+from .unknowns import BIAS_SD, SCALE_SD, Prior, State, misalignment_scale
 from .windows import CURVE, PART, ThermalWindows
 
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
@@ -68,13 +67,16 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     if problem.options.prior is not None:
         return _regress(windows, problem)
     if problem.options.model != 'golovach':
-        windows = replace(windows, data=_constant_in(windows.data, _is_steady(windows)))
-    if not _is_constant(windows, windows.data.position):
+        data, is_steady = windows.data, rests.is_steady(windows)
+        is_settled = is_steady & rests.is_without_drift(data, problem.start.scale)
+        is_settled &= rests.is_bench(windows, problem.up)
+        windows = replace(windows, data=rests.constant_in(data, is_steady, is_settled))
+    if not rests.is_constant(windows, windows.data.position):
         return _regress(windows, problem)
     # In a soak a lag of unknown size and the remaining drift of the temperature change the
     # readings by similar amounts, so only the norms of the positions determine the curve.
-    data = _constant_in(windows.data, np.ones(windows.data.n_positions, dtype=bool))
-    at_rest = replace(windows, data=replace(data, start=np.zeros_like(data.start)))
+    everywhere = np.ones(windows.data.n_positions, dtype=bool)
+    at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
     # A regression reports progress from 0.7 to 0.95; each of two regressions gets half the range.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
@@ -82,7 +84,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     if not is_better(fit.selected.score, of_drifts.selected.score):
         return fit
     has_curve = any(trial.is_chosen and CURVE in trial.groups for trial in fit.selected.trials)
-    if not has_curve or not _is_constant(windows, windows.data.bag):
+    if not has_curve or not rests.is_constant(windows, windows.data.bag):
         return of_drifts
     return of_drifts._replace(of_means=fit.posterior.state)
 
@@ -92,12 +94,11 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
     # A prior separates the drifts of bias and scale, also in one attitude.
-    is_heated = _is_heated(windows) if known is None else np.ones(len(problem.up), dtype=bool)
-    is_one_heated = len(distinct_directions(problem.up[is_heated])) == 1
-    has_poses = n_directions < POSITIONS_NEEDED and _is_constant(windows, data.position)
+    is_bench = known is None and rests.is_bench(windows, problem.up)
+    has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
-        data = replace(data, pose=_poses_of(windows, problem.up))
-    if options.model == 'golovach' or is_one_heated or data.n_poses:
+        data = replace(data, pose=rests.poses_of(windows, problem.up))
+    if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
         # In one attitude a tilt of the support cannot be distinguished from a drift of the unit,
         # and in a pose to which the unit is returned not from an error of the next attitude. In
         # the paper's model tilts would absorb errors of its two sets.
@@ -108,9 +109,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if n_directions >= POSITIONS_NEEDED:
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
-    candidates = _candidates(
-        windows, steepness, options, n_directions, is_bench=is_one_heated and n_directions > 1
-    )
+    candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
         *others, widest = informative_priors(known, regression, state, windows.model, options)
@@ -138,78 +137,6 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     )
     claimed = candidates.typical * (full / used)[:, np.newaxis]
     return Fit(windows, regression, selected, claimed)
-
-
-def _is_constant(windows: ThermalWindows, part: Ints) -> bool:
-    """
-    Whether temperatures change less in the parts, positions or bags, than from part to part;
-    `part`: number of the part of each window, (n,).
-    """
-    t = windows.temperature
-    within = within_positions(t[:, None], part)[:, 0]
-    return bool(np.var(within) < np.var(t - within))
-
-
-def _poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
-    """
-    Return the number of the pose of each position, -1 for a position without a pose, shape
-    (n_positions,); None if no position has a pose.
-
-    `up`: attitudes, shape (n_positions, 3). The positions of an attitude are in one pose if the
-    unit was returned from another attitude between them, or if there is no other attitude.
-    """
-    if len(up) == 1:
-        return None
-    directions, result = distinct_directions(up), np.full(len(up), -1)
-    attitude = np.argmax(up @ directions.T, axis=1)
-    order = np.argsort([bag.start_ns for bag, _ in windows.rests], kind='stable')
-    for k in range(len(directions)):
-        n_visits = np.sum(np.diff((attitude[order] == k).astype(int), prepend=0) > 0)
-        if len(directions) == 1 or n_visits > 1:
-            result[attitude == k] = result.max() + 1
-    return result if result.max() >= 0 else None
-
-
-def _is_steady(windows: ThermalWindows) -> Bools:
-    """
-    Return the positions whose temperatures change by less than three sd of the thermometers' noise
-    (RMS), shape (n_positions,).
-
-    The noise of the temperature would act as a change without a drift, as if the unit had no
-    thermal response in the attitudes of short rests. At three sd a ninth of the apparent change is
-    noise, and a slope would be that much too small.
-    """
-    data, model = windows.data, windows.model
-    lags = [column.group in LAGS and not column.power for column in model.columns]
-    celsius = np.column_stack((windows.temperature, windows.raw[:, lags]))
-    square = within_positions(celsius, data.position) ** 2
-    change = np.array([part.mean(axis=0).max() for part in np.split(square, data.edges[1:-1])])
-    noise = np.array([np.median(track.states[:, VAR_BOARD]) for track in windows.tracks])
-    return np.asarray(change < 9.0 * noise[data.bag_of_position])
-
-
-def _is_heated(windows: ThermalWindows) -> Bools:
-    """
-    Return the positions that show an effect of temperature, shape (n_positions,): a position whose
-    temperature changes by more than a tenth of the span of all temperatures, or whose mean is this
-    far from the median. Rests of a tumble in a room, in which the room or the unit warms up by
-    some kelvins, do not count: their short drifts hardly separate bias and scale factor.
-    """
-    t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
-    mean = block_means(t[:, None], weight, edges)[:, 0]
-    change = np.maximum.reduceat(t, edges) - np.minimum.reduceat(t, edges)
-    is_heated = np.maximum(np.abs(mean - np.median(mean)), change) > 0.1 * np.ptp(t)
-    return np.asarray(is_heated | ~is_heated.any())
-
-
-def _constant_in(data: Windows, position: Bools) -> Windows:
-    """Return the windows with columns that are constant in some positions, (n_positions,)."""
-    is_constant = position[data.position][:, np.newaxis]
-    means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
-    columns = np.where(is_constant, means[data.position], data.columns)
-    square, of_means = (np.mean(values**2, axis=0) for values in (data.columns, columns))
-    kelvins = data.kelvins * np.sqrt(of_means / np.where(square > 0.0, square, 1.0))
-    return replace(data, columns=columns, kelvins=kelvins)
 
 
 def initial_state(regression: Regression, start: ConstantCalibration, up: Floats) -> State:
@@ -324,7 +251,7 @@ def _candidates(
     """
     Return the columns that may take part, with the typical and largest sd of their weights.
 
-    `is_bench`: whether one attitude of several shows an effect of temperature, see `_is_heated`
+    `is_bench`: whether one attitude of several was heated, see `rests`
     """
     data = windows.data
     groups = np.array(data.groups)

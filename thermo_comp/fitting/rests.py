@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns what the rests of a test can show: whether temperatures and readings change in a rest, which
+attitudes were heated, and to which attitudes the unit was returned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..thermal.state import VAR_BOARD
+from ..typing import Bools, Floats, Ints
+from .coverage import distinct_directions
+from .initial_triad import block_means, white_noise_of, within_positions
+from .selection import LAGS
+from .unknowns import Windows
+from .windows import ThermalWindows
+
+
+def is_constant(windows: ThermalWindows, part: Ints) -> bool:
+    """
+    Whether temperatures change less in the parts, positions or bags, than from part to part;
+    `part`: number of the part of each window, (n,).
+    """
+    t = windows.temperature
+    within = within_positions(t[:, None], part)[:, 0]
+    return bool(np.var(within) < np.var(t - within))
+
+
+def is_bench(windows: ThermalWindows, up: Floats) -> bool:
+    """Whether one attitude of several shows an effect of temperature; `up`: attitudes, (n, 3)."""
+    n_heated = len(distinct_directions(up[_is_heated(windows)]))
+    return n_heated == 1 and len(distinct_directions(up)) > 1
+
+
+def _is_heated(windows: ThermalWindows) -> Bools:
+    """
+    Return the positions that show an effect of temperature, shape (n_positions,): a position whose
+    temperature changes by more than a tenth of the span of all temperatures, or whose mean is this
+    far from the median. Rests of a tumble in a room, in which the room or the unit warms up by
+    some kelvins, do not count: their short drifts hardly separate bias and scale factor.
+    """
+    t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
+    mean = block_means(t[:, None], weight, edges)[:, 0]
+    change = np.maximum.reduceat(t, edges) - np.minimum.reduceat(t, edges)
+    is_heated = np.maximum(np.abs(mean - np.median(mean)), change) > 0.1 * np.ptp(t)
+    return np.asarray(is_heated | ~is_heated.any())
+
+
+def is_steady(windows: ThermalWindows) -> Bools:
+    """
+    Return the positions whose temperatures change by less than three sd of the thermometers' noise
+    (RMS), shape (n_positions,).
+
+    The noise of the temperature would act as a change without a drift, as if the unit had no
+    thermal response in the attitudes of short rests. At three sd a ninth of the apparent change is
+    noise, and a slope would be that much too small.
+    """
+    data, model = windows.data, windows.model
+    lags = [column.group in LAGS and not column.power for column in model.columns]
+    celsius = np.column_stack((windows.temperature, windows.raw[:, lags]))
+    square = within_positions(celsius, data.position) ** 2
+    change = np.array([part.mean(axis=0).max() for part in np.split(square, data.edges[1:-1])])
+    noise = np.array([np.median(track.states[:, VAR_BOARD]) for track in windows.tracks])
+    return np.asarray(change < 9.0 * noise[data.bag_of_position])
+
+
+def is_without_drift(data: Windows, scale: Floats) -> Bools:
+    """
+    Return the positions in which the drift of the readings of each axis is less than three times
+    the white noise of a window (RMS), shape (n_positions,).
+    """
+    drift = within_positions(data.mean / scale, data.position) * np.sqrt(data.weight)[:, None]
+    square = np.add.reduceat(drift**2, data.edges[:-1], axis=0) / np.diff(data.edges)[:, None]
+    return np.asarray((square <= (3.0 * white_noise_of(data, scale)) ** 2).all(axis=1))
+
+
+def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
+    """
+    Return the windows with columns that are constant in steady positions, (n_positions,), and with
+    lags that begin settled in settled positions, (n_positions,): initial lag states that fit the
+    noise of a rest would show its drift per kelvin in an attitude that was not heated.
+    """
+    in_steady = steady[data.position][:, np.newaxis]
+    means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
+    columns = np.where(in_steady, means[data.position], data.columns)
+    square, of_means = (np.mean(values**2, axis=0) for values in (data.columns, columns))
+    kelvins = data.kelvins * np.sqrt(of_means / np.where(square > 0.0, square, 1.0))
+    start = np.where(settled[data.position][:, np.newaxis], 0.0, data.start)
+    return replace(data, columns=columns, kelvins=kelvins, start=start)
+
+
+def poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
+    """
+    Return the number of the pose of each position, -1 for a position without a pose, shape
+    (n_positions,); None if no position has a pose.
+
+    `up`: attitudes, shape (n_positions, 3). The positions of an attitude are in one pose if the
+    unit was returned from another attitude between them, or if there is no other attitude.
+    """
+    if len(up) == 1:
+        return None
+    directions, result = distinct_directions(up), np.full(len(up), -1)
+    attitude = np.argmax(up @ directions.T, axis=1)
+    order = np.argsort([bag.start_ns for bag, _ in windows.rests], kind='stable')
+    for k in range(len(directions)):
+        n_visits = np.sum(np.diff((attitude[order] == k).astype(int), prepend=0) > 0)
+        if len(directions) == 1 or n_visits > 1:
+            result[attitude == k] = result.max() + 1
+    return result if result.max() >= 0 else None
