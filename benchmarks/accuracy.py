@@ -25,7 +25,7 @@ import numpy as np
 from triads import sibling, unit_of
 
 from thermo_comp.fitting import FitOptions, FitSource, fit
-from thermo_comp.fitting.priors import population
+from thermo_comp.fitting.population import population
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.recording.blocks import Block, Readings

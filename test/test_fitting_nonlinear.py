@@ -27,7 +27,7 @@ from thermo_comp.fitting.known_force import (
 )
 from thermo_comp.fitting.left_out import score_of
 from thermo_comp.fitting.nonlinear import Forces, choose, prior_sd, starting_sd
-from thermo_comp.fitting.priors import population
+from thermo_comp.fitting.population import population
 from thermo_comp.fitting.selection import Selected
 from thermo_comp.judging.evaluation import judge_bags
 from thermo_comp.recording.reader import inspect_recording

@@ -28,7 +28,7 @@ from strangers_cases import (
 from strangers_helpers import slow
 from strangers_units import GRAVITY, UG, rng_of, spread
 
-from thermo_comp.fitting.priors import population
+from thermo_comp.fitting.population import population
 from thermo_comp.fitting.windows import Model, Sets
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.calibration_file import load_calibration

@@ -13,7 +13,7 @@ from triads import sibling, triad
 from thermo_comp.cli.app import run
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, fit
-from thermo_comp.fitting.priors import _scatter, population
+from thermo_comp.fitting.population import _scatter, population
 from thermo_comp.fitting.selection import fit_all
 from thermo_comp.fitting.unknowns import Prior
 from thermo_comp.simulation.campaign import Position, parse_cyclogram, positions

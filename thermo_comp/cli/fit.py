@@ -159,7 +159,7 @@ def prior(
     Example:
       thermo_comp prior unit01.yaml unit02.yaml unit03.yaml -o type.yaml
     """
-    from ..fitting.priors import population
+    from ..fitting.population import population
     from ..unit.calibration_file import load_calibration, save_calibration
 
     check_output(output, CALIBRATION, overwrite=force, others=calibrations)

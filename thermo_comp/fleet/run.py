@@ -19,7 +19,7 @@ import numpy as np
 
 from .. import files
 from ..errors import FitError, ThermoCompError
-from ..fitting.priors import UNITS_NEEDED, population
+from ..fitting.population import UNITS_NEEDED, population
 from ..judging.verdicts import Verdict
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import load_calibration, save_calibration

@@ -1,0 +1,290 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the population of a type of unit: a calibration with the mean and the scatter, over the units,
+of the parameters relative to the scale factors.
+
+References
+----------
+.. [1] J. Schaefer, K. Strimmer, "A shrinkage approach to large-scale covariance matrix estimation
+   and implications for functional genomics", Stat. Appl. Genet. Mol. Biol. 4(1), 2005.
+.. [2] A. Gelman et al., "Bayesian Data Analysis", 3rd ed., CRC Press 2013, section 3.2.
+
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..errors import FitError
+from ..thermal.lags import Lag
+from ..typing import Floats
+from ..unit.calibration import POPULATION, Calibration, RegimeSet, parameter_layout
+from ..unit.columns import FINE_TAUS, Column
+from ..unit.posterior import ParameterLayout
+from ..unit.provenance import Provenance, Source
+from ..unit.terms import LINE
+from .assembly import blank_terms, parameters_of, with_parameters
+from .nonlinear import without_terms
+from .priors import constants_of, prior_columns
+from .thermal_ranges import union
+
+#: Smallest number of units of a population: fewer units do not determine the scatter.
+UNITS_NEEDED = 3
+#: Smallest share by which correlations of the curves are reduced, so that a covariance is regular.
+LEAST_SHARE = 0.01
+#: The keys of a column of a single lag of the board alone, and its shortest time constant [s].
+_ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
+_LEAST_BEHIND_S = 1.0
+
+
+def population(calibrations: Sequence[Calibration]) -> Calibration:
+    """
+    Make the prior of a type of unit from calibrations of at least three units.
+
+    Raises FitError if there are fewer calibrations, or if they differ in input, reference
+    temperature, sensors or curves.
+    """
+    if len(calibrations) < UNITS_NEEDED:
+        raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
+    # Nonlinear terms are left out: most units have none, because a centrifuge is needed to
+    # determine them.
+    calibrations = [
+        each if each.nonlinearity is None else without_terms(each) for each in calibrations
+    ]
+    first = calibrations[0]
+    if len({calibration.unit.serial for calibration in calibrations}) < len(calibrations):
+        raise FitError('two of the calibrations are of one unit: give one of each unit')
+    for calibration in calibrations:
+        serial, unit = calibration.unit.serial, calibration.unit
+        alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
+        if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
+            raise FitError(
+                f'{serial} differs from {first.unit.serial} in its input, reference temperature '
+                'or sensors: they are not of one type'
+            )
+        if _shape(calibration) != _shape(first):
+            raise FitError(
+                f'{serial} has other curves than {first.unit.serial}: fit both with the same model'
+            )
+    keys: dict[Column, list[Column]] = {}
+    for calibration in calibrations:
+        for column in prior_columns(calibration):
+            for common, _ in _on_common_lags(column):
+                keys.setdefault(_without_range(common), []).append(common)
+    columns = [
+        replace(
+            key,
+            range=union(column.range for column in columns),
+            rest_k=float(np.mean([column.rest_k for column in columns])),
+        )
+        for key, columns in keys.items()
+    ]
+    template = _template(calibrations, columns)
+    K = np.array([constants_of(calibration).scale for calibration in calibrations])
+    mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
+    units = [_relative_to(calibration, template, mean_K) for calibration in calibrations]
+    vectors = np.array([vector for vector, _ in units])
+    mean = vectors.mean(axis=0)
+    deviations = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
+    scatter = (1.0 + 1.0 / len(vectors)) * _scatter(deviations, parameter_layout(template), mean_K)
+    # Parameters that none of the units determined keep the uncertainty of their own prior.
+    scatter += np.mean([covariance for _, covariance in units], axis=0)
+    return with_parameters(template, mean_K, mean, scatter)
+
+
+def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
+    """
+    Return the covariance of units from their distances to the mean / sqrt(n - 1), (n, p); `K`:
+    scale factors of the axes.
+
+    The constants of a unit are taken as independent of each other and of the curves. With the
+    correlations by chance between few units, one position would determine all constants. The
+    correlations of the curves are multiplied by 1 - share [1]_. A dynamic curve counts as its
+    difference from the static curve: most units have one curve for both sets, and smaller
+    correlations between two equal curves would make them two different curves.
+    """
+    to_differences = np.eye(deviations.shape[1])
+    for block in (*layout.bias, *layout.scale):
+        n_common = min(block.dynamic - block.static, block.response - block.dynamic)
+        for coefficient in range(1, n_common):
+            to_differences[block.dynamic + coefficient, block.static + coefficient] = -1.0
+    deviations = _with_common_scatter(deviations @ to_differences.T, layout, K)
+    kind = np.zeros(deviations.shape[1], np.int64)
+    levels = [[block.static, block.dynamic] for block in (*layout.bias, *layout.scale)]
+    for number, places in enumerate((*levels, *range(layout.misalignment, len(kind))), 1):
+        kind[places] = number
+    scatter: Floats = deviations.T @ deviations * (kind[:, np.newaxis] == kind)
+    curves = np.flatnonzero((kind == 0) & (np.diag(scatter) > 0.0))
+    sd = np.sqrt(np.diag(scatter))
+    relative, n = deviations[:, curves] / sd[curves], len(deviations)
+    correlation = relative.T @ relative
+    variance = n / (n - 1.0) * ((relative**2).T @ relative**2 - correlation**2 / n)
+    others = ~np.eye(len(curves), dtype=bool)
+    share = np.sum(variance, where=others) / max(np.sum(correlation**2, where=others), 1e-300)
+    is_pair = (kind == 0) & ~np.eye(len(kind), dtype=bool)
+    scatter[is_pair] *= 1.0 - np.clip(share, LEAST_SHARE, 1.0)
+    to_curves = 2.0 * np.eye(len(kind)) - to_differences
+    return np.asarray(to_curves @ scatter @ to_curves.T)
+
+
+def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
+    """
+    Return the deviations, multiplied so that each kind of parameter, such as a slope of the bias,
+    has the same scatter on all axes on which any unit has it. The scatter is that of the next unit
+    by Student's distribution [2]_, because three units can be alike by chance.
+    """
+    size = deviations.shape[1]
+    units, kinds = np.ones(size), [[*range(layout.misalignment, size)]]
+    for block, scale_factor in zip(layout.bias, np.abs(K), strict=True):
+        units[block.rows] = scale_factor
+    for blocks in (layout.bias, layout.scale):
+        kinds += map(list, zip(*(range(block.static, block.end) for block in blocks), strict=True))
+    result: Floats = deviations.copy()
+    for kind in kinds:
+        used = [place for place in kind if deviations[:, place].any()]
+        square = np.sum((deviations[:, used] / units[used]) ** 2, axis=0)
+        freedom = (len(deviations) - 1.0) * len(used)
+        if used:
+            growth = freedom / max(freedom - 2.0, 1.0)
+            result[:, used] *= np.sqrt(growth * square.mean() / square)
+    return result
+
+
+def _without_range(column: Column) -> Column:
+    """Return a column without the fields that differ between units of a type: range and rest."""
+    return replace(column, range=(0.0, 1.0), rest_k=0.0)
+
+
+def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
+    """
+    Return columns of the bank whose sum is (about) a given column, each with its share.
+
+    The parts of two units of a type differ in their time constants. A lag is interpolated between
+    the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
+    a lag behind a temperature between board and sensor, and a lag with a lead are sums of single
+    lags. The powers of such a sum are approximated by the powers of one lag of the board that is
+    the same time behind in a long ramp.
+    """
+    tau, second, lag = column.tau_s, column.second_tau_s, column.source
+    is_line = isinstance(lag, Lag) and column.term.form is LINE
+    if not is_line and any(column.part[1:]):
+        behind_s = max(tau + second - column.lead_s, _LEAST_BEHIND_S)
+        return _on_common_lags(replace(column, tau_s=behind_s, **_ALONE))
+    summands: list[tuple[Column, float]] = []
+    if column.sensor_share:
+        of_board = replace(column, sensor_share=0.0)
+        of_sensor = replace(of_board, group='gradient_lag', kind='gradient_lag')
+        summands = [(of_board, 1.0), (of_sensor, -column.sensor_share)]
+    elif any(column.part[1:]) and isinstance(lag, Lag):
+        summands = [
+            (replace(column, tau_s=tau_s, **_ALONE), share)
+            for (_, tau_s), share in lag.singles.items()
+        ]
+    if summands:
+        return [
+            (common, share * part)
+            for summand, share in summands
+            for common, part in _on_common_lags(summand)
+        ]
+    if not isinstance(lag, Lag) or tau in FINE_TAUS:
+        return [(column, 1.0)]
+    at = bisect(FINE_TAUS, tau)
+    if not at:
+        share = tau / FINE_TAUS[0]
+        shortest = replace(column, tau_s=FINE_TAUS[0])
+        if column.term.is_temperature:
+            return [(replace(column, tau_s=0.0), 1.0 - share), (shortest, share)]
+        return [(shortest, share**column.term.order)]
+    if at == len(FINE_TAUS):
+        return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
+    # The shares are a cubic interpolation over the logarithm of the time constant, by Lagrange's
+    # polynomials.
+    first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
+    near = FINE_TAUS[first : first + 4]
+    result = []
+    for tau_s in near:
+        others = [other for other in near if other != tau_s]
+        share = math.prod(math.log(tau / other) / math.log(tau_s / other) for other in others)
+        result.append((replace(column, tau_s=tau_s), share))
+    return result
+
+
+def _relative_to(
+    calibration: Calibration, template: Calibration, mean_K: Floats
+) -> tuple[Floats, Floats]:
+    """Return a unit's parameters and covariance in `template`'s layout, relative to `mean_K`."""
+    if calibration.posterior is None:
+        raise FitError(
+            f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '
+            'of a population'
+        )
+    common_columns = [_without_range(column) for column in prior_columns(template)]
+    unit_columns = prior_columns(calibration)
+    terms = np.zeros((len(common_columns), len(unit_columns)))
+    for k, column in enumerate(unit_columns):
+        for common, share in _on_common_lags(column):
+            terms[common_columns.index(_without_range(common)), k] += share
+    scale = constants_of(calibration).scale
+    values, factor = parameters_of(calibration), np.ones(calibration.posterior.n_parameters)
+    layout, into = parameter_layout(calibration), parameter_layout(template)
+    for axis, (bias, relative) in enumerate(zip(layout.bias, layout.scale, strict=True)):
+        factor[bias.rows] = mean_K[axis] / scale[axis]
+        values[[relative.static, relative.dynamic]] = np.log(scale[axis] / mean_K[axis])
+    placed = np.zeros((into.n_parameters, len(values)))
+    others = np.arange(layout.nonlinear, len(values))
+    placed[others - len(values) + into.n_parameters, others] = 1.0
+    blocks = zip((*layout.bias, *layout.scale), (*into.bias, *into.scale), strict=True)
+    for old, new in blocks:
+        placed[new.static : new.response, old.static : old.response] = np.eye(
+            old.response - old.static
+        )
+        placed[new.response : new.end, old.response : old.end] = terms
+    placed = placed * factor
+    return placed @ values, placed @ calibration.posterior.covariance() @ placed.T
+
+
+def _shape(calibration: Calibration) -> list[tuple[str, int]]:
+    return [
+        (function.kind, function.n_free)
+        for regime in calibration.regime_sets()
+        for axis in regime.axes()
+        for function in (axis.bias_function, axis.scale_function)
+    ]
+
+
+def _template(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
+    """Return a calibration with the union of the ranges and the given columns, all weights 0."""
+    first = calibrations[0]
+    slow = [[axis.residual_sd_m_s2 for axis in each.static.axes()] for each in calibrations]
+    usual = np.median(slow, axis=0).tolist()
+    regimes = []
+    for each in zip(*(calibration.regime_sets() for calibration in calibrations), strict=True):
+        x, y, z = (
+            replace(axis, residual_sd_m_s2=sd)
+            for axis, sd in zip(each[0].axes(), usual, strict=True)
+        )
+        temperatures = union(regime.temperature_range_c for regime in each)
+        regimes.append(RegimeSet(temperatures, union(r.rate_range_k_min for r in each), x, y, z))
+    return replace(
+        first,
+        unit=replace(first.unit, serial=POPULATION),
+        static=regimes[0],
+        dynamic=regimes[1],
+        response=blank_terms(columns),
+        provenance=Provenance(
+            tool_version=__version__,
+            model=POPULATION,
+            sources=tuple(Source(calibration.unit.serial) for calibration in calibrations),
+        ),
+        evidence=(),
+        posterior=None,
+        gyroscope=None,
+    )
