@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits of units that were heated in one or two attitudes, with bags of another generator."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import strangers
@@ -16,6 +18,8 @@ from strangers_cases import (
 )
 from strangers_helpers import slow
 from strangers_units import GRAVITY, program, record, rng_of, spread
+
+from thermo_comp.fitting.rests import poses_of
 
 
 @pytest.mark.parametrize('poses', [1, 2])
@@ -32,6 +36,22 @@ def test_rests_in_a_pose_at_four_temperatures_show_the_drift_of_the_level_axes(u
     # The rests are turned by 0.2 mrad RMS, 0.2 mg along each level axis; a curve through them is
     # off by about as much. Tolerance: two standard deviations.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
+
+
+def test_a_pose_is_an_attitude_to_which_the_unit_was_returned():
+    # WHY: blocks of one long rest counted as returns, and the walk of the bias became a curve.
+    x, y = np.eye(3)[:2]
+
+    def poses(*up, start_ns=range(4)):
+        rests = [(SimpleNamespace(start_ns=start), None) for start in start_ns]
+        found = poses_of(SimpleNamespace(rests=rests), np.array(up))
+        return None if found is None else found.tolist()
+
+    assert poses(x, x, y, y) is None
+    assert poses(x, y, x, y) == [0, 1, 0, 1]
+    assert poses(x, y, y, x) == [0, -1, -1, 0]
+    assert poses(x, x, y, y, start_ns=(0, 2, 1, 3)) == [0, 0, 1, 1]
+    assert poses(x, x, x, x) == [0, 0, 0, 0]
 
 
 def test_a_stated_repeatability_of_mountings_holds_in_one_pose():

@@ -131,6 +131,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     share = np.sum(variance, where=others) / max(np.sum(correlation**2, where=others), 1e-300)
     is_pair = (kind == 0) & ~np.eye(len(kind), dtype=bool)
     scatter[is_pair] *= 1.0 - np.clip(share, LEAST_SHARE, 1.0)
+    # The inverse: where the differences subtract the static curve, it adds the static curve.
     to_curves = 2.0 * np.eye(len(kind)) - to_differences
     return np.asarray(to_curves @ scatter @ to_curves.T)
 
