@@ -78,15 +78,20 @@ def uneven(rng):
 
 
 def dense(position, time, weight, noise):
-    """Build the covariance: exponentially correlated noise in each position, and white noise."""
+    """Build the covariance: exponentially correlated noises in each position, and white noise."""
     same = position[:, None] == position
     distance = np.abs(time[:, None] - time)
-    slow = np.where(same, noise.ratio * np.exp(-distance / noise.time_s), 0.0)
-    return slow + np.diag(1.0 / weight)
+    times_s = [noise.time_s * 10.0**k for k in range(noise.n_times)]
+    slow = noise.ratio * sum(np.exp(-distance / time_s) for time_s in times_s)
+    return np.where(same, slow, 0.0) + np.diag(1.0 / weight)
 
 
 @pytest.mark.parametrize(
-    'noise', [Noise(), Noise(1e-6, 30.0), Noise(1e-2, 1e4), Noise(10.0, 3.0), Noise(1e3, 1e4)]
+    'noise',
+    [
+        *(Noise(), Noise(1e-6, 30.0), Noise(1e-2, 1e4), Noise(10.0, 3.0), Noise(1e3, 1e4)),
+        *(Noise(1e-2, 30.0, 3), Noise(10.0, 3.0, 4)),
+    ],
 )
 def test_products_and_determinant_are_those_of_the_dense_matrix(rng, noise):
     position, time, weight = uneven(rng)

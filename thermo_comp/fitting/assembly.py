@@ -113,7 +113,7 @@ def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[Regi
     temperatures = temperature_range(windows)
     rates = valid_range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
     # The sd of mounting offset plus slow noise of each axis [m/s^2].
-    slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.ratio).tolist()
+    slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.variance).tolist()
     lacks = lack_of_fit(fit, claim) if fit.regression.gravity else ((), ())
     result = []
     for k, (family, lack) in enumerate(zip(windows.model.sets.families, lacks, strict=True)):

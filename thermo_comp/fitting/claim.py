@@ -373,7 +373,7 @@ def _norm_evidence(
     else:
         errors += along @ point.deviation[: layout.n_unit]
         of_prior = solve_triangular(prior.informative.root, along.T, trans='T').T
-    noise = float(np.mean(prior.sigma**2)) * (1.0 / weight + prior.noise.ratio)
+    noise = float(np.mean(prior.sigma**2)) * (1.0 / weight + prior.noise.variance)
     known = of_prior @ of_prior.T
     if not of_turn_ons:
         variances, vectors = np.linalg.eigh(known + np.diag(noise))

@@ -235,15 +235,17 @@ def with_slow_noise(
         return replace(fitted, prior=trial)
 
     # The parameters absorb a part of the noise, so residuals underestimate the noise; the log
-    # evidence does not. Search the correlated noise (variance ratio and correlation time) in steps
-    # of a factor of 3, then of 3^(1/2) and 3^(1/4).
-    best = with_noise(estimated)
+    # evidence does not. Decide by log evidence between one correlation time and flicker noise, and
+    # search variance ratio and correlation time in steps of a factor of 3, then of 3^(1/2) and
+    # 3^(1/4).
+    flicker = estimated._replace(n_times=regression.whitener.n_flicker)
+    best = max(map(with_noise, (estimated, flicker)), key=lambda fit: fit.log_evidence)
     step = 3.0
     while step > 3.0**0.2:
-        ratio, time_s = best.prior.noise
+        ratio, time_s, n_times = best.prior.noise
         factors = (step, 1.0), (1.0 / step, 1.0), (1.0, step), (1.0, 1.0 / step)
         around = [
-            with_noise(Noise(ratio * by_ratio, time_s * by_time))
+            with_noise(Noise(ratio * by_ratio, time_s * by_time, n_times))
             for by_ratio, by_time in factors
             if regression.whitener.shows(time_s * by_time)
         ]

@@ -28,7 +28,7 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
     """Return the lack of fit of the static and of the dynamic regime; () for none."""
     windows, regression, selected = fit[:3]
     prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
-    noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.ratio)
+    noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.variance)
     claimed = drift_variance(regression, state, claim.layout, claim.covariance)
     excess = selected.score.drift**2 - noise - claimed
     near = [trial.posterior.state for trial in selected.trials if trial.is_near]

@@ -10,20 +10,24 @@ the regression.
 The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
 stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952,
-Annex B.4.3); a random walk is its limit for a long T. The innovations of a Kalman filter for white
-plus Gauss-Markov noise, divided by their standard deviations, are white and contain the same
-information, so samples and columns that are filtered alike can be treated by ordinary least
-squares [1]_.
+Annex B.4.3); a random walk is its limit for a long T. Flicker noise, the bias instability of a
+sensor, is the sum of such processes of equal variance, with the correlation times T, 10 T, 100 T
+and so on [2]_. The innovations of a Kalman filter for white plus Gauss-Markov noise, divided by
+their standard deviations, are white and contain the same information, so samples and columns that
+are filtered alike can be treated by ordinary least squares [1]_.
 
 References
 ----------
 .. [1] A. C. Harvey, Forecasting, structural time series models and the Kalman filter, Cambridge
    University Press (1989), section 3.4: likelihood by prediction errors.
+.. [2] M. S. Keshner, 1/f noise, Proceedings of the IEEE 70 (1982), pp 212 to 218: one relaxation
+   process for each decade of frequency gives a 1/f spectrum.
 
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -59,47 +63,55 @@ class Whitener:
             time_s *= 10.0**0.5
         #: The correlation time after the longest candidate, up to which a search may go [s].
         self._longest_s = time_s
+        #: Number of processes of flicker noise: the longest correlation time exceeds the length of
+        #: a position.
+        self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
     def shows(self, time_s: float) -> bool:
         """Whether a correlation time is within the range of the candidates."""
         return bool(self.times_s) and self.times_s[0] <= time_s <= self._longest_s
 
     def _innovations(
-        self, series: Floats, weight: Floats, ratio: Floats | float, time_s: Floats | float
+        self, series: Floats, weight: Floats, noises: Sequence[Noise]
     ) -> Iterator[tuple[Ints, Bools, Floats, Floats]]:
         """
-        Run the Kalman filter over series, shape (n, m), for one noise, or for k of shape (k, 1).
+        Run the Kalman filter over series, shape (n, m), for k noises of equally many processes.
 
         Yields for each step: window of each position, whether the position has it, innovations,
-        shape (..., n_positions, m), and their variances [sigma^2], shape (..., n_positions).
+        shape (k, n_positions, m), and their variances [sigma^2], shape (k, n_positions).
         """
-        variance, level = ratio, 0.0
+        times_s = np.array([[noise.times_s] for noise in noises])
+        # Stationary covariance of the processes, which are independent of each other.
+        still = np.array([[noise.ratio * np.eye(noise.n_times)] for noise in noises])
+        covariance = np.repeat(still, self._row.shape[1], axis=1)
+        level = np.zeros((*covariance.shape[:3], series.shape[1]))
         for rows, is_there, interval in zip(
             self._row, self._is_there, self._interval, strict=True
         ):
-            decay = np.exp(-interval / time_s)
-            variance = ratio + decay**2 * (variance - ratio)
-            total = variance + 1.0 / weight[rows]
+            decay = np.exp(-interval[:, None] / times_s)
+            covariance = still + decay[..., None] * decay[..., None, :] * (covariance - still)
+            shared = covariance.sum(axis=-1)
+            total = shared.sum(axis=-1) + 1.0 / weight[rows]
             level = level * decay[..., None]
-            innovation = series[rows] - level
+            innovation = series[rows] - level.sum(axis=-2)
             yield rows, is_there, innovation, total
-            gain = variance / total
-            level = level + gain[..., None] * innovation
-            variance = variance * (1.0 - gain)
+            gain = shared / total[..., None]
+            level = level + gain[..., None] * innovation[..., None, :]
+            covariance = covariance - gain[..., None] * shared[..., None, :]
 
     def filter(self, series: Floats, weight: Floats, noise: Noise) -> Floats:
         """Whiten series, shape (n, m)."""
         if noise.ratio <= 0.0:
             return np.asarray(series * (1.0 / np.sqrt(1.0 / weight))[:, None])
         result = np.empty_like(series)
-        for rows, is_there, innovation, total in self._innovations(series, weight, *noise):
-            result[rows[is_there]] = (innovation / np.sqrt(total)[:, None])[is_there]
+        for rows, is_there, innovation, total in self._innovations(series, weight, [noise]):
+            result[rows[is_there]] = (innovation[0] / np.sqrt(total[0])[:, None])[is_there]
         return result
 
     def log_determinant(self, weight: Floats, noise: Noise) -> float:
         """Return the log determinant of the noise covariance, in units of sigma^2."""
-        steps = self._innovations(np.empty((self._n, 0)), weight, *noise)
-        return float(sum(np.log(total[is_there]).sum() for _, is_there, _, total in steps))
+        steps = self._innovations(np.empty((self._n, 0)), weight, [noise])
+        return float(sum(np.log(total[0, is_there]).sum() for _, is_there, _, total in steps))
 
     def estimate(self, residual: Floats, weight: Floats) -> Noise:
         """
@@ -127,9 +139,8 @@ class Whitener:
 
     def _deviances(self, residual: Floats, weight: Floats, noises: Sequence[Noise]) -> Floats:
         """Return -2 times the profile log likelihood of each noise, shape (n_noises,)."""
-        ratio, time_s = np.array(noises).T[..., None]
         square, size = np.zeros((len(noises), 3)), np.zeros(len(noises))
-        steps = self._innovations(residual, weight, ratio, time_s)
+        steps = self._innovations(residual, weight, noises)
         for _, is_there, innovation, total in steps:
             square += np.sum((innovation**2 / total[..., None])[:, is_there], axis=1)
             size += np.log(total[:, is_there]).sum(axis=1)

@@ -160,19 +160,33 @@ class Windows:
 
 class Noise(NamedTuple):
     """
-    Gauss-Markov part of the noise.
+    The slow noise: one Gauss-Markov process; or flicker noise (bias instability), the sum of
+    several such processes of equal variance, each with ten times the correlation time of the last.
 
-    ratio: its stationary variance / white variance of a typical window; 0 without this part
-    time_s: its correlation time [s]
+    ratio: stationary variance of each process / white variance of a typical window; 0 without
+        this part
+    time_s: the shortest correlation time [s]
+    n_times: number of processes
     """
 
     ratio: float = 0.0
     time_s: float = 1.0
+    n_times: int = 1
+
+    @property
+    def times_s(self) -> list[float]:
+        """Correlation times of the processes [s]."""
+        return [self.time_s * 10.0**k for k in range(self.n_times)]
+
+    @property
+    def variance(self) -> float:
+        """Stationary variance of all processes / white variance of a typical window."""
+        return self.ratio * self.n_times
 
     @property
     def rate(self) -> float:
         """Rate of the equivalent random walk at short times / white sd [1/sqrt(s)]."""
-        return math.sqrt(2.0 * self.ratio / self.time_s)
+        return math.sqrt(sum(2.0 * self.ratio / time_s for time_s in self.times_s))
 
 
 @dataclass(frozen=True)
@@ -200,7 +214,7 @@ class Prior:
         scale (relative); 0 for an inactive column, shape (2, m)
     offset_sd: sd of the bias offset of each position and axis by mounting and turn-on [m/s^2]
     sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
-    noise: Gauss-Markov part of the noise
+    noise: slow noise
     offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0: offset_sd is constant
     misalignment_scale: misalignment_sd before the data [rad]
     unseen_misalignment_sd: sd of the elements of M in the covariance, if the positions do not show
