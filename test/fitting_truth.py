@@ -40,7 +40,7 @@ class Truth:
     misalignment: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
     start_sd: float = 0.0
     sigma: Floats = field(default_factory=lambda: np.full(3, 2.0 * MICRO))
-    #: Gauss-Markov noise of the bias, in addition to the white noise.
+    #: Slow noise of the bias, in addition to the white noise.
     noise: Noise = field(default_factory=Noise)
     offset_sd: float = 0.0
     #: Sd of the supports' tilts [rad per RMS of a temperature].
@@ -74,7 +74,7 @@ def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
     tilt = np.concatenate(shapes)[:, [0, 2]]
     tilt /= np.sqrt(np.mean(tilt**2, axis=0))
     tilts = truth.tilt_sd * rng.standard_normal((n_positions, 2, 2)) if truth.tilt_sd else None
-    decay = np.exp(-step_s / truth.noise.time_s)
+    decay = np.exp(-step_s / np.array(truth.noise.times_s))[:, None]
     for p, (columns, direction) in enumerate(zip(shapes, up, strict=True)):
         moved = columns.copy()
         moved[:, 2:4] += share[:, 2:4] * (truth.start_sd * rng.standard_normal(2))
@@ -86,11 +86,11 @@ def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
             across = tangent_basis(up)[p] @ tilts[p].T
             part = tilt[p * n_windows : (p + 1) * n_windows]
             clean += truth.kappa * GRAVITY * (part @ (A @ across).T)
-        slow = rng.standard_normal((n_windows, 3)) * np.sqrt(truth.noise.ratio)
+        slow = rng.standard_normal((n_windows, len(decay), 3)) * np.sqrt(truth.noise.ratio)
         for k in range(1, n_windows):
             slow[k] = decay * slow[k - 1] + np.sqrt(1.0 - decay**2) * slow[k]
         white = rng.standard_normal((n_windows, 3))
-        means.append(NOMINAL * (clean + (slow + white) * truth.sigma))
+        means.append(NOMINAL * (clean + (slow.sum(axis=1) + white) * truth.sigma))
     number = np.repeat(np.arange(n_positions), n_windows)
     columns = np.concatenate(shapes)
     steepest = np.array([1.0, 2.0 * np.abs(columns[:, 0]).max(), 1.0, 1.0, 1.0, 1.0])
