@@ -344,6 +344,19 @@ def slow_thermometer(number: int) -> Iterator[Study]:
     yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
 
 
+def flicker(number: int) -> Iterator[Study]:
+    """Give units a bias instability: flicker noise of 3 ug, and of 60 ug in a MEMS unit."""
+    for label, floor, grade, full_scale, rate_hz in (
+        ('navigation', 3.0, navigation, 8388607.0, 0.5),
+        ('MEMS', 60.0, consumer_grade, 32767.0, 10.0),
+    ):
+        rng = rng_of('flicker', label, number)
+        unit = replace(grade(rng), flicker=floor)
+        fit = positions(unit, HALF, spread(12, rng), rng, rate_hz=rate_hz)
+        held = positions(unit, HELD, spread(3, rng), rng, rate_hz=rate_hz)
+        yield Study(label, fit, one_test(held), {'full_scale': full_scale})
+
+
 def third_node(number: int) -> Iterator[Study]:
     """Add a node without a thermometer, and a bag in still air, fitted jointly or with a prior."""
     rng = rng_of('third-node', number)
@@ -449,6 +462,7 @@ CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'gravity': (gravity, 3),
     'cold-start': (cold_start, 3),
     'slow-thermometer': (slow_thermometer, 3),
+    'flicker': (flicker, 3),
     'third-node': (third_node, 3),
     'bench3': (bench3, 3),
     'quadratic': (quadratic, 100),

@@ -81,6 +81,8 @@ class Unit:
         Whether the converter carries its remainder on to the next sample.
     density : float
         White noise [ug/sqrt(Hz)].
+    flicker : float
+        Floor of the Allan deviation by flicker noise [ug].
     reading_sd, reading_step, reading_s : float
         Noise [K], rounding [K] and interval [s] of the thermometers.
     thermometer_s : float
@@ -111,6 +113,7 @@ class Unit:
     counts: float = 4e5
     carries: bool = True
     density: float = 5.0
+    flicker: float = 0.0
     reading_sd: float = 0.005
     reading_step: float = 0.001
     reading_s: float = 5.0
@@ -314,6 +317,8 @@ def record(
     bias = unit.bias_at(parts, (nodes[:, HIDDEN] - nodes[:, BOARD])[:, None])
     bias = bias + unit.gradient_bias * (nodes[:, CASE] - nodes[:, BOARD])[:, None]
     noise = unit.density * np.sqrt(rate_hz) * rng.standard_normal((n, 3))
+    if unit.flicker:
+        noise += flicker_noise(n, 1.0 / rate_hz, unit.flicker, rng)
     samples = ideal + UG * (bias + shift + noise)
     if unit.counts:
         samples = quantised(unit.counts * samples, unit.carries)
@@ -324,6 +329,19 @@ def record(
         value = np.interp(read, grid, node) + unit.reading_sd * rng.standard_normal(len(read))
         temperatures[sensor] = read, np.round(value / unit.reading_step) * unit.reading_step
     return Bag(name, stamps, samples, temperatures, force)
+
+
+def flicker_noise(n: int, interval_s: float, floor: float, rng: np.random.Generator) -> Floats:
+    """
+    Draw noise, shape (n, 3), of the one-sided spectrum ``h / f`` down to a quarter of the lowest
+    frequency of a recording. Its Allan deviation is ``floor = sqrt(2 ln(2) h)`` at all times.
+    """
+    whole = 4 * n
+    frequency = np.fft.rfftfreq(whole, interval_s)[1:, None]
+    density = floor**2 / (2.0 * np.log(2.0)) / frequency
+    parts = rng.standard_normal((2, len(frequency), 3))
+    spectrum = np.sqrt(density * whole / interval_s) / 2.0 * (parts[0] + 1j * parts[1])
+    return np.asarray(np.fft.irfft(np.vstack((np.zeros(3), spectrum)), axis=0)[:n])
 
 
 def lagged(node: Floats, tau_s: float) -> Floats:

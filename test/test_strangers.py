@@ -119,6 +119,15 @@ def test_a_carried_remainder_loses_no_part_of_a_count():
     assert not lost.any()
 
 
+def test_flicker_noise_has_a_flat_allan_deviation():
+    noise = units.flicker_noise(40_000, 2.0, 3.0, rng_of('flicker'))
+    for size in (10, 100, 1000):
+        means = noise.reshape(-1, size, 3).mean(axis=1)
+        deviation = np.sqrt(0.5 * np.mean(np.diff(means, axis=0) ** 2))
+        # Tolerance: 39 differences of three axes determine the longest deviation to 7 %.
+        assert deviation == pytest.approx(3.0, rel=0.2)
+
+
 @pytest.fixture
 def recorded(monkeypatch):
     """Replace recordings by notes of their programs."""
