@@ -135,6 +135,7 @@ LIMITS = {
     # The data do not show a wrong gravity, which the baselines also use: limit only the ratio.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
+    # The claim contains changes over times that are longer than the recordings.
     'flicker': Limit(low=0.5, high=1.4, unit=2.0),
     'slow-thermometer': Limit(),
     # A further bag of another environment must not increase the error by more than the noise of
