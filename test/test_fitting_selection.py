@@ -153,16 +153,18 @@ def test_noise_parameters_are_estimated(noisy):
 def test_flicker_noise_has_several_correlation_times():
     # WHY: with a single correlation time the initial lag states and the tilts explained the slower
     # processes, and the errors of the biases were 1.9 claimed sd.
-    truth = Truth(noise=Noise(4.0, 400.0, 3))
+    # With a shortest time below the candidates, 3 windows, the variance ratio was not searched.
     errors = []
-    for seed in (0, 5, 6):
+    for seed, time_s in ((0, 400.0), (5, 400.0), (6, 180.0)):
+        truth = Truth(noise=Noise(4.0, time_s, 3))
         windows, up = table_of(truth, 18, np.random.default_rng(seed), n_windows=100)
         regression, chosen = selected_of(truth, windows, up, ('curve', 'board'))
         noise = chosen.posterior.prior.noise
         assert noise.n_times == truth.noise.n_times
-        # The shortest correlation time is determined to 10 %; steps of the search are 30 %.
-        assert 0.6 < noise.ratio / truth.noise.ratio < 1.6
-        assert 0.6 < noise.time_s / truth.noise.time_s < 1.6
+        if regression.whitener.shows(time_s):
+            # The shortest correlation time is determined to 10 %; steps of the search are 30 %.
+            assert 0.6 < noise.ratio / truth.noise.ratio < 1.6
+            assert 0.6 < noise.time_s / truth.noise.time_s < 1.6
         errors.append(truth.errors(regression, chosen.posterior)['bias'])
     # The 1 % point of a chi-square of nine errors.
     assert np.sqrt(np.mean(np.square(errors))) < 1.55

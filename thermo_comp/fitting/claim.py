@@ -26,11 +26,11 @@ from scipy.linalg import solve_triangular
 
 from ..typing import Floats, Ints
 from .equations import as_vector
-from .hyperparameters import STUDENT_NU
+from .hyperparameters import CLEAR_GAIN, STUDENT_NU
 from .initial_triad import within_positions
 from .layout import Layout
 from .regression import Posterior, Regression
-from .selection import LAGS, TRIAL_GAIN
+from .selection import LAGS
 from .unknowns import InformativePrior, Prior, State
 from .windows import CURVE, PART
 
@@ -246,12 +246,12 @@ def _over_mountings(
 
     fits = solved(tried)
     # With a large mounting sd the attitudes absorb errors of the model: the log evidence relative
-    # to the mode may exceed that of the norms alone by at most `TRIAL_GAIN`.
+    # to the mode may exceed that of the norms alone by at most `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
-    weight = np.minimum(of_data, of_norms + TRIAL_GAIN)
+    weight = np.minimum(of_data, of_norms + CLEAR_GAIN)
     if n_rests > 1.0:
         # All rests of a mounting share its offset: only the means of mountings determine the sd.
         fits, weight = solved(n_rests**0.5 * tried), of_norms

@@ -19,6 +19,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +37,8 @@ STUDENT_NU = 4.0
 #: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
 #: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
+#: Gain in log evidence by which the less usual of two assumptions is preferred: odds of e^4 = 55.
+CLEAR_GAIN = 4.0
 #: Variance of the log-normal hyperpriors of the logarithm of an sd: the sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
 
@@ -235,26 +238,37 @@ def with_slow_noise(
         return replace(fitted, prior=trial)
 
     # The parameters absorb a part of the noise, so residuals underestimate the noise; the log
-    # evidence does not. Decide by log evidence between one correlation time and flicker noise, and
-    # search variance ratio and correlation time in steps of a factor of 3, then of 3^(1/2) and
-    # 3^(1/4).
-    flicker = estimated._replace(n_times=regression.whitener.n_flicker)
-    best = max(map(with_noise, (estimated, flicker)), key=lambda fit: fit.log_evidence)
-    step = 3.0
+    # evidence does not. All accelerometers have flicker noise, so a single correlation time needs
+    # more evidence.
+    kinds = (estimated._replace(n_times=n) for n in (1, regression.whitener.n_flicker))
+    single, best = (_likeliest(with_noise, regression.whitener.shows, noise) for noise in kinds)
+    if single.log_evidence > best.log_evidence + CLEAR_GAIN:
+        best = single
+    return settle(regression, best.state, best.prior, candidates)
+
+
+def _likeliest(
+    with_noise: Callable[[Noise], Posterior], shows: Callable[[float], bool], noise: Noise
+) -> Posterior:
+    """
+    Search variance ratio and correlation time of the largest log evidence, from a given noise, in
+    steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
+    """
+    best, step = with_noise(noise), 3.0
     while step > 3.0**0.2:
         ratio, time_s, n_times = best.prior.noise
         factors = (step, 1.0), (1.0 / step, 1.0), (1.0, step), (1.0, 1.0 / step)
-        around = [
+        around = (
             with_noise(Noise(ratio * by_ratio, time_s * by_time, n_times))
             for by_ratio, by_time in factors
-            if regression.whitener.shows(time_s * by_time)
-        ]
-        nearby = max(around, key=lambda posterior: posterior.log_evidence)
-        if nearby.log_evidence > best.log_evidence:
-            best = nearby
-        else:
+            if shows(time_s * by_time)
+        )
+        better = next((fit for fit in around if fit.log_evidence > best.log_evidence), None)
+        if better is None:
             step = step**0.5
-    return settle(regression, best.state, best.prior, candidates)
+        else:
+            best = better
+    return best
 
 
 def pruned_fit(

@@ -298,7 +298,8 @@ def _by_sections(
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
     """
-    Score the drift of left-out sections about the mean of the windows that stay in the fit.
+    Score the drift of left-out sections about the mean of the windows that stay in the fit, by one
+    Gauss-Newton step from the fit of all data.
 
     `folds`: the sections left out at once, in all positions; `is_within`: score only windows at
     temperatures that occur in the fit
@@ -309,10 +310,7 @@ def _by_sections(
     squares, counts = np.full(len(folds), np.nan), np.zeros(len(folds))
     for k, fold in enumerate(folds):
         point = regression.at(posterior.state, posterior.prior, products.without(fold))
-        # Two Gauss-Newton steps from the fit of all data suffice.
-        for _ in range(2):
-            point = point.moved(point.solution[0])
-        force = regression.force(point.state)
+        force = regression.force(point.moved(point.solution[0]).state)
         judged = gone = np.isin(windows.section, fold)
         if is_within:
             t = windows.columns[:, 0]

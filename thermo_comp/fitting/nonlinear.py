@@ -22,12 +22,12 @@ from ..unit.calibration import Calibration, parameter_layout
 from ..unit.nonlinearity import POWERS, Kind, Nonlinearity, NonlinearTerm, linearised, unit_of
 from ..unit.posterior import Posterior as FilePosterior
 from .data_checks import Finding, advice
-from .hyperparameters import LEAST_GAIN
+from .hyperparameters import CLEAR_GAIN, LEAST_GAIN
 from .left_out import Score, score_of
 from .options import FitOptions
 from .reduction import ReducedBag
 from .regression import Posterior, Regression
-from .selection import TRIAL_GAIN, Selected
+from .selection import Selected
 from .unknowns import State
 from .windows import ThermalWindows
 
@@ -212,7 +212,7 @@ def choose(
     fits = _TermFits(regression, selected, sd)
     odd = fits.term(forces.kinds.index('odd_square'))
     used = fits.thinned(frozenset(range(2 * k)) - odd)
-    if fits.loss(used | odd, odd) > TRIAL_GAIN:
+    if fits.loss(used | odd, odd) > CLEAR_GAIN:
         gain, error = fits.left_out_gain(used | odd, odd)
         used = fits.thinned(used | odd) if gain > error else used
     evidence: dict[int, tuple[float, float]] = {}

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..typing import Floats
 from .hyperparameters import (
+    CLEAR_GAIN,
     Candidates,
     downweigh,
     log_density,
@@ -29,8 +30,6 @@ from .regression import Posterior, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, PART, PART_SUMS, SET, ThermalWindows
 
-#: A group is tried if its largest possible gain in log evidence exceeds this: odds of e^4 = 55:1.
-TRIAL_GAIN = 4.0
 #: Groups that are linear in a temperature difference.
 GRADIENT = 'gradient'
 LAGS = ('gradient', 'board', 'gradient_lag')
@@ -171,7 +170,7 @@ class Growth:
     def lowest_degree(self, constants: Trial) -> Trial:
         """
         Fit the curve with its first column, and with more columns if they gain more than
-        `TRIAL_GAIN` in log density: norms alone are explained by many curves.
+        `CLEAR_GAIN` in log density: norms alone are explained by many curves.
         """
         prior = constants.posterior.prior
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
@@ -183,7 +182,7 @@ class Growth:
             for degree in range(1, int(number[-1]) + 1)
         )
         for curve in larger:
-            if log_density(curve.posterior) - log_density(chosen.posterior) > TRIAL_GAIN:
+            if log_density(curve.posterior) - log_density(chosen.posterior) > CLEAR_GAIN:
                 chosen = curve
         return chosen
 
@@ -199,7 +198,7 @@ class Growth:
             # Forward selection chooses at most 60 bend columns: a bump in the curve of an axis
             # needs 20.
             is_bend = self._names == BEND
-            knees = inactive.chosen(typical, is_bend, TRIAL_GAIN, 60)
+            knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
         # Some groups are tried together, because one effect has columns in all of them: the curve
         # of a part that lags by m, from the board or from the gradient, is
@@ -208,7 +207,7 @@ class Growth:
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
         gains = {groups: inactive.gain(typical, np.isin(self._names, groups)) for groups in sets}
-        likely = [groups for groups in sets if gains[groups] > TRIAL_GAIN]
+        likely = [groups for groups in sets if gains[groups] > CLEAR_GAIN]
         likely.sort(key=gains.__getitem__, reverse=True)
         tried = likely[:3]
         if chosen.groups == (CURVE,) and (SET,) in likely[3:]:
@@ -238,12 +237,12 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose the fit that is better on left-out data: begun with a small or with a large prior sd of
     mounting offsets. If neither is better, the large sd is taken only if its log density is larger
-    by `TRIAL_GAIN`. Mounting offsets and misalignments explain the norms of few positions equally
+    by `CLEAR_GAIN`. Mounting offsets and misalignments explain the norms of few positions equally
     well, but only misalignments predict the norm of another position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
-    is_likelier = evidence_gain > TRIAL_GAIN and not is_better(large.score, small.score)
+    is_likelier = evidence_gain > CLEAR_GAIN and not is_better(large.score, small.score)
     return large if is_likelier or is_better(small.score, large.score) else small
 
 
@@ -290,7 +289,7 @@ def select(
     trials += tried
     if chosen is not constants and not is_better(constants.score, chosen.score):
         more_evidence = log_density(chosen.posterior) - log_density(constants.posterior)
-        if not is_undecided(constants.score, chosen.score) or more_evidence < TRIAL_GAIN:
+        if not is_undecided(constants.score, chosen.score) or more_evidence < CLEAR_GAIN:
             chosen = constants
     candidates = replace(candidates, typical=chosen.typical)
     posterior, score = finish(regression, chosen.posterior, candidates)
@@ -313,8 +312,8 @@ def _grown(
         chosen = _best(chosen, tried)
     chosen, tried = growth.added(chosen, progress)
     trials += tried
-    is_without_bends = BEND in growth.free and BEND not in chosen.groups
-    if is_without_bends and not chosen.is_complete:
+    may_bend = BEND in growth.free and {'product', 'square'} & {*chosen.groups}
+    if may_bend and BEND not in chosen.groups and not chosen.is_complete:
         # A change of slope of a part is visible only in a model with the lag of this part, not in
         # a model whose products and squares approximate the lag. Further groups are added to a
         # model with bends if its drift is less than three times that of the chosen model.

@@ -69,7 +69,10 @@ class Whitener:
 
     def shows(self, time_s: float) -> bool:
         """Whether a correlation time is within the range of the candidates."""
-        return bool(self.times_s) and self.times_s[0] <= time_s <= self._longest_s
+        if not self.times_s:
+            return False
+        # Rounding must not exclude the shortest time.
+        return bool(0.999 * self.times_s[0] < time_s < 1.001 * self._longest_s)
 
     def _innovations(
         self, series: Floats, weight: Floats, noises: Sequence[Noise]
