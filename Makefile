@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 #
 # make demo   sets up .venv, plays the sample bag over DDS into the node, prints the table
-# make test   sets up .venv, runs the whole test suite
+# make test   sets up .venv, runs the test suite
+# make slow   the tests that `make test` leaves out: further units, long statistics (two minutes)
 # make lint   ruff, mypy --strict and the layering test
-# make nightly  the properties of test_properties.py, ten thousand examples each
+# make nightly  `make slow`, and the properties of test_properties.py with ten thousand examples
 # make oldest  the suite with the oldest versions that setup.py allows, in .venv-oldest
 # make fuzz   the fuzz targets, FUZZ_SECONDS (60) each
 # make bench  installs the package in .venv-bench and measures its speed (half an hour)
@@ -30,7 +31,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Keep compiled modules: otherwise each of the many processes of the tests compiles them again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint nightly oldest fuzz bench docs clean help
+.PHONY: demo test slow lint nightly oldest fuzz bench docs clean help
 .DEFAULT_GOAL := help
 
 help:
@@ -43,13 +44,16 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-test
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder $(PYTEST_ARGS)
 
+slow: $(VENV)/.installed-test
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n $(JOBS) $(PYTEST_ARGS)
+
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy --strict thermo_comp
 	$(BIN)/python -m pytest test/test_layers.py
 
-nightly: $(VENV)/.installed-test
+nightly: slow
 	$(BIN)/python -m pytest --hypothesis-profile=nightly -n $(JOBS) test/test_properties.py
 
 # Tests with the first release of the oldest series of each library that setup.py allows.

@@ -51,13 +51,13 @@ settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 #: The longest test files, in order of duration, with which `make test` begins.
 _LONG = (
-    *('part_lags', 'fleet_run', 'faults', 'few_positions', 'priors', 'fitting', 'cli_demo'),
-    *('cli_help', 'real_data', 'record', 'regime', 'report', 'gyroscope', 'one_attitude'),
-    *('drift_watch', 'drivers', 'docs', 'fault_process', 'field', 'fault_files', 'fleet_unit'),
-    *('degenerate', 'node_defence', 'fitting_selection', 'fitting_windows', 'node_parity'),
-    *('fit_api', 'fitting_closing', 'player', 'judging', 'attacks', 'node_sources', 'middleware'),
-    *('api', 'replay', 'properties', 'fitting_change', 'correction', 'acquisition', 'allow'),
-    *('fitting_regression', 'node_startup', 'third_thermometer', 'judging_history'),
+    *('fleet_run', 'faults', 'part_lags', 'priors', 'regime', 'fitting', 'few_positions'),
+    *('cli_help', 'record', 'fault_process', 'drivers', 'degenerate', 'one_attitude', 'gyroscope'),
+    *('report', 'node_defence', 'fitting_selection', 'fleet_unit', 'docs', 'fault_files'),
+    *('real_data', 'field', 'node_parity', 'attacks', 'fitting_regression', 'fit_api', 'replay'),
+    *('fitting_windows', 'properties', 'judging', 'report_figures', 'correction', 'middleware'),
+    *('judging_history', 'player', 'node_sources', 'fitting_closing', 'api', 'allow'),
+    *('acquisition', 'drift_watch', 'node_startup', 'third_thermometer', 'fitting_change'),
 )
 
 

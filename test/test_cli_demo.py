@@ -19,6 +19,7 @@ def needs_ros():
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 
+@pytest.mark.slow
 def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
     # The fits of the sample bags are shared with the README's test, so the demo runs here.
     import demo

@@ -131,6 +131,7 @@ def states_of(unit, rng, n=5):
     return tracker, collected
 
 
+@pytest.mark.slow
 def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_posterior(rng):
     # The corrections of random, correlated calibrations scatter as SlowUncertainty states.
     unit = replace(full_bank(rng), noise_density_m_s2_sqrt_hz=(1e-4,) * 3)

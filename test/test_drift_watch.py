@@ -48,6 +48,7 @@ def test_the_first_passage_follows_the_reflection_principle():
     assert walked(rate, bound, mean=51.0) == (0.0,) * 3
 
 
+@pytest.mark.slow
 def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
     # WHY: signed errors of opposite attitudes had cancelled: forecasts were 3 to 5 times too long.
     # WHAT: the times at which walks of known sd leave the tolerance lie in the printed interval.
@@ -63,7 +64,9 @@ def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
     assert 0.45 < min(ratios) < max(ratios) < 2.2
 
 
-@pytest.mark.parametrize('attitudes', [upright, in_any_attitude])
+@pytest.mark.parametrize(
+    'attitudes', [upright, pytest.param(in_any_attitude, marks=pytest.mark.slow)]
+)
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
     # The RMS error along gravity is 1.5 times the limit from day 20 to 34 and 0.6 times on other
     # days, with turn-ons of 5 ug and a disturbance on day 12. The logs end on different days.

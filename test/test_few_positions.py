@@ -47,6 +47,7 @@ def left_by(pair, **options):
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
 
 
+@pytest.mark.slow
 def test_two_positions_tell_the_thermal_response():
     # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine the sd to 6 %, and superfluous
     # columns may add 10 %. All 36 pairs of positions have a median of 1.3 ug (docs/accuracy.md).
@@ -147,6 +148,7 @@ def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
     assert (pulls < 3.0).all()
 
 
+@pytest.mark.slow
 def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_each_rest(rng):
     # WHY: the warm-up of the board, which the sensor does not follow, gave a slope of 0, and the
     # differences between the norms of 36 rests were taken for mountings that do not repeat.
@@ -170,6 +172,7 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
 
 
+@pytest.mark.slow
 def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
     # WHY: a curve from the drifts in the warm-ups was wrong by 7 claimed sd between the rests.
     # With this seed the error exceeds the claim of the drifts alone.
@@ -296,6 +299,7 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
     assert 2.5e-3 < fit(bags, OPTIONS).calibration.static.x.residual_sd_m_s2 < 1e-2
 
 
+@pytest.mark.slow
 def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
     # WHY: each of three recordings has a temperature of its own. The turn-ons were claimed as an
     # error of their mean alone, and the offsets of mountings as independent: the claimed variance

@@ -3,6 +3,7 @@
 """Fits through the public API: a knee in the curve, a thermometer on two topics."""
 
 import numpy as np
+import pytest
 
 import thermo_comp as tc
 
@@ -92,6 +93,7 @@ def sd_of_a_correction(unit):
     return np.sqrt(np.diag(last)) / MICRO_G
 
 
+@pytest.mark.slow
 def test_a_bag_of_another_environment_is_excluded_and_widens_the_claimed_sd():
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',), 'mounting_sd': 1e-7}
     alone = tc.fit(columns_of([SLOPE] * 4), **options)

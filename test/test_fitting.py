@@ -85,6 +85,7 @@ def pulls(found, unit):
                            (M - np.array(unit.M)[[1, 2, 2], [0, 0, 1]]) / M_sd))  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_constants_of_a_fit_are_within_their_claimed_sd(response):
     # The nine constants have correlated errors, so the largest may be at 4 sd.
     pull = pulls(response, OWN_LAGS)
@@ -113,6 +114,7 @@ def test_fitted_attitudes_have_unit_norm(response):
     np.testing.assert_allclose(up, positions(12, 1), atol=3e-5)
 
 
+@pytest.mark.slow
 def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     calibration = golovach.calibration
     assert calibration.response == ()
@@ -325,6 +327,7 @@ def test_saturated_samples_are_refused(rng):
         fit(sources, options)
 
 
+@pytest.mark.slow
 def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
     # Misalignments of some mrad or mounting offsets of 5 mg explain the norms of nine positions.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)

@@ -5,6 +5,7 @@
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from builders import source_of
 from scipy.signal import lfilter
 
@@ -50,6 +51,7 @@ def recorded(rng, up, name, targets):
     return source_of(stamps, accel, *readings, name=name)
 
 
+@pytest.mark.slow
 def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]

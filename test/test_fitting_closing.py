@@ -46,6 +46,7 @@ def weight(record, closes):
     return np.repeat(result, 4)[: len(record.accel_stamp_ns)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('closes', 'options'),
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],

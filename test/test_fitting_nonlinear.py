@@ -238,6 +238,7 @@ def source(run, spin, name):
     return source_of(*arrays_of(run), name=name, force=force)
 
 
+@pytest.mark.slow
 def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
     # For speed the test has one temperature, and nine mountings at 1, 3 and 8 g.
     unit = replace(triad('plain', 3), bend=Bend((10.0, -10.0, 10.0), (1.0, 1.0, -1.0)))

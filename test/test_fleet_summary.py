@@ -66,7 +66,7 @@ class TestOutliers:
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
         assert {one.serial for one in summarise(rows).outliers} == {f'S{i:03d}' for i in range(5)}
 
-    @pytest.mark.parametrize('n', [10, 40])
+    @pytest.mark.parametrize('n', [10, pytest.param(40, marks=pytest.mark.slow)])
     def test_fleets_without_outliers_have_a_false_alarm_in_one_of_twenty(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
         # At an alarm rate of 0.05, 60 fleets give 3 alarms on average, 12 or more with p < 1e-4.

@@ -83,6 +83,7 @@ def held_out(unit):
     return arrays(unit, [replace(station, program=program)], 99, rate_hz=RATE_HZ)[0]
 
 
+@pytest.mark.slow
 def test_the_residual_of_a_mems_gyroscope_is_its_noise(unit, fitted, held_out):
     calibration = fitted.calibration
     gyroscope = calibration.gyroscope
@@ -242,6 +243,7 @@ def reduced(unit, records):
     return [reduce_source(source, full_scale=None) for source in sources]
 
 
+@pytest.mark.slow
 def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, [held_out])
     # The first third of the bag has enough ramps and soaks to show an error.

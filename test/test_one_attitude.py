@@ -23,7 +23,7 @@ from thermo_comp.fitting.rests import poses_of
 
 
 @pytest.mark.parametrize('poses', [1, 2])
-@pytest.mark.parametrize('unit', [1, 2])
+@pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_rests_in_a_pose_at_four_temperatures_show_the_drift_of_the_level_axes(unit, poses):
     # WHY: with a free attitude in each rest, the curve came from the warm-ups of the board, which
     # the sensor follows with a lag: errors of 1 to 4 mg between the rests.
@@ -66,8 +66,8 @@ def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
     ('draw', 'unit', 'is_cold'),
     [
         (consumer_grade, 3, False),
-        (consumer_grade, 4, False),
-        (navigation, 2, True),
+        pytest.param(consumer_grade, 4, False, marks=pytest.mark.slow),
+        pytest.param(navigation, 2, True, marks=pytest.mark.slow),
         (navigation, 2, False),
     ],
 )

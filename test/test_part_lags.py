@@ -117,6 +117,7 @@ def test_a_part_between_board_and_case():
     assert judged(calibration, study).norm < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('sensors', [('board',), ('board', 'case')])
 def test_thermometers_that_lag_board_and_case(sensors):
     # WHY: lags of parts alone left 1.2 times the noise, so that a bank of time constants was
@@ -145,6 +146,7 @@ def test_bags_that_only_warm_up_predict_a_cool_down():
     assert judged(strangers.fitted(study), study).norm < 2.0
 
 
+@pytest.mark.slow
 def test_a_noisy_sensor_in_one_warm_up():
     # WHY: with a spline of 60 nodes a time constant was twice the true value, the error 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
@@ -157,6 +159,7 @@ def test_a_noisy_sensor_in_one_warm_up():
     assert taus == pytest.approx(unit.part_s[:, None], rel=0.03)
 
 
+@pytest.mark.slow
 def test_bags_of_one_warm_up_predict_another():
     # All bags have the same thaw, so the lags are functions of the board temperature.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
@@ -187,6 +190,7 @@ def test_a_curve_over_a_part_is_a_sum_of_columns():
     assert not len(without.part_curves.sums)
 
 
+@pytest.mark.slow
 def test_one_thermometer_is_sufficient():
     unit, study = study_of('parts', up=12, part_s=PARTS_S, sensors=('board',))
     calibration = strangers.fitted(study)
@@ -194,6 +198,7 @@ def test_one_thermometer_is_sufficient():
     assert judged(calibration, study).norm < 2.0
 
 
+@pytest.mark.slow
 def test_a_unit_without_lags_gets_none():
     _, study = study_of('no lag', part_s=np.zeros(3))
     calibration = strangers.fitted(study)
@@ -201,6 +206,7 @@ def test_a_unit_without_lags_gets_none():
     assert judged(calibration, study).norm < 1.5
 
 
+@pytest.mark.slow
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
     # WHY: a time constant of 223 s instead of 163 s absorbed an effect of the gradient, which
     # failed in a soak: the error was 167 ug, the claimed sd 15 ug.
@@ -210,6 +216,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
     assert judged(calibration, study).norm < 2.0
 
 
+@pytest.mark.slow
 def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
@@ -221,6 +228,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
     assert judgement.norm_ratio < 1.5
 
 
+@pytest.mark.slow
 def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     # Heads lag the board, pendulums lag the heads; the error is the stress board - pendulum.
     unit = second_simulator.unit_of('products', 2)
@@ -248,6 +256,7 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
         assert any(tau == taus and second == seconds for tau, second in stages)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('grade', [consumer_grade, navigation])
 def test_soaks_determine_the_curve_by_their_norms(grade):
     # The board drifts by 0.01 K within a soak; 26 K between the soaks move the norms by milli-g.
@@ -259,6 +268,7 @@ def test_soaks_determine_the_curve_by_their_norms(grade):
     assert score.ratio < 1.5
 
 
+@pytest.mark.slow
 def test_six_faces_in_three_soaks():
     # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
     # unit with drifts of 10 mg left 40 mg. With a stated repeatability the fit divided by zero.
@@ -272,6 +282,7 @@ def test_six_faces_in_three_soaks():
         assert judged(calibration, study).vector < 100.0
 
 
+@pytest.mark.slow
 def test_a_curve_between_two_soaks_is_claimed():
     # WHY: two soaks do not determine the powers of t; without these powers in the covariance the
     # claimed sd was 1/8 of the error.
@@ -280,12 +291,14 @@ def test_a_curve_between_two_soaks_is_claimed():
     assert judged(strangers.fitted(study), study).ratio < 2.0
 
 
+@pytest.mark.slow
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
     # WHY: with each axis vertical at a different temperature the error was 15 claimed sd.
     _, study = study_of('confounded soaks', up=np.vstack((FACES, np.eye(3))), corners=SOAKS)
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
 
+@pytest.mark.slow
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
     # WHY: left-out soaks do not contain lags, so their score rejected the columns of lags.
     unit, alone, score = soaked(navigation)
@@ -301,6 +314,7 @@ def lags_of(calibration):
     return {term.tau_s for term in calibration.response if term.kind == 'board'}
 
 
+@pytest.mark.slow
 def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
     # A hidden node makes no axis a curve of one part.
     study = next(third_node(0))

@@ -69,6 +69,7 @@ def sd_of_levels(calibration):
     return np.sqrt(variance[places]) / np.abs(K)
 
 
+@pytest.mark.slow
 def test_population_is_the_mean_unit_and_its_scatter():
     prior = population(siblings())
     K = np.array([[unit.axes.x.scale_factor, unit.axes.z.scale_factor] for unit in siblings()])
@@ -133,6 +134,7 @@ def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(
     assert share_left(common, bias) < 0.1
 
 
+@pytest.mark.slow
 def test_units_with_one_curve_for_both_sets_have_it_in_their_population():
     # WHY: smaller correlations between the equal curves made them independent: with nine positions
     # and this prior a fit had an error of 3.1 ug, where the bags alone left 0.7 ug.
@@ -166,6 +168,7 @@ def helped():
         return fit(few, options).calibration, seen
 
 
+@pytest.mark.slow
 def test_a_fit_starts_with_the_widest_prior():
     # WHY: begun with the narrow prior of three units, a fit explained 190 ug by mounting offsets
     # and stayed in this minimum: the held-out error was 271 ug instead of 0.9 ug. WHAT: the prior
@@ -178,6 +181,7 @@ def test_a_fit_starts_with_the_widest_prior():
         assert np.linalg.eigvalsh(narrower).min() > -1e-6
 
 
+@pytest.mark.slow
 def test_siblings_improve_the_fit_of_one_position():
     # One position does not determine the scale over temperature, but the siblings' prior does.
     few = [source(record) for record in test_of(9, 0, 1)]
@@ -204,6 +208,7 @@ def test_new_rests_improve_an_old_calibration():
     assert np.all(np.abs(bias) < 4.0 * np.hypot(sd_of_levels(new), sd_of_levels(old)))
 
 
+@pytest.mark.slow
 def test_rests_at_one_temperature_correct_ageing_and_keep_the_response():
     # An hour at one temperature determines a bias change of 200 ug without --ageing-bias.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
@@ -250,6 +255,7 @@ def left_by(calibration, record):
     return float(np.sqrt(np.nanmean(left**2)))
 
 
+@pytest.mark.slow
 def test_population_refuses_too_few_equal_or_different_units():
     first, second, third = siblings()
     with pytest.raises(FitError, match='need 3 for a population'):
@@ -261,6 +267,7 @@ def test_population_refuses_too_few_equal_or_different_units():
         population([first, second, other])
 
 
+@pytest.mark.slow
 def test_the_command_names_the_nonlinear_terms_that_a_prior_leaves_out(cli, tmp_path):
     cube = NonlinearTerm('cube', (1e-6,) * 3, (0.0,) * 3, 1e-5)
     first, *others = siblings()
@@ -306,6 +313,7 @@ def test_prior_of_the_other_input_is_refused():
         replace(OPTIONS, prior=fitted(1).calibration, input='m/s^2')
 
 
+@pytest.mark.slow
 def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
     files = []
     for unit in siblings():

@@ -132,7 +132,15 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
         assert each[-1][0] < 0.5 * end_s
 
 
-@pytest.mark.parametrize('sensor', SENSORS)
+@pytest.mark.parametrize(
+    'sensor',
+    [
+        '1 mK',
+        pytest.param('10 mK', marks=pytest.mark.slow),
+        pytest.param('1 mK, 62.5 mK steps', marks=pytest.mark.slow),
+        '10 mK, 62.5 mK steps',
+    ],
+)
 def test_soaks_have_no_false_switches(sensor):
     # At 0.05 switches an hour, two per opening, more than 2 openings in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]

@@ -76,6 +76,7 @@ def runs():
     ]
 
 
+@pytest.mark.slow
 def test_a_third_thermometer_explains_what_board_and_case_do_not(runs, tmp_path):
     *bags, held_out = (record(tmp_path / f'{k}.mcap', run) for k, run in enumerate(runs))
     save_calibration(fitted(bags), tmp_path / 'unit.yaml')
