@@ -206,7 +206,7 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
     positions, norms, force, drift = _by_positions(regression, posterior)
     sections, section_drift = _by_sections(regression, posterior, numbers[:, None])
     halves = np.array_split(numbers, 2) if len(numbers) else []
-    by_halves, _ = _by_sections(regression, posterior, halves, is_within=True)
+    by_halves, _ = _by_sections(regression, posterior, halves, n_steps=2, is_within=True)
     drift = np.where(np.isfinite(drift), drift, section_drift)
     scale = regression.nominal_scale
     noise = float(np.sqrt(np.mean(white_noise_of(regression.windows, scale) ** 2)))
@@ -295,11 +295,12 @@ def _by_sections(
     posterior: Posterior,
     folds: Sequence[Ints] | Ints,
     *,
+    n_steps: int = 1,
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
     """
-    Score the drift of left-out sections about the mean of the windows that stay in the fit, by one
-    Gauss-Newton step from the fit of all data.
+    Score the drift of left-out sections about the mean of the windows that stay in the fit, by
+    Gauss-Newton steps from the fit of all data.
 
     `folds`: the sections left out at once, in all positions; `is_within`: score only windows at
     temperatures that occur in the fit
@@ -310,7 +311,9 @@ def _by_sections(
     squares, counts = np.full(len(folds), np.nan), np.zeros(len(folds))
     for k, fold in enumerate(folds):
         point = regression.at(posterior.state, posterior.prior, products.without(fold))
-        force = regression.force(point.moved(point.solution[0]).state)
+        for _ in range(n_steps):
+            point = point.moved(point.solution[0])
+        force = regression.force(point.state)
         judged = gone = np.isin(windows.section, fold)
         if is_within:
             t = windows.columns[:, 0]
