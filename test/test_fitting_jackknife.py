@@ -47,6 +47,7 @@ def ratio(path):
     return float(np.sqrt(np.mean(scatter / np.concatenate((*claimed, variance[-3:])))))
 
 
+@pytest.mark.slow
 def test_the_claimed_sd_agrees_with_a_jackknife(real_data):
     logs = [real_data / f'mikoff-mpu9150/mk_imu{k}.log' for k in range(3)]
     if not all(path.is_file() for path in logs):

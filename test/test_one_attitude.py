@@ -65,7 +65,7 @@ def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
 @pytest.mark.parametrize(
     ('draw', 'unit', 'is_cold'),
     [
-        (consumer_grade, 3, False),
+        pytest.param(consumer_grade, 3, False, marks=pytest.mark.slow),
         pytest.param(consumer_grade, 4, False, marks=pytest.mark.slow),
         pytest.param(navigation, 2, True, marks=pytest.mark.slow),
         (navigation, 2, False),

@@ -103,6 +103,7 @@ def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
     assert judged(calibration, study).norm < 2.0
 
 
+@pytest.mark.slow
 def test_a_part_between_board_and_case():
     case_share = np.array([0.6, 0.3, 0.0])
     unit, study = study_of('between', part_s=PARTS_S, case_share=case_share)
@@ -138,6 +139,7 @@ def test_thermometers_that_lag_board_and_case(sensors):
         assert leads / taus == pytest.approx(60.0 / unit.part_s, abs=0.01)
 
 
+@pytest.mark.slow
 def test_bags_that_only_warm_up_predict_a_cool_down():
     # WHY: lags were valid only in the direction of the bags' ramps, and left 180 ug.
     warm, cool = program(5, 20, (35, 0.8, 40)), program(33, 20, (10, 0.8, 40))

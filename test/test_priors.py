@@ -293,6 +293,7 @@ def test_a_prior_without_covariance_is_refused():
         fit(few, replace(OPTIONS, serial='unit-1', prior=prior))
 
 
+@pytest.mark.slow
 def test_the_calibration_of_another_unit_is_no_prior():
     # WHY: the nine constants of a sibling have small sd, and were taken for this unit's.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]

@@ -144,6 +144,7 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 
+@pytest.mark.slow
 def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
     # The parts are after the last jump; the freezer was knocked near 860 and 1134 s.

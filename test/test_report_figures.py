@@ -53,6 +53,7 @@ def test_bias_and_scale_curves_by_hand():
     assert heating.value[:, 4] == pytest.approx(70.0 * t + behind)
 
 
+@pytest.mark.slow
 def test_a_soak_measures_what_the_calibration_lacks():
     # Make the scale of all axes wrong by 30 ppm in every soak.
     windows = evidence().windows
