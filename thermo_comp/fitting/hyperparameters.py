@@ -37,7 +37,7 @@ STUDENT_NU = 4.0
 #: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
 #: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
-#: Gain in log evidence by which the less usual of two assumptions is preferred: odds of e^4 = 55.
+#: Gain in log evidence from which a model is clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
 #: Variance of the log-normal hyperpriors of the logarithm of an sd: the sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
