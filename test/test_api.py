@@ -230,3 +230,6 @@ def test_arrays_that_cannot_be_fitted_are_refused():
         tc.fit([], gravity=0.0)
     with pytest.raises(tc.ThermoCompError, match='no bag was given'):
         tc.fit([], gravity=9.8)
+    for name in ('groups', 'forced', 'allow'):
+        with pytest.raises(ValueError, match=f"`{name}` must be a list of names, got 'curve'"):
+            tc.fit([], gravity=9.8, **{name: 'curve'})

@@ -137,6 +137,8 @@ class FitOptions:
         }
         for name, words in allowed.items():
             given = getattr(self, name)
+            if isinstance(given, str) and name in ('groups', 'forced', 'allow'):
+                raise ValueError(f'`{name}` must be a list of names, got {given!r}')
             for word in given if isinstance(given, tuple | list) else (given,):
                 if word is not None and word not in words:
                     raise ValueError(f'`{name}` must be of {", ".join(words)}, got {word!r}')
