@@ -1,20 +1,64 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Claimed sd of real units against their scatter from position to position."""
+"""Claimed sd: effects that the model lacks; scatter of real units from position to position."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from builders import source_of
-from fitting_truth import rows_of
+from fitting_truth import (
+    GROUPS,
+    MICRO,
+    NOMINAL,
+    Truth,
+    begin,
+    prior_of,
+    rows_of,
+    table_of,
+    without_starts,
+)
 
 from thermo_comp.fitting import FitOptions, fit_bags
+from thermo_comp.fitting.claim import claim_of
+from thermo_comp.fitting.hyperparameters import white_noise
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.regression import Regression
-from thermo_comp.fitting.windows import FEWEST_WINDOWS
+from thermo_comp.fitting.windows import FEWEST_WINDOWS, N_SECTIONS
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
+
+
+def ratios_to_sd(seed, effect_sd):
+    """
+    Return errors of the weights / sd of the fit, and / claimed sd. An effect that the model lacks
+    changes the biases in each section of the program, equally in all positions.
+    """
+    truth, rng = Truth(), np.random.default_rng(seed)
+    windows, up = table_of(truth, 12, rng, n_windows=24)
+    effect = effect_sd * rng.standard_normal((N_SECTIONS, 3))
+    windows = replace(windows, mean=windows.mean + NOMINAL * effect[windows.section])
+    regression, state = begin(without_starts(windows), up)
+    fitted = regression.solve(state, prior_of(truth))
+    prior = replace(fitted.prior, sigma=white_noise(regression, fitted))
+    fitted = regression.solve(fitted.state, prior)
+    used = np.array(GROUPS) != 'idle'
+    missed = fitted.state.weights[0] - truth.on_bias * regression.rms
+    places = fitted.layout.weights[0][:, used]
+    covariances = fitted.covariance, claim_of(regression, fitted).covariance
+    return [missed[:, used] / np.sqrt(np.diag(each)[places]) for each in covariances]
+
+
+@pytest.mark.parametrize('effect_sd', [0.0, 3.0 * MICRO, 10.0 * MICRO])
+def test_the_claimed_sd_contains_effects_that_the_model_lacks(effect_sd):
+    ratios = np.array([ratios_to_sd(seed, effect_sd) for seed in range(10)])
+    of_fit, of_claim = np.sqrt(np.mean(ratios**2, axis=(0, 2, 3)))
+    # 120 errors, those of an axis correlated: their RMS is known to some 15 %.
+    assert 0.7 < of_claim < 1.3
+    if effect_sd:
+        assert of_fit > 2.5
+    else:
+        np.testing.assert_allclose(ratios[:, 0], ratios[:, 1], rtol=1e-6)
 
 
 def ratio(path):

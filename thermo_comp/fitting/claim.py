@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the published uncertainty: the covariance of the fit, widened by the parameters that the data
-do not determine.
+do not determine, and by the effects that the model lacks.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. A fit's weight in the mixture is the evidence
 of the norms times a half-Student prior. The standard deviation of gravity is a common error of the
-scale factors.
+scale factors. The effects that the model lacks are those of `jackknife`.
 
 References
 ----------
@@ -28,6 +28,7 @@ from ..typing import Floats, Ints
 from .equations import as_vector
 from .hyperparameters import CLEAR_GAIN, STUDENT_NU
 from .initial_triad import within_positions
+from .jackknife import jackknife_covariance
 from .layout import Layout
 from .regression import Posterior, Regression
 from .selection import LAGS
@@ -89,6 +90,7 @@ def claim_of(
         shared_variance = _turn_on_sd(regression, posterior, *tried) ** 2
         offset_sd = float(np.sqrt(offset_sd**2 + shared_variance))
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
+    covariance = covariance + _excess(jackknife_covariance(regression, posterior), covariance)
     if shared_variance:
         covariance = covariance + shared_variance * _of_turn_ons(regression, posterior)
     if candidates is not None:
@@ -284,14 +286,18 @@ def _excess_over_priors(
     ]
     weight = np.array([fit.log_evidence for fit in fits])
     weight = np.exp(weight - weight.max())
-    sd = np.sqrt(np.diag(posterior.covariance))
     mode = as_vector(posterior.state, posterior.layout)[:n]
-    excess = -posterior.covariance
+    mixture = np.zeros((n, n))
     for share, fit in zip(weight / weight.sum(), fits, strict=True):
         difference = as_vector(fit.state, fit.layout)[:n] - mode
-        excess = excess + share * (fit.covariance + np.outer(difference, difference))
-    # Directions in which the mixture is narrower are left as they are.
-    values, vectors = np.linalg.eigh(excess / np.outer(sd, sd))
+        mixture += share * (fit.covariance + np.outer(difference, difference))
+    return _excess(mixture, posterior.covariance)
+
+
+def _excess(covariance: Floats, other: Floats) -> Floats:
+    """Return by how much a covariance exceeds another, 0 in directions where it is smaller."""
+    sd = np.sqrt(np.diag(other))
+    values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(root @ root.T)
 

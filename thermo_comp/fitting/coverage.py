@@ -234,7 +234,9 @@ def direction_text(up: Floats) -> str:
     signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
     size = np.abs(up)
     axes = [sign for sign, share in zip(signs, size, strict=True) if share > 0.1]
-    reading = ', '.join(f'{name} {value:+.2f} g' for name, value in zip('xyz', up, strict=True))
+    # Adding 0 turns a rounded -0 into +0.
+    rounded = zip('xyz', (np.round(up, 2) + 0.0).tolist(), strict=True)
+    reading = ', '.join(f'{name} {value:+.2f} g' for name, value in rounded)
     names = ' and '.join(filter(None, (', '.join(axes[:-1]), axes[-1])))
     how = ' in part' if np.ptp(size[size > 0.1]) > 0.1 else ' alike' if len(axes) > 1 else ''
     return f'{names} up{how}: {reading}'

@@ -1,0 +1,61 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the uncertainty by effects that the model lacks: a jackknife over the sections of the program.
+
+The covariance of a fit contains the errors by noise alone. If the model lacks an effect, each
+section of the program requires other weights, and the error in another program is as large as the
+differences between these weights. The jackknife [1]_ estimates them from fits without one section.
+
+References
+----------
+.. [1] B. Efron, The jackknife, the bootstrap and other resampling plans, SIAM (1982), chapter 3.
+
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..typing import Floats
+from .regression import Posterior, Regression
+
+
+def jackknife_covariance(regression: Regression, posterior: Posterior) -> Floats:
+    """
+    Return the covariance of the unit's unknowns by the jackknife over the sections of the program,
+    shape (n_unit, n_unit); 0 if noise explains the changes of the unknowns without each section.
+    """
+    n = posterior.layout.n_unit
+    last = int(regression.windows.section.max())
+    if not last:
+        return np.zeros((n, n))
+    products = regression.products(posterior.layout.used)
+    step, factor = regression.at(posterior.state, posterior.prior, products.whole).solution
+    changes, ratios = [], []
+    for number in range(last + 1):
+        grams = products.without(np.array([number]))
+        other, remaining = regression.at(posterior.state, posterior.prior, grams).solution
+        changes.append(other[:n] - step[:n])
+        ratios.append(_ratios_to_noise(factor.T @ changes[-1], remaining.T @ posterior.root))
+    ratio, without = np.concatenate(ratios), np.array(changes)
+    # Under noise alone each ratio has mean 1 and variance 2.
+    if ratio.sum() - len(ratio) < 2.0 * np.sqrt(2.0 * len(ratio)):
+        return np.zeros((n, n))
+    return np.asarray(last / (last + 1) * without.T @ without)
+
+
+def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
+    """
+    Return the squared changes of the unknowns without some windows, along the principal directions
+    that these windows measure, in units of the variance of these changes by noise, shape (k,).
+
+    `change`: in units of the fit's root, shape (n,); `remaining`: root of the information of the
+    remaining windows in the same units, ``remaining.T @ remaining``, shape (n, n)
+    """
+    shares, directions = np.linalg.eigh(remaining.T @ remaining)
+    # The windows left out do not measure directions of which they have less than 1e-6 of the
+    # information.
+    is_measured = shares < 1.0 - 1e-6
+    shares = np.maximum(shares[is_measured], 1e-12)
+    return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))
