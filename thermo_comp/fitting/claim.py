@@ -59,6 +59,8 @@ def claim_of(
     known_offset_sd: float = 0.0,
     informative: Sequence[InformativePrior] = (),
     of_means: State | None = None,
+    *,
+    lacks_effects: bool = True,
 ) -> Claim:
     """
     Return the published covariance of the fit of the chosen model.
@@ -67,7 +69,8 @@ def claim_of(
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
     `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
     `informative`: priors from one calibration, with different ageings since that calibration;
-    `of_means`: see `Fit`
+    `of_means`: see `Fit`; `lacks_effects`: whether noise leaves a part of the left-out drift
+    unexplained, so that the model may lack effects, see `jackknife`
     """
     # All rests of a mounting share an offset, but the regression has an offset for each rest. The
     # mean of k offsets with k times the variance has the variance of a single offset.
@@ -90,7 +93,8 @@ def claim_of(
         shared_variance = _turn_on_sd(regression, posterior, *tried) ** 2
         offset_sd = float(np.sqrt(offset_sd**2 + shared_variance))
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
-    covariance = covariance + _excess(jackknife_covariance(regression, posterior), covariance)
+    if lacks_effects:
+        covariance = covariance + _excess(jackknife_covariance(regression, posterior), covariance)
     if shared_variance:
         covariance = covariance + shared_variance * _of_turn_ons(regression, posterior)
     if candidates is not None:

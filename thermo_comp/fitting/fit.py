@@ -44,7 +44,7 @@ from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of
 from .reduction import ReducedBag, reduce_source
-from .selection import Fit
+from .selection import Fit, is_explained
 from .sensors import without_copies
 from .sources import FitSource
 from .windows import FEWEST_WINDOWS
@@ -236,6 +236,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known)),
         informative=fit.selected.informative,
         of_means=fit.of_means,
+        lacks_effects=not is_explained(fit.selected.score, fit.posterior),
     )
     residuals, in_sample, left_out = residual_rows(fit)
     drift = within_positions(in_sample[:, None], fit.windows.data.position)

@@ -35,6 +35,11 @@ GRADIENT = 'gradient'
 LAGS = ('gradient', 'board', 'gradient_lag')
 
 
+def is_explained(score: Score, posterior: Posterior) -> bool:
+    """Whether noise explains the left-out drift of a fit."""
+    return score.rms <= 2.0 * float(posterior.prior.sigma.mean())
+
+
 @dataclass(frozen=True)
 class Trial:
     """
@@ -58,7 +63,7 @@ class Trial:
     @property
     def is_complete(self) -> bool:
         """Whether noise explains the left-out drift."""
-        return self.score.rms <= 2.0 * float(self.posterior.prior.sigma.mean())
+        return is_explained(self.score, self.posterior)
 
 
 @dataclass(frozen=True)
