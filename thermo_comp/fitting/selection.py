@@ -35,11 +35,6 @@ GRADIENT = 'gradient'
 LAGS = ('gradient', 'board', 'gradient_lag')
 
 
-def is_explained(score: Score, posterior: Posterior) -> bool:
-    """Whether noise explains the left-out drift of a fit."""
-    return score.rms <= 2.0 * float(posterior.prior.sigma.mean())
-
-
 @dataclass(frozen=True)
 class Trial:
     """
@@ -63,7 +58,7 @@ class Trial:
     @property
     def is_complete(self) -> bool:
         """Whether noise explains the left-out drift."""
-        return is_explained(self.score, self.posterior)
+        return self.score.rms <= 2.0 * float(self.posterior.prior.sigma.mean())
 
 
 @dataclass(frozen=True)
