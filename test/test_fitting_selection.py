@@ -277,6 +277,17 @@ def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.parametrize('noise', [Noise(), Noise(4.0, 2000.0)])
+def test_noise_alone_is_no_effect_that_the_model_lacks(noise):
+    truth = Truth(noise=noise)
+    windows, up = table_of(truth, 12, np.random.default_rng(1))
+    _, chosen = selected_of(truth, without_starts(windows), up)
+    # The left-out drift is the noise, which must be doubled to count as a missing effect.
+    assert not chosen.lacks_effects
+    calmer = replace(chosen.posterior.prior, sigma=0.3 * chosen.posterior.prior.sigma)
+    assert replace(chosen, posterior=replace(chosen.posterior, prior=calmer)).lacks_effects
+
+
 def test_outliers_do_not_shift_the_fit(calm):
     regression, one, truth = calm
     rng = np.random.default_rng(6)

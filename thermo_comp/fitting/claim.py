@@ -69,8 +69,8 @@ def claim_of(
     do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
     `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
     `informative`: priors from one calibration, with different ageings since that calibration;
-    `of_means`: see `Fit`; `lacks_effects`: whether noise leaves a part of the left-out drift
-    unexplained, so that the model may lack effects, see `jackknife`
+    `of_means`: see `Fit`; `lacks_effects`: whether noise does not explain the left-out drift, see
+    `Selected` and `jackknife`
     """
     # All rests of a mounting share an offset, but the regression has an offset for each rest. The
     # mean of k offsets with k times the variance has the variance of a single offset.

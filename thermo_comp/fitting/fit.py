@@ -44,7 +44,6 @@ from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of
 from .reduction import ReducedBag, reduce_source
-from .regression import Posterior
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
@@ -237,7 +236,7 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known)),
         informative=fit.selected.informative,
         of_means=fit.of_means,
-        lacks_effects=fit.selected.score.rms > 2.0 * _noise(fit.posterior),
+        lacks_effects=fit.selected.lacks_effects,
     )
     residuals, in_sample, left_out = residual_rows(fit)
     drift = within_positions(in_sample[:, None], fit.windows.data.position)
@@ -275,12 +274,6 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         bags=tuple(bags),
         rates=rates,
     )
-
-
-def _noise(posterior: Posterior) -> float:
-    """Return the sd of the white and the slow noise of a typical window, mean of the axes."""
-    prior = posterior.prior
-    return float(prior.sigma.mean() * np.sqrt(1.0 + prior.noise.variance))
 
 
 def _offset_sd(known: Calibration | None) -> float:

@@ -86,7 +86,8 @@ def add_gyroscope(
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
     # The positions determine the sd of the offsets, so `claim_of` does not marginalise over it.
     fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
-    claim = claim_of(regression, replace(fit.posterior, prior=fixed_sd))
+    chosen = replace(fit.posterior, prior=fixed_sd)
+    claim = claim_of(regression, chosen, lacks_effects=fit.selected.lacks_effects)
     # The Earth's rate, which the offsets contain, is a true rate and not an error of the
     # gyroscope.
     turn_on = math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0))
