@@ -271,7 +271,8 @@ def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, floa
 
 def calibrations(rate: int, folder: Path) -> list[str]:
     """
-    Write two calibrations of the example's unit at a rate, with quick lags, to change between.
+    Write two calibrations of the example's unit at a rate, with quick lags, between which the
+    running node switches.
     """
     from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
     from thermo_comp.unit.calibration_file import load_calibration, save_calibration

@@ -186,7 +186,9 @@ def one_pose(number: int) -> Iterator[Study]:
 
 
 def returned(number: int) -> Iterator[Study]:
-    """Record rests of a MEMS unit at four temperatures, in one or two poses to 0.2 mrad."""
+    """
+    Record rests of a MEMS unit at four temperatures, in one or two poses that repeat to 0.2 mrad.
+    """
     for label, poses in (('one pose', 1), ('two poses', 2)):
         rng = rng_of('returned', number)
         unit = consumer_grade(rng)

@@ -182,7 +182,7 @@ def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
             rest = Rest(rng, level=tuple(GRAVITY * up), sd=0.1 * MG, warm=celsius, fall=-1.0)
             warm_up = rest.temperature(rest.time) - celsius
             rest.accel += np.outer(celsius - 20.0 + 0.5 * warm_up, slopes)
-            # Turn-ons of 0.1 mg leave the curve to the drifts.
+            # With turn-on offsets of 0.1 mg only the drifts within the rests determine the curve.
             rest.accel += rng.normal(0.0, 0.1 * MG, 3)
             bags.append(rest.source(name=f'{len(bags)}'))
     pulls = pulls_of(fit(bags, OPTIONS).calibration, -15.0, 15.0, slopes)

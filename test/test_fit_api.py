@@ -49,7 +49,8 @@ def test_a_knee_of_the_bias_is_found():
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # Trial knees are 1 K apart: the fit uses the two around the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # The mean slope between two knees is wrong by at most 20 ug/K * 0.25 K in 1 of 22 kelvins.
+    # A mean slope between two knees instead of the kink gives an error of at most 20 ug/K times
+    # 0.25 K, within 1 K of the 22 K.
     assert left < 1.5
 
 

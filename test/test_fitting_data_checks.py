@@ -217,7 +217,8 @@ def test_options_out_of_range_are_refused(change, message):
 
 
 def test_the_gradient_of_a_soak_is_that_without_the_ramps(good, rng):
-    # The unit heats itself by 3 K; the board lags 600 s in ramps, 1500 s while a soak settles.
+    # The unit heats itself by 3 K; the board lags the case by 600 s in ramps, by 1500 s
+    # while a soak settles.
     windows, _ = good
     t = windows.data.time
     rate = np.where(t < 3000.0, 1.0 / 60.0, 0.02 / 60.0 * np.exp(-(t - 3000.0) / 600.0))

@@ -369,7 +369,7 @@ def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, offset):
     chosen = fit_all(regression, state, prior, fixed, priors)
     assert chosen.posterior.prior.informative is priors[int(offset > 0.0)]
     curve = unit_of(chosen.posterior.state, layout)[places]
-    # With the right prior the fitted curve agrees with the curve of the first fit.
+    # With the right prior the fitted curve agrees with the true curve.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 

@@ -33,7 +33,7 @@ K = 300.0
 
 
 def of_bias(counts, **keys):
-    """Make a calibration that is recognised by its bias of x."""
+    """Make a calibration that a test recognises by its bias of x."""
     axes = Axes(AxisReference(K, counts), AxisReference(K, 0.0), AxisReference(K, 0.0))
     return calibration(axes=axes, **keys)
 
@@ -250,7 +250,8 @@ def test_a_calibration_that_cannot_be_applied_changes_nothing(peer, tmp_path):
 
 
 def test_a_calibration_of_another_unit_is_named(peer, tmp_path, capfd):
-    # WHY: a file of another unit was used without a warning, with errors of 890 claimed sd.
+    # WHY: a file of another unit was used without a warning, with errors of 890 times the claimed
+    # sd.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
     one = of_bias(1.0).unit

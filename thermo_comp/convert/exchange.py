@@ -81,7 +81,7 @@ def export_calibration(
 
 
 class _Curves(NamedTuple):
-    """In a soak: K and bias of each axis, and changes of bias and scale over n temperatures."""
+    """K, bias and the curves of bias and scale of each axis in a soak, at n temperatures."""
 
     temperature: Floats
     K: Floats

@@ -8,7 +8,7 @@ by evidence.
 s(t_i) + B_i o_k + L_i l_k + lack + e_i``: delta is the error of the calibration (its posterior), b
 and s are random walks of bias and scale since the calibration, o_k is a bias offset, l_k are the
 unknown lag states at the start, e is independent noise. The slopes of the bias over temperature
-walk slowly, by a fixed sd.
+are random walks of a fixed sd per root day.
 Jumps of the levels or of gravity, and a change of the curve, are added one at a time while the log
 Bayes factor is high enough. The variances of walks, offsets and noise maximise the marginal
 likelihood, with wide priors.
@@ -186,7 +186,7 @@ class Model:
             np.diag(rows.scatter),
             np.where(is_same, rows.by_start @ rows.by_start.T, 0.0),
         ]
-        # The lack of fit is correlated between temperatures that differ by less than about 10 K.
+        # Errors of the fitted model are correlated between temperatures less than 10 K apart.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)

@@ -214,8 +214,8 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     # At least 1e-8 m/s^2, below any sensor's noise: the estimate for constant samples is 0.
     least = np.full(3, 1e-8)
     if not regression.windows.has_drifts:
-        # Without columns that change the slow noise describes the whole drift of a position, and
-        # the white noise would be estimated as zero. A drift cancels in second differences.
+        # If no column changes within a position, the slow noise explains the whole drift, and the
+        # white noise would be estimated as zero. A drift cancels in second differences.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 

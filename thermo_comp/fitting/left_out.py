@@ -249,7 +249,10 @@ def _mean(values: Floats, weights: Floats) -> Floats:
 
 
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
-    """Return a fit's state to first order, and its root, see `Posterior`, by other equations."""
+    """
+    Return the state of a fit after one Gauss-Newton step with changed equations, and the root of
+    its covariance, see `Posterior`; `matrix`: the changed equations of the unit's unknowns
+    """
     step, factor = point.unit_step(matrix)
     step = np.pad(step, (0, point.layout.n - point.layout.n_unit))
     return point.moved(step).state, inverse_root(factor)

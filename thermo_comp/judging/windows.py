@@ -33,7 +33,7 @@ WINDOW_S = 60.0
 # Distance outside a calibrated range that noise can explain, so that a window counts as inside
 # [half ranges].
 _EDGE = 0.02
-# Smallest ratio of the number of samples in a partial sum to the median of this number.
+# Fewest samples in a partial sum that is used, relative to the median over all partial sums.
 _LEAST_FILLED = 0.9
 
 

@@ -191,7 +191,7 @@ class _Clock:
     longest_gap_s: float = 0.0
 
     def add(self, stamp_ns: Ints) -> None:
-        """Take the next stamps, at least one."""
+        """Add the next stamps; `stamp_ns` must not be empty."""
         if not self.n:
             self.first_ns = self.last_ns = self.newest_ns = int(stamp_ns[0])
         later = stamp_ns[not self.n :]

@@ -57,7 +57,8 @@ class RecordingReader(ExitStack):
 
     The roles in `require` must be in the bag. `info` describes the bag; after all blocks are read,
     `info.truncated` names the missing messages. `topics` are the bag's names by role, `fields` the
-    fields read from messages with more content, `definitions` encoding and text of message types.
+    fields read from messages that have further fields, `definitions` encoding and text of the
+    message types.
     Raises RecordingError if the file is not a bag, is damaged, or a topic is missing or ambiguous.
     """
 

@@ -119,7 +119,7 @@ class Evidence:
 
     @cached_property
     def shown(self) -> ShownBag | None:
-        """The bag of the time figures, with the node's thermal state."""
+        """The bag that the figures over time show, with the node's thermal state."""
         if not self.bags:
             return None
         calibration, index = self.calibration, widest(self.bags)

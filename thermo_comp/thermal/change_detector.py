@@ -248,7 +248,10 @@ class ChangeDetector:
         self._baseline_error = error - share * error
 
     def _learn_swing(self, dt: float) -> None:
-        """Update the swing, the largest distance of the rate from its trend in half periods."""
+        """
+        Update the swing: the largest deviation of the rate from its trend in each half period of
+        an oscillation.
+        """
         rate = self.rate
         trend = self._trend
         self._trend = trend = trend + dt / (dt + self._baseline_s) * (rate - trend)

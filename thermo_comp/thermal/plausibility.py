@@ -76,7 +76,7 @@ class Fault(Enum):
 class SensorCheck:
     """
     Judges one sensor's readings by its past and by the other sensor, which it follows with a lag
-    of `lag_s` (0 for the leading sensor). `is_revived`: the reading just admitted ends a fault.
+    of `lag_s` (0 for the leading sensor). `is_revived`: the reading just accepted ends a fault.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
@@ -173,7 +173,7 @@ class SensorCheck:
                 self.step = step
                 return False
             if fault is Fault.STEP:
-                # After a rejected step the estimate starts again if an admitted reading differs
+                # After a rejected step the estimate starts again if an accepted reading differs
                 # from the expected temperature by more than noise.
                 self.is_revived = abs(step) > self._largest_noise + _SIGMAS * sqrt(variance)
         self.fault = Fault.NONE
