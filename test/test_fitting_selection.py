@@ -436,3 +436,23 @@ def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
     np.testing.assert_allclose(correlation, 1.0, rtol=1e-6)
     added[both] = 0.0
     assert not added.any()
+
+
+def test_the_drifts_of_scale_factors_show_how_well_turn_ons_repeat():
+    # WHY: nine constants explain the norms of nine positions. The fit kept offsets of 5 ug, with
+    # constants wrong by 75 claimed sd.
+    truth = Truth(
+        offset_sd=300.0 * MICRO,
+        sigma=np.full(3, 0.5 * MICRO),
+        on_scale=np.outer([1.0, -0.7, 1.3], [1e-4, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    )
+    windows, up = table_of(truth, 9, np.random.default_rng(2), n_windows=60)
+    regression, state = begin(without_starts(windows), up)
+    candidates = candidates_of(windows, ('curve', 'board'))
+    candidates = replace(candidates, typical=candidates.typical * ~IDLE)
+    posterior = select(regression, state, constants(truth), candidates).posterior
+    # The drifts determine the 27 offsets, except for 9 combinations that the constants explain:
+    # the sd is uncertain by 1 / sqrt(2 * 18), 17 %.
+    assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
+    for errors in truth.errors(regression, posterior).values():
+        assert np.sqrt(np.mean(errors**2)) < 2.0

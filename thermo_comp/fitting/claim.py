@@ -123,15 +123,15 @@ def _offsets_tried(scale: float, known_sd: float, *, has_turn_ons: bool) -> tupl
         # Twelve positions determine an sd to a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
-    # By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg, those of MEMS within
-    # some mg: 10 to 20 times the scale. The ratio `largest_usual` is a compromise between these
-    # units and units whose turn-ons repeat perfectly.
-    largest_usual = 5.0 if has_turn_ons else 1.0
+    # By data sheets, turn-ons of navigation grade repeat within some 10 ug at best, those of
+    # tactical triads within 0.3 to 1 mg, those of MEMS within some mg: 10 to 20 times the scale.
+    # The ratio `largest` is a compromise between these units and units whose turn-ons repeat
+    # perfectly. Mountings within one turn-on repeat better.
+    least, largest = (min(1e-4 / scale, 1.0), 5.0) if has_turn_ons else (0.01, 1.0)
     # In steps of a third of a decade, over which the log evidence is smooth.
     ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)
-    # Few mountings repeat within a hundredth of the scale.
-    small = np.minimum(np.log(ratio / 0.01), 0.0)
-    return scale * ratio, _student(ratio / largest_usual) + small
+    small = np.minimum(np.log(ratio / least), 0.0)
+    return scale * ratio, _student(ratio / largest) + small
 
 
 def _student(x: Floats) -> Floats:
