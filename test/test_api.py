@@ -233,3 +233,5 @@ def test_arrays_that_cannot_be_fitted_are_refused():
     for name in ('groups', 'forced', 'allow'):
         with pytest.raises(ValueError, match=f"`{name}` must be a list of names, got 'curve'"):
             tc.fit([], gravity=9.8, **{name: 'curve'})
+    with pytest.raises(ValueError, match=r"`prior` must be a Calibration, .* got 'a\.yaml'"):
+        tc.fit([], gravity=9.8, prior='a.yaml')

@@ -148,6 +148,7 @@ def test_bad_calibration_files_leave_the_running_calibration(path, tmp_path):
     assert n == sum(e[0] == 'counts' for e in events if seconds_of(e[1]) < 80.0)
 
 
+@pytest.mark.slow
 def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))

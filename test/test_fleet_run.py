@@ -347,6 +347,7 @@ def with_stuck_bit(bit):
     return fault
 
 
+@pytest.mark.slow
 def test_a_prior_does_not_repair_units_that_contradict_themselves(client, tmp_path):
     # WHY: with the larger uncertainty of a prior, a unit with a stuck bit was judged valid.
     kind = unit_preset('mems', 1)

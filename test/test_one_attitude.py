@@ -22,7 +22,7 @@ from strangers_units import GRAVITY, program, record, rng_of, spread
 from thermo_comp.fitting.rests import poses_of
 
 
-@pytest.mark.parametrize('poses', [1, 2])
+@pytest.mark.parametrize('poses', [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_rests_in_a_pose_at_four_temperatures_show_the_drift_of_the_level_axes(unit, poses):
     # WHY: with a free attitude in each rest, the curve came from the warm-ups of the board, which

@@ -123,9 +123,12 @@ class FitOptions:
                 raise ValueError(f'`{name}` must be 0 or positive, got {getattr(self, name)}')
         if self.offset is not None and not math.isfinite(self.offset):
             raise ValueError(f'`offset` must be finite, got {self.offset}')
-        known = self.prior and self.prior.unit.input
-        if known and known != self.input:
-            raise ValueError(f'`prior` is in {known}, the samples are in {self.input}')
+        if self.prior is not None:
+            if not isinstance(self.prior, Calibration):
+                raise ValueError(f'`prior` must be a Calibration, see `load`, got {self.prior!r}')
+            if self.prior.unit.input != self.input:
+                known = self.prior.unit.input
+                raise ValueError(f'`prior` is in {known}, the samples are in {self.input}')
         allowed: dict[str, tuple[str, ...]] = {
             'input': ('counts', 'm/s^2'),
             'model': ('response', 'golovach'),
