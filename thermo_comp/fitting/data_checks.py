@@ -231,11 +231,12 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
 
 def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator[Finding]:
     """
-    Report the assumed repeatability of mountings and turn-ons if the norms do not determine it.
+    Report the assumed repeatability of mountings and turn-ons if the data do not determine it.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
-    are explained by nine constants, whatever the offsets.
+    are explained by nine constants, whatever the offsets; only large offsets appear in the drifts.
     """
+    prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
@@ -251,7 +252,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
             f'few to show how well the bias repeats after the unit is switched on again; {assumed}'
             f', or switch the unit off between {needed} recordings or more',
         )
-    elif n < POSITIONS_FOR_MOUNTINGS:
+    elif n < POSITIONS_FOR_MOUNTINGS and prior.offset_sd < prior.offset_scale:
         yield advice(
             'mountings',
             f'{n} positions do not show how well the bias repeats after the unit is mounted or '
