@@ -20,7 +20,10 @@ from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
-UNITS = ('thermostatted', 'bare-quartz', 'mems', 'sample')
+#: Units, each with its options of the fit.
+UNITS: dict[str, tuple[str, ...]] = {
+    'thermostatted': (), 'bare-quartz': (), 'mems': ('--mounting-sd', '30ug'), 'sample': (),
+}  # fmt: skip
 RATE_HZ = '2'
 MICRO_G = 9.80665e-6
 
@@ -58,9 +61,9 @@ def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
     return sorted((folder / 'fit').iterdir()), sorted((folder / 'held').iterdir())
 
 
-def left(bags: list[Path], held: list[Path], calibration: Path) -> dict[str, float]:
+def left(bags: list[Path], held: list[Path], calibration: Path, *options: str) -> dict[str, float]:
     """Fit, and return RMS of |f| - g on the held-out run, raw and corrected [m/s^2]."""
-    command('fit', *bags, '-o', calibration, '--gravity', '9.80665')
+    command('fit', *bags, '-o', calibration, '--gravity', '9.80665', *options)
     found: dict[str, float] = command('evaluate', *held, '-c', calibration)['sections_m_s2']['all']
     return found
 
@@ -78,8 +81,8 @@ def main() -> None:
             ones.mkdir()
             alone = [without_case(bag, ones / f'{bag.stem}.mcap') for bag in bags]
             held_alone = [without_case(bag, ones / f'held_{bag.stem}.mcap') for bag in held]
-            two = left(bags, held, folder / 'two.yaml')
-            board = left(alone, held_alone, folder / 'one.yaml')
+            two = left(bags, held, folder / 'two.yaml', *UNITS[unit])
+            board = left(alone, held_alone, folder / 'one.yaml', *UNITS[unit])
             values = (two['raw_rms'], two['rms'], board['rms'])
             print(f'{unit:16}' + ''.join(f'{rms / MICRO_G:8.3g}' for rms in values), flush=True)
 

@@ -44,7 +44,7 @@ Schema; this page is generated from the schema.
 
 A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity,
 ranges that do not rise, functions that are not normalised at the reference temperature, a scale that
-could reach zero within its ranges, a posterior of the wrong size, a newer `format_version`, YAML
+could reach zero within its ranges, a posterior of the wrong size, another `format_version`, YAML
 aliases or tags, or more than 8 MiB. The error names the file, the key, the value and the expected
 value. Numbers are written with all digits and the posterior in single precision, so that reading
 and writing a file again does not change it.
@@ -170,7 +170,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
 | a temperature that jumps faster than any part can | its readings are not used until they are plausible again or the sensor is lost |
 | a temperature that is constant while that of the other thermometer changes | its readings are not used: the last value is held, then the sensor counts as lost |
-| both temperatures constant for 5 s | used, with a growing covariance, WARN |
+| both temperatures constant over 20 readings and 5 s, or more | used, with a growing covariance, WARN |
 | a board that leads the case in ramps (swapped topics) | larger covariance, ERROR |
 | counts constant for `stuck_timeout`, or all zero | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |

@@ -196,7 +196,8 @@ class Calibration:
         'White noise of each axis; variance of a sample = density^2 / cycle, plus rounding.',
     ]
     slow_noise_m_s2_sqrt_h: Annotated[
-        tuple[_Slow, _Slow, _Slow], 'Random walk of the bias of each axis, per root hour.'
+        tuple[_Slow, _Slow, _Slow],
+        'Slow noise of each axis: how far the bias moves over short times, per root hour.',
     ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
         tuple[Vector, Vector, Vector],
@@ -215,7 +216,8 @@ class Calibration:
     board_lag_s: Annotated[
         float,
         QUANTITIES['time constant'],
-        'Lag of T_board behind T_case; while the case is lost, gradient = lag * dT_board/dt.',
+        'Lag of T_board behind T_case; while the case is lost, the gradient is that at rest plus '
+        'lag * dT_board/dt.',
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,

@@ -26,7 +26,7 @@ _FLOAT32 = np.dtype('<f4')
 
 @dataclass(frozen=True)
 class Posterior:
-    """Covariance of all parameters (order: `ParameterLayout`): factor @ factor.T + diag(rest)."""
+    """Covariance of all parameters, in the order stated above: factor @ factor.T + diag(rest)."""
 
     rank: Annotated[int, QUANTITIES['number'], 'Number of columns of the factor.']
     factor: Annotated[

@@ -60,7 +60,7 @@ class RateTerm(Column):
 @dataclass(frozen=True)
 class Gyroscope:
     """
-    Bias of the angular rate over temperature: ``w = measured - bias``, as in `calibration`.
+    Bias of the angular rate over temperature: ``w = measured - bias``.
 
     Order of the posterior, axis by axis: level and coefficients of each set, then the weights.
     """
@@ -74,7 +74,8 @@ class Gyroscope:
         tuple[_Density, _Density, _Density], 'White noise density of each axis.'
     ]
     slow_noise_rad_s_sqrt_h: Annotated[
-        tuple[_Slow, _Slow, _Slow], 'Random walk of the bias, per root hour.'
+        tuple[_Slow, _Slow, _Slow],
+        'Slow noise: how far the bias moves over short times, per root hour.',
     ] = NIL
     residual_sd_rad_s: Annotated[
         tuple[_Deviation, _Deviation, _Deviation],
