@@ -120,9 +120,9 @@ def test_the_largest_angle_to_the_nearest_direction():
     ('up', 'words'),
     [
         ((0, 0, 1), '+z up: x +0.00 g, y +0.00 g, z +1.00 g'),
-        ((1, -1, 0), '+x and -y up alike: x +0.71 g, y -0.71 g, z +0.00 g'),
-        ((-1, 1, 1), '-x, +y and +z up alike: x -0.58 g, y +0.58 g, z +0.58 g'),
-        ((3, 1, 0), '+x and +y up partly: x +0.95 g, y +0.32 g, z +0.00 g'),
+        ((1, -1, 0), '+x and -y equally up: x +0.71 g, y -0.71 g, z +0.00 g'),
+        ((-1, 1, 1), '-x, +y and +z equally up: x -0.58 g, y +0.58 g, z +0.58 g'),
+        ((3, 1, 0), '+x and +y partly up: x +0.95 g, y +0.32 g, z +0.00 g'),
     ],
 )
 def test_a_direction_is_described_in_words(up, words):

@@ -238,8 +238,8 @@ def direction_text(up: Floats) -> str:
     rounded = zip('xyz', (np.round(up, 2) + 0.0).tolist(), strict=True)
     reading = ', '.join(f'{name} {value:+.2f} g' for name, value in rounded)
     names = ' and '.join(filter(None, (', '.join(axes[:-1]), axes[-1])))
-    how = ' partly' if np.ptp(size[size > 0.1]) > 0.1 else ' alike' if len(axes) > 1 else ''
-    return f'{names} up{how}: {reading}'
+    how = 'partly ' if np.ptp(size[size > 0.1]) > 0.1 else 'equally ' if len(axes) > 1 else ''
+    return f'{names} {how}up: {reading}'
 
 
 def _cube() -> Floats:
