@@ -5,9 +5,9 @@ Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit. Here t is the board temperature T less the reference
-temperature, and m = T - L(T + v g) is the difference between T and the temperature of the part.
+temperature, and m = T - L(T + v G) is the difference between T and the temperature of the part.
 The part lags a temperature between board and case: that of the board plus the share v of the
-gradient g. The lag has one stage or, for a part that is heated through another part, two stages in
+gradient G. The lag has one stage or, for a part that is heated through another part, two stages in
 series. Without a case thermometer, the temperature that the part lags may lead that of the board.
 The time constants, v and the lead minimise the RMS residual of a spline of the bias and a cubic of
 the scale factor, over x.
@@ -164,7 +164,7 @@ class _PartCurves:
         ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
         knots = _interpolation_place(np.append(0.0, self._taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
-        # The lag L_tau(g) of the gradient g is interpolated over tau; its limit at tau = 0 is g.
+        # The lag L_tau(G) of the gradient G is interpolated over tau; its limit at tau = 0 is G.
         of_case = [
             [c.group == 'gradient_lag' and c.tau_s == tau and c.sensor == 'case' for c in columns]
             for tau in self._taus

@@ -17,7 +17,7 @@ part then responds to the readings by ``(1 + theta s) / (1 + tau s)``, so that
 ``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``.
 
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v g`` between them, with ``g = T_s - T``. The lag behind ``T + v g`` is the lag
+temperature ``T + v G`` between them, with ``G = T_s - T``. The lag behind ``T + v G`` is the lag
 of the board less v times the lag of the gradient.
 """
 
