@@ -26,7 +26,10 @@ _FLOAT32 = np.dtype('<f4')
 
 @dataclass(frozen=True)
 class Posterior:
-    """Covariance of all parameters, in the order stated above: factor @ factor.T + diag(rest)."""
+    """
+    Covariance of all parameters, in the order that docs/calibration_file.md states: factor @
+    factor.T + diag(rest).
+    """
 
     rank: Annotated[int, QUANTITIES['number'], 'Number of columns of the factor.']
     factor: Annotated[
