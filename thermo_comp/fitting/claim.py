@@ -31,9 +31,14 @@ from .initial_triad import within_positions
 from .jackknife import jackknife_covariance
 from .layout import Layout
 from .regression import Posterior, Regression
-from .selection import LAGS
 from .unknowns import InformativePrior, Prior, State
-from .windows import CURVE, PART
+from .windows import CURVE, LAGS, PART
+
+#: Largest usual sd of the offsets of mountings within a turn-on, of turn-ons, and of mountings
+#: that each have a turn-on of their own, relative to the scale of the fit's prior. By data sheets,
+#: turn-ons of tactical triads repeat within 0.3 to 1 mg, those of MEMS within some mg: 10 to 20
+#: times the scale. The values are a compromise with units whose turn-ons repeat perfectly.
+LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
 @dataclass(frozen=True)
@@ -86,10 +91,10 @@ def claim_of(
     # mountings the covariance contains the offsets of n turn-ons with 1 - n / m of the variance.
     shared_variance = offset_sd**2 * (1.0 - n_turn_ons / n_mountings)
     if prior.offset_scale > 0.0:
-        has_turn_ons = n_turn_ons == n_mountings
-        scale = prior.offset_scale
-        tried = _offsets_tried(scale, known_offset_sd, has_turn_ons=has_turn_ons)
+        kind = 'both' if n_turn_ons == n_mountings else 'mounting'
+        tried = _offsets_tried(prior.offset_scale, known_offset_sd, kind)
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
+        tried = _offsets_tried(prior.offset_scale, known_offset_sd, 'turn-on')
         shared_variance = _turn_on_sd(regression, posterior, *tried) ** 2
         offset_sd = float(np.sqrt(offset_sd**2 + shared_variance))
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
@@ -111,27 +116,25 @@ def claim_of(
     return Claim(layout, covariance, offset_sd)
 
 
-def _offsets_tried(scale: float, known_sd: float, *, has_turn_ons: bool) -> tuple[Floats, Floats]:
+def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Floats]:
     """
-    Return values of the sd of the offsets of mountings [m/s^2], and their log prior density per
-    step of the logarithm.
+    Return values of the sd of the offsets of mountings or turn-ons [m/s^2], and their log prior
+    density per step of the logarithm.
 
     `scale`: scale of the fit's prior, 3 times the noise in 1 Hz; `known_sd`: the sd by a prior
-    calibration, 0 for none; `has_turn_ons`: whether each mounting has a turn-on of its own
+    calibration, 0 for none; `kind`: a key of `LARGEST_USUAL`
     """
     if known_sd:
         # Twelve positions determine an sd to a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
-    # By data sheets, turn-ons of navigation grade repeat within some 10 ug at best, those of
-    # tactical triads within 0.3 to 1 mg, those of MEMS within some mg: 10 to 20 times the scale.
-    # The ratio `largest` is a compromise between these units and units whose turn-ons repeat
-    # perfectly. Mountings within one turn-on repeat better.
-    least, largest = (min(1e-4 / scale, 1.0), 5.0) if has_turn_ons else (0.01, 1.0)
+    # By data sheets, turn-ons of navigation grade repeat within some 10 ug at best; mountings
+    # within one turn-on repeat better.
+    least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
     # In steps of a third of a decade, over which the log evidence is smooth.
     ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)
     small = np.minimum(np.log(ratio / least), 0.0)
-    return scale * ratio, _student(ratio / largest) + small
+    return scale * ratio, _student(ratio / LARGEST_USUAL[kind]) + small
 
 
 def _student(x: Floats) -> Floats:

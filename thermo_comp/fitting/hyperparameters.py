@@ -14,6 +14,8 @@ References
 .. [1] D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992), eqs 4.8 to 4.10.
 .. [2] A. Gelman, Prior distributions for variance parameters in hierarchical models, Bayesian
    Analysis 1 (2006): half-t priors for standard deviations.
+.. [3] J. A. Nelder, A reformulation of linear models, Journal of the Royal Statistical Society A
+   140 (1977): a model with a product has its factors.
 
 """
 
@@ -30,7 +32,8 @@ from .equations import as_vector
 from .gains import log_bayes_factors
 from .initial_triad import white_noise_of
 from .regression import Posterior, Regression
-from .unknowns import POSE_SD, Noise, Prior, State
+from .unknowns import POSE_SD, Noise, Prior, State, Windows
+from .windows import LAGS, PRODUCTS
 
 #: Degrees of freedom of the half-Student prior of the mounting's standard deviation; 4 as in [2]_.
 STUDENT_NU = 4.0
@@ -301,6 +304,7 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
         part, column = np.array(droppable).T
         places = layout.weights[part, :, column]
         gains = log_bayes_factors(mode, covariance, places, weight_sd[part, :, column])
+        gains[_has_products(regression.windows, column_sd)[part, column]] = np.inf
         least = int(np.argmin(gains))
         if gains[least] >= LEAST_GAIN:
             break
@@ -310,6 +314,20 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
         mode = mode - gain.T @ mode[at]
         covariance -= covariance[:, at] @ gain
     return replace(prior, column_sd=column_sd)
+
+
+def _has_products(windows: Windows, column_sd: Floats) -> Bools:
+    """
+    Return which columns, shape (2, m), are lags of which the model also has products or powers.
+
+    A product t m approximates the lag m at the rates of one program, but not at other rates, so a
+    lag is kept as long as its products are (marginality, [3]_).
+    """
+    groups = np.array(windows.groups)
+    is_product = np.isin(groups, PRODUCTS) & (column_sd > 0.0)
+    lags = [np.unique(windows.lag[of_part]) for of_part in is_product]
+    is_lag = np.isin(groups, LAGS) & (windows.lag >= 0)
+    return np.stack([is_lag & np.isin(windows.lag, of_part) for of_part in lags])
 
 
 def downweigh(regression: Regression, posterior: Posterior) -> None:

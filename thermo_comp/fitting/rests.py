@@ -15,9 +15,8 @@ from ..thermal.state import VAR_BOARD
 from ..typing import Bools, Floats, Ints
 from .coverage import distinct_directions
 from .initial_triad import block_means, white_noise_of, within_positions
-from .selection import LAGS
 from .unknowns import Windows
-from .windows import ThermalWindows
+from .windows import LAGS, ThermalWindows
 
 
 def is_constant(windows: ThermalWindows, part: Ints) -> bool:

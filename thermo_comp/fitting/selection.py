@@ -28,11 +28,9 @@ from .hyperparameters import (
 from .left_out import Score, gain, is_better, is_near, is_undecided, score_of
 from .regression import Posterior, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
-from .windows import BEND, CURVE, PART, PART_SUMS, SET, ThermalWindows
+from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalWindows
 
-#: Groups that are linear in a temperature difference.
 GRADIENT = 'gradient'
-LAGS = ('gradient', 'board', 'gradient_lag')
 #: Large sd of mounting offsets relative to the prior's scale: turn-ons of tactical triads repeat
 #: within 0.3 to 1 mg by data sheets, 10 to 20 times the scale.
 LARGE_OFFSETS = 10.0
@@ -213,9 +211,12 @@ class Growth:
         # Some groups are tried together, because one effect has columns in all of them: the curve
         # of a part that lags by m, from the board or from the gradient, is
         # (t - m)^2 = t^2 - 2 t m + m^2.
-        together = ('product', 'square'), (*LAGS, 'product', 'gradient_x_temperature', 'square')
+        together = PRODUCTS, (*LAGS, 'product', 'gradient_x_temperature', 'square')
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
+        if {*LAGS} & {*absent} and not {*LAGS} & {*chosen.groups}:
+            # Products and powers of a lag are tried with the lag, see `hyperparameters`.
+            sets = [each for each in sets if {*LAGS} & {*each} or not {*PRODUCTS} & {*each}]
         gains = {groups: inactive.gain(typical, np.isin(self._names, groups)) for groups in sets}
         likely = [groups for groups in sets if gains[groups] > CLEAR_GAIN]
         likely.sort(key=gains.__getitem__, reverse=True)
@@ -322,7 +323,7 @@ def _grown(
         chosen = _best(chosen, tried)
     chosen, tried = growth.added(chosen, progress)
     trials += tried
-    may_bend = BEND in growth.free and {'product', 'square'} & {*chosen.groups}
+    may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
         # A change of slope of a part is visible only in a model with the lag of this part, not in
         # a model whose products and squares approximate the lag. Further groups are added to a

@@ -36,6 +36,8 @@ from .unknowns import Windows
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
 #: Groups whose columns, with those of the curve, are summed in a curve over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
+#: Groups that are linear in a temperature difference; their products with temperature and powers.
+LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Smallest number of windows of a short rest: fewer windows do not determine the rest's noise.
 FEWEST_WINDOWS = 20
 #: Longest gap between two bags of one recording [s]; switching a unit off and on takes longer.
