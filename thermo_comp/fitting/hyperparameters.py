@@ -304,7 +304,7 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
         part, column = np.array(droppable).T
         places = layout.weights[part, :, column]
         gains = log_bayes_factors(mode, covariance, places, weight_sd[part, :, column])
-        gains[_has_products(regression.windows, column_sd)[part, column]] = np.inf
+        gains[_is_last_lag(regression.windows, column_sd)[part, column]] = np.inf
         least = int(np.argmin(gains))
         if gains[least] >= LEAST_GAIN:
             break
@@ -316,18 +316,19 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
     return replace(prior, column_sd=column_sd)
 
 
-def _has_products(windows: Windows, column_sd: Floats) -> Bools:
+def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
     """
-    Return which columns, shape (2, m), are lags of which the model also has products or powers.
+    Return which column, shape (2, m), is the only lag of a model that has products or squares of
+    lags.
 
     A product t m approximates the lag m at the rates of one program, but not at other rates, so a
-    lag is kept as long as its products are (marginality, [3]_).
+    model with products keeps a lag (marginality, [3]_).
     """
-    groups = np.array(windows.groups)
-    is_product = np.isin(groups, PRODUCTS) & (column_sd > 0.0)
-    lags = [np.unique(windows.lag[of_part]) for of_part in is_product]
-    is_lag = np.isin(groups, LAGS) & (windows.lag >= 0)
-    return np.stack([is_lag & np.isin(windows.lag, of_part) for of_part in lags])
+    groups, used = np.array(windows.groups), column_sd > 0.0
+    is_lag = used & np.isin(groups, LAGS) & (windows.lag >= 0)
+    has_products = (used & np.isin(groups, PRODUCTS)).any(axis=1)
+    is_single = has_products & (is_lag.sum(axis=1) == 1)
+    return np.asarray(is_lag & is_single[:, np.newaxis])
 
 
 def downweigh(regression: Regression, posterior: Posterior) -> None:

@@ -215,7 +215,7 @@ class Growth:
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
         if {*LAGS} & {*absent} and not {*LAGS} & {*chosen.groups}:
-            # Products and powers of a lag are tried with the lag, see `hyperparameters`.
+            # Products and powers of lags are tried only with lags, see `hyperparameters`.
             sets = [each for each in sets if {*LAGS} & {*each} or not {*PRODUCTS} & {*each}]
         gains = {groups: inactive.gain(typical, np.isin(self._names, groups)) for groups in sets}
         likely = [groups for groups in sets if gains[groups] > CLEAR_GAIN]
