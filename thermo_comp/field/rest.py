@@ -68,7 +68,7 @@ def encode(record: Start | Rest) -> bytes:
         memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
         data: Any = {**vars(record), 'memory': [*memory, rates] if rates else memory}
     else:
-        # Nine digits resolve 0.001 counts of a 24-bit converter.
+        # Nine digits resolve 0.01 counts of a 24-bit converter.
         data = [
             [float(f'{value:.9g}') for value in part] if isinstance(part, tuple) else part
             for part in astuple(record)

@@ -125,9 +125,9 @@ def judge(
     is_seen: bool = False,
 ) -> Judgement:
     """
-    Judge a calibration by its windows; windows of the fit's bags (`is_seen`) by the RMS on
-    positions left out. If a `tolerance` on the RMS [m/s^2] is given, the tolerance decides instead
-    of the claimed sd.
+    Judge a calibration by corrected windows; by the RMS on positions left out of the fit if the
+    windows are of the fit's bags (`is_seen`). A given `tolerance` on the RMS [m/s^2] decides
+    instead of the claimed sd.
     """
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
@@ -228,7 +228,7 @@ def distinct_positions(windows: Windows) -> int:
 
 
 def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:
-    """Fit the shifts of nine constants to ``|f| = g``; none with fewer than six positions."""
+    """Fit shifts of bias, scale, misalignment to ``|f| = g``; none for fewer than 6 positions."""
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity

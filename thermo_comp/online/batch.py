@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # A full queue applies its oldest readings, as in the node, but after the first sample
-            # only those before the next sample.
+            # A full queue applies its oldest readings, as in the node, but once a sample has been
+            # processed only readings up to the stamp of the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

@@ -128,7 +128,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Use a new direction once it lasts: with coarse readings the rate changes in steps."""
+        """Use a new direction after half a dwell time: a coarse quantum makes the rate step."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -144,7 +144,7 @@ class RegimeDetector:
         self.direction = direction
         self._turning_ns = None
         self._is_grown = False
-        # The onset is detected long before the rate has grown: hold the dynamic state meanwhile.
+        # The onset is detected long before the rate has grown: hold the dynamic state `hold_ns`.
         hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
         self._held_until_ns = stamp_ns + hold_ns
 

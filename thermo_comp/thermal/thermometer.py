@@ -26,9 +26,9 @@ from typing import Final
 from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
-OUTLIER_LIMITS: Final = 5.0  # innovation / OUTLIER_SIGMAS, beyond which a reading is rejected
+OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a reading is rejected
 RESTART_READINGS: Final = 4  # number of outliers in a row on one side that count as a real change
-# Mean time in the quiet mode [s]; the mean time in the bending mode is the lag.
+# Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
 QUIET_SHARE: Final = 5e-3  # acceleration in quiet / bending mode, for a sensor without wide cells
 CELL_SHARE: Final = 0.2  # acceleration in quiet / bending mode, for a sensor with wide cells
@@ -100,7 +100,7 @@ class Thermometer:
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
-        Take a reading [degC]; return False if it is impossible, not newer, or an outlier.
+        Take a reading [degC]; return False if impossible, not newer than the last, or an outlier.
         """
         if not COLDEST <= reading_c <= HOTTEST:
             return False

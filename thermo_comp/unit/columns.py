@@ -194,7 +194,7 @@ def bank(
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
     of each sensor at rest [K], `span_k` the range of temperatures in the data, from the reference
-    [K]. `parts` are the lags of the part of each axis; if given, there are no other lags.
+    [K]. `parts` are the lags of the part of each axis; if given, no column has another lag.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
@@ -378,7 +378,7 @@ class ColumnTable:
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
         Differentiate u, without limits of range: by the number that u is computed from, and by the
-        board temperature at a given lag; None if no column depends on the board temperature.
+        board temperature at a given lag (None if no column depends on the board temperature).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:
