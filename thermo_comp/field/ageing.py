@@ -77,7 +77,7 @@ class Ageing:
 @dataclass(frozen=True)
 class Change:
     """
-    A jump of the levels or of gravity at `time` [days since 1970], or a change of the curve.
+    A jump of levels or gravity at `time` [days since 1970], or a change of the bias curves' slope.
 
     sd: prior standard deviation of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
     may_be_gravity: whether a jump of gravity explains a jump of the levels almost as well
@@ -90,7 +90,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return the derivatives of the ageing model's rows by the change, (n, 6 or 1 or 3)."""
+        """Return the rows' derivatives by levels (n, 6), gravity (n, 1) or curve slopes (n, 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -400,7 +400,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     Condition the parameters of the calibration on the rests.
 
     Derivatives of the file's parameters: `to_file` by the six levels, (n_parameters, 6); `bend` by
-    the bias slope of each axis, (n_parameters, 3). `ahead`: use after the last rest [days].
+    the bias slope of each axis, (n_parameters, 3). `ahead`: days of use after the last rest.
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

@@ -28,7 +28,7 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node, or a later change of its calibration, with the `start_ns` of the start.
+    A start of the node, or a later change of calibration with the `start_ns` of the node's start.
 
     `start_ns` identifies a start and is not a date: many computers set their clock only later.
     """

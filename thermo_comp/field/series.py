@@ -3,7 +3,7 @@
 """
 Owns rests as measurements of a calibration: ``|f| - g`` and its derivatives by every parameter.
 
-A rest at an unknown attitude measures one number. With x the axes' forces before the misalignment
+A rest at an unknown attitude measures one number, |f|. With x the axes' forces before the matrix
 M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
 i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order ``|f| - g = H (true
 - calibrated parameters) + noise``.

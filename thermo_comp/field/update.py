@@ -308,7 +308,7 @@ def refuse_another_unit(result: Update) -> None:
 
 
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
-    """Add a shift to a calibration's parameters; a shift of a scale's level multiplies K."""
+    """Add a shift to a calibration's parameters; K is multiplied by 1 + shift of scale level."""
     layout = parameter_layout(calibration)
     of_scale = np.array([shift[block.static] for block in layout.scale])
     K = np.array([axis.scale_factor for axis in calibration.axes])

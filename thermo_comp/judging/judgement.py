@@ -125,9 +125,9 @@ def judge(
     is_seen: bool = False,
 ) -> Judgement:
     """
-    Judge a calibration by corrected windows; by the RMS on positions left out of the fit if the
-    windows are of the fit's bags (`is_seen`). A given `tolerance` on the RMS [m/s^2] decides
-    instead of the claimed sd.
+    Judge a calibration by corrected windows; for windows of the fit's bags (`is_seen`) also by the
+    RMS on positions left out of the fit. If a `tolerance` on the RMS [m/s^2] is given, the
+    tolerance decides instead of the claimed sd.
     """
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)

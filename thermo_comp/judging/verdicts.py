@@ -121,7 +121,7 @@ def _section(raw: Floats, residual: Floats, claimed: Floats, rows: Bools | Ints)
 
 @dataclass(frozen=True)
 class RateJudgement:
-    """The judgement of a gyroscope; `sections` judge changes of the rate, all axes [rad/s]."""
+    """The judgement of a gyroscope; `sections` hold changes of the angular rate [rad/s]."""
 
     kind: Verdict
     reason: str

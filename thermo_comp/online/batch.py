@@ -207,7 +207,7 @@ def _apply(
 
 
 def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
-    """Evaluate the slow part of the variance of segments, each held state once."""
+    """Evaluate the slow part of the variance of segments, once for each `SlowState`."""
     held = {id(segment.slow): segment.slow for segment, _ in segments}
     rows = compensator.thermal.model.slow_rows([*held.values()])
     places = {key: place for place, key in enumerate(held)}

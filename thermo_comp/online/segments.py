@@ -33,7 +33,7 @@ from .status import CompensatorConfig, Counters
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000  # time for which the slow part of the variance is held [ns]
-YOUNG_READINGS: Final = 30  # number of readings after a start that determine the rate
+YOUNG_READINGS: Final = 30  # board readings after a start that determine the board's rate
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -117,8 +117,8 @@ class ThermalSide:
         self._slow = _NO_STATE
         self._slow_evaluated = _NO_STATE
         self._slow_rows: Floats = np.empty(0)
-        #: End and thermal state of the last segment: without a reading the next segment begins
-        #: there.
+        #: End and thermal state of the last segment: the next segment begins at both if no reading
+        #: is applied in between.
         self._last_end: tuple[int, int, tuple[float, ...]] | None = None
 
     def _new_tracker(self) -> ThermalTracker:
@@ -209,7 +209,7 @@ class ThermalSide:
 
     def count_unmeasured(self, n_samples: int) -> None:
         """
-        Count samples as dropped: without a board temperature, or too long after the last one.
+        Count samples as dropped: no board temperature yet, or the last one is older than allowed.
         """
         if self.tracker.board.stamp_ns is None:
             self.counters.n_no_temperature += n_samples

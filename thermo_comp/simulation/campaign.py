@@ -125,7 +125,7 @@ def positions(n: int, seed: int = 0) -> Floats:
     Return attitudes of a calibration test as unit vectors of the specific force, shape (n, 3).
 
     Six attitudes are the faces of a cube, nine the corners of a three-capped prism, twelve the
-    corners of an icosahedron: for their number the best sets to determine bias, scale and
+    corners of an icosahedron: the best sets of 6, 9 and 12 attitudes to determine bias, scale and
     misalignment. Other numbers of attitudes take the faces of a cube, then its edges, then its
     corners; more than 26 attitudes follow a uniform spiral on the sphere. The sets of 6, 9, 12,
     18, 24 and 26 attitudes are balanced. `seed` tilts each attitude by a small random angle.

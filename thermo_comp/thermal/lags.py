@@ -63,7 +63,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def by_board(self) -> float:
-        """Derivative by the board temperature at a given state of the lag."""
+        """Derivative by the board temperature, while the single lags L are constant."""
         if self.input != BOARD_INPUT:
             return 0.0
         return 1.0 if self.second_tau_s else self.shares[0]

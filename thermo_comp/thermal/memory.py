@@ -18,8 +18,8 @@ import numpy as np
 from ..typing import Floats
 from .lags import BOARD_INPUT, MemorySpec, singles_of
 
-#: Interval between readings / time constant beyond which the input between the readings is
-#: unknown.
+#: Interval between readings / time constant of a lag, beyond which the time at which the input
+#: changed between the readings adds variance.
 SPARSE_SHARE: Final = 0.1
 #: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
 _FADED: Final = 1e-18

@@ -136,7 +136,7 @@ class SensorCheck:
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
-        """Judge a reading [degC] before it is used: return whether the estimator may use it."""
+        """Judge a new reading [degC]: return whether the estimator may use the reading."""
         sensor = self.sensor
         last_ns, fault = sensor.stamp_ns, self.fault
         self.is_revived = False
@@ -155,8 +155,8 @@ class SensorCheck:
         self._n_same = 0
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
-        # The usual case is decided cheaply: the reading differs from the estimate by less than a
-        # step.
+        # The usual case is decided cheaply: the reading and the estimate differ by less than
+        # `LARGEST_STEP`.
         if (
             fault is Fault.NONE
             and abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the causal decision between the static and the dynamic regime; its only clock is the stamps.
+Owns the causal decision between static and dynamic regime; the only clock is the readings' stamps.
 
 The dynamic state *opens* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
@@ -175,7 +175,7 @@ class _Watch:
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
         """
-        Follow the sensor's rate; return whether it is low, as assumed of a lost or stale sensor.
+        Follow the sensor's rate; return whether the rate is low; without a fresh reading, True.
         """
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:

@@ -45,7 +45,7 @@ NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor
 State = tuple[float, float, float, float, float, float, float, float, float]
 """Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance."""
 
-_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # nothing is known
+_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # before a reading
 
 
 class Thermometer:
@@ -68,7 +68,7 @@ class Thermometer:
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
         self._noise_scale = 1.0  # actual / declared noise variance
-        self._n_turns = 8.0  # number of innovations in `_noise_scale`; its prior counts as 8
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`, with 8 for the prior
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s

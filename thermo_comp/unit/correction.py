@@ -149,7 +149,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Lengthen a transition time [s] until the force changes by GENTLE_RATE, with a limit."""
+        """Lengthen a transition time [s] towards GENTLE_RATE, at most by LONGEST_TRANSITION."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         static, dynamic = self.curves.values(board)
         gap = dynamic - static

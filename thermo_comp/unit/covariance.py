@@ -86,8 +86,8 @@ def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
 
 
 def grown(between: Floats, growth: Floats) -> Floats:
-    """Multiply rows `BETWEEN` (36, n) by the factors (3, n) by which the axes' variances grow."""
-    # The misalignment does not depend on the temperature.
+    """Increase the rows `BETWEEN` (36, n) by the growth factors (3, n) of the axes' variances."""
+    # The misalignment does not depend on the temperature, so its errors have the factor 1.
     roots = np.repeat(
         np.concatenate((np.sqrt(growth), np.ones_like(growth))), [2] * 3 + [1] * 3, 0
     )

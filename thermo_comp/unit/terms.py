@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function and its derivative; the bits of a result depend on one x alone."""
+    """A function of x and its derivative; each x is evaluated alone, bit for bit."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
