@@ -162,7 +162,8 @@ def counted_rests(content: bytes) -> int:
 
 def thinned(content: bytes) -> bytes:
     """
-    Drop every second rest of a file, and damaged lines; the first rest of each start is kept.
+    Drop every second rest of a file, and lines that begin like no record; checksums are not
+    verified. The first rest of each start is kept.
     """
     kept: list[bytes] = []
     n = 0

@@ -151,8 +151,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # If the last week is outside the claim, its last two days are within (see above), so the
-        # last day outside has a following day.
+        # For a unit within its claim, a last week above the limit ends with two days within the
+        # limit, so a day follows the last day outside.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)

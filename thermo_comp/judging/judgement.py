@@ -24,8 +24,8 @@ from .windows import Windows
 _WIDE_CLAIM = 1e3 * MICRO_G
 # Smallest significant shift of bias or scale, in standard deviations.
 _SIGNIFICANT_SDS = 3.0
-# Smallest sd assumed for a misalignment [rad], and for the relative error of a position's mean
-# |f|.
+# Smallest sd assumed for a misalignment [rad]; smallest relative sd of a position's mean |f|, and
+# smallest claimed sd of a window [m/s^2].
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_MISS = 1e-5, 1e-8
 # Number of consecutive windows that count as one, since thermal residuals are correlated.
 _CORRELATED_WINDOWS = 6.0

@@ -82,7 +82,7 @@ class Sections(dict[str, Section]):
 
     @property
     def worst_ratio(self) -> float:
-        """Largest ratio of RMS error to claimed RMS over the regimes, or of all windows."""
+        """Largest ratio of RMS error to claimed RMS: of the regimes, and of all windows."""
         return max(part.ratio for part in (*self.regimes, self['all']))
 
     def facts(self) -> dict[str, Any]:
