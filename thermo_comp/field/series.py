@@ -46,7 +46,7 @@ class Series:
     """
     Rests in order of the starts, (n,) and (n, ...); accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the start, in order of appearance; `direction`: v;
+    `time`: days since 1970; `start`: number of the node's start, from 0 in order; `direction`: v;
     `force`: x; `gravity`: stated g; `residual`: ``|f| - g``; `by_parameter`: H, (n, n_parameters);
     `by_level`: derivatives by the bias of each axis and by its scale times g, (n, 6); `noise`:
     variance of one rest by samples and thermometers; `by_start`: derivatives by the unknown lag
@@ -269,7 +269,7 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 
 def _numbered(start: Ints) -> Ints:
-    """Return numbers of the starts, in order of appearance."""
+    """Number the starts of the node from 0, in order of appearance."""
     _, first, start = np.unique(start, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
 

@@ -23,8 +23,8 @@ from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
 
-#: Future readings in reverse order; for each reading the number of samples before it, the latest
-#: stamp of its thermometer so far, the thermometer, the stamp [ns] and the temperature [degC].
+#: Readings not queued yet, in reverse order; per reading the number of samples before it, the
+#: latest stamp of its thermometer so far, the thermometer, stamp [ns] and temperature [degC].
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]

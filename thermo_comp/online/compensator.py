@@ -229,7 +229,7 @@ class Compensator:
         self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
         if self.gravity.is_refuted and not is_too_fast:
-            # The dropped samples still feed the gravity check, which may clear the calibration.
+            # Samples dropped for |f| still feed the gravity check, which may accept |f| again.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1

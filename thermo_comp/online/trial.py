@@ -47,7 +47,7 @@ def is_sound_sample(row: Corrected) -> bool:
     if min(xx, yy, zz) <= 0.0:
         return False
     # The variances of two axes may differ by more than the 16 digits of a float, so that rounding
-    # would exceed the smaller variance. Correlations are free of units.
+    # would exceed the smaller variance: test the correlations instead.
     sd = np.sqrt((xx, yy, zz))
     correlations = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) / sd / sd[:, np.newaxis]
     return bool(np.linalg.eigvalsh(correlations)[0] > 0.0)

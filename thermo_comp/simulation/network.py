@@ -50,7 +50,7 @@ class Thermostat:
 
 @dataclass(frozen=True)
 class ThermalNetwork:
-    """Parts with heat capacities [J/K], the paths between them, and their dissipation [W]."""
+    """Parts by heat capacity [J/K], heat paths between parts, dissipation of parts [W]."""
 
     capacity: Mapping[str, float] = field(hash=False)
     links: tuple[Link, ...]

@@ -286,8 +286,8 @@ class Thermometer:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
         # A repeated reading has no new information: its cell only bounds the variance. If the
-        # estimate is outside the cell, the edge counts as measured, once per time in which the
-        # predicted temperature changes by one sd of the estimate.
+        # estimate is outside the cell, the edge of the cell counts as one measurement per time in
+        # which the predicted temperature changes by one sd of the estimate.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))

@@ -328,7 +328,7 @@ class ColumnTable:
             for term in dict.fromkeys(terms.tolist())
             if term.form is not LINE
         ]
-        # The temperature of a part is the difference of two numbers of a thermal state.
+        # The temperature of a part is the board temperature less a lag: two numbers of a state.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 

@@ -156,7 +156,7 @@ class GradientLag(Term):
 
 
 class Square(Term):
-    """Curves of parts that lag the board; without a lag, losses of a heat flow."""
+    """Curves of parts that lag the board; without a lag, losses quadratic in a heat flow."""
 
     kind, formula = 'square', '(T - lagged T)^2, or q_s^2 without lag'
     groups = (('square', 'curves of parts that lag'),)
