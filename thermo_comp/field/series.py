@@ -269,7 +269,7 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 
 def _numbered(start: Ints) -> Ints:
-    """Number the starts of the node from 0, in order of appearance."""
+    """Return the number of each start of the node, from 0 in order of appearance."""
     _, first, start = np.unique(start, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
 
