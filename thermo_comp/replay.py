@@ -4,8 +4,8 @@
 Owns the offline run of the node: the correction of a whole bag into another bag or a table.
 
 The correction is the node's code, applied to blocks of samples instead of single samples. A
-temperature reading applies from the first sample after the reading in the bag. The output
-equals, bit for bit, the output of a node that receives the messages in the order of the bag.
+temperature reading applies from the first sample that follows in the bag and has no earlier stamp.
+The output equals, bit for bit, that of a node that receives the messages in the bag's order.
 Only one block of the bag is in memory at a time.
 """
 

@@ -1,17 +1,18 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ageing model of a unit: a Gaussian model of the errors at rest, with variances estimated
+Owns the ageing model of a unit: a Gaussian model of ``|f| - g`` at rest, with variances estimated
 by evidence.
 
 ``|f| - g`` of rest i at time t_i after start k of the node is ``H_i delta + B_i b(t_i) + S_i
 s(t_i) + B_i o_k + L_i l_k + lack + e_i``: delta is the error of the calibration (its posterior), b
 and s are random walks of bias and scale since the calibration, o_k is a bias offset, l_k are the
-unknown lag states at the start, e is independent noise. The slopes of the bias over temperature
-are random walks of a fixed sd per root day.
-Jumps of the levels or of gravity, and a change of the curve, are added one at a time while the log
-Bayes factor is high enough. The variances of walks, offsets and noise maximise the marginal
-likelihood, with wide priors.
+unknown lag states at the start, lack is the lack of fit of the calibration, e is independent
+noise. The matrices H_i, B_i, S_i and L_i are derivatives of ``|f|``. The slopes of the bias over
+temperature are random walks of a fixed sd per root day. Jumps of the levels (bias and scale of
+each axis) or of gravity, and a change of the bias curves over temperature, are added one at a time
+while the log Bayes factor of the next is high enough. The variances of walks, offsets, lag states
+and noise maximise the marginal likelihood, with wide priors.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from ..unit.gravity import MICRO_G
 from .series import Series
 
 #: Centres of the priors, relative to the turn-on offset: random walk per root day of bias, and of
-#: scale times g; scatter of a rest. Sd of the logarithm of all priors: a factor of 5.
+#: scale times g; scatter of a rest. Prior sd of the logarithm of each sd: a factor of 5.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Centre of the prior of the sd of the lag states at a start, relative to the calibration's
-#: assumption: units that are at rest before their start have smaller lags.
+#: assumption: units in thermal equilibrium before their start have smaller lags.
 _LAG_SHARE = 1.0
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
@@ -42,15 +43,16 @@ _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Prior sd of a jump in the biases, and in the scales times g, relative to `_JUMPS`: a shock
 #: changes scales less.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
-#: Smallest log Bayes factor of a change (150:1), and of a jump of gravity relative to a jump of
-#: the levels (20:1).
+#: Smallest log Bayes factor at which a change is added to the model (150:1), and of a jump of
+#: gravity relative to a jump of the levels (20:1).
 _LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
-#: Random walk of the curves' slopes [m/s^2 per K per root day]: smallest `_BENDS` in a year.
+#: Random walk of the curves' slopes [m/s^2 per K per root day]: the smallest of `_BENDS` is the sd
+#: after a year.
 _SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
 #: Largest number of rows (equations) per start of the node in the solution, and in the search for
-#: the variances; largest number of all rows in the search, whose time grows with its cube.
+#: the variances; largest number of all rows in the search, whose time grows with the cube of rows.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
 
 
@@ -75,10 +77,10 @@ class Ageing:
 @dataclass(frozen=True)
 class Change:
     """
-    A jump of the levels or of gravity at `time` [days since 1970], or a change of the curve.
+    A jump of levels or gravity at `time` [days since 1970], or a change of the bias curves' slope.
 
     sd: prior standard deviation of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
-    may_be_gravity: a jump of the levels that another gravity explains almost as well
+    may_be_gravity: whether a jump of gravity explains a jump of the levels almost as well
     """
 
     kind: Literal['levels', 'gravity', 'curve']
@@ -88,7 +90,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return the derivatives of the ageing model's rows by the change, (n, 6 or 1 or 3)."""
+        """Return the rows' derivatives by levels (n, 6), gravity (n, 1) or curve slopes (n, 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -98,8 +100,8 @@ class Change:
 @dataclass(frozen=True)
 class Rows:
     """
-    Equations of the rests, in order of the starts, at most `_ROWS` of a start: orthogonal sums
-    with all information of its rests about the six levels.
+    Equations of the rests, in order of the node's starts, at most `_ROWS` per start: orthogonal
+    sums of the rests of a start, with all their information about the six levels.
 
     noise, scatter: variance of the noise, and factor of the rests' scatter variance in a row
     rank: number of the row within its start
@@ -121,7 +123,7 @@ class Rows:
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives by a jump of the levels, in `_JUMP_SHARES`, and of gravity, (n, 7)."""
+        """Derivatives by a jump of the levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
@@ -165,7 +167,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
 
 
 class Model:
-    """The covariance of the model's rows as a function of the variances, with given changes."""
+    """The covariance of the rows as a function of the sds in `Ageing`, with given changes."""
 
     def __init__(
         self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
@@ -186,7 +188,7 @@ class Model:
             np.diag(rows.scatter),
             np.where(is_same, rows.by_start @ rows.by_start.T, 0.0),
         ]
-        # Errors of the fitted model are correlated between temperatures less than 10 K apart.
+        # Errors of the fitted model are correlated between temperatures: a Gaussian of 10 K sd.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
@@ -221,7 +223,7 @@ class Model:
             return float(value), np.array(slope) + shift / _LOG_SD
 
         # The evidence has almost no gradient where variances are small, so the search has two
-        # initial points: all scatter is due to the starts, or all scatter to the random walks.
+        # initial points: most scatter is due to the starts, or most scatter to the random walks.
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
@@ -259,7 +261,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centre of the priors; its turn-on sd is the residual sd, or the noise in 1 Hz."""
+    """Return the centre of the priors; the turn-on sd is the fit's residual sd, or 1 Hz noise."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -270,7 +272,7 @@ def learn(
     series: Series, calibration: Calibration, since: float, *, is_gravity_certain: bool = False
 ) -> tuple[Ageing, Model, Series]:
     """
-    Estimate variances and changes by evidence, without starts that contradict all other starts.
+    Estimate the ageing model by evidence, without starts that contradict all other starts.
 
     At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
     of the node is left out if one of its rows is more than 5 sd from the prediction by all other
@@ -326,7 +328,7 @@ def _gain(change: Change | None) -> float:
 
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
     """
-    Yield possible jumps before each start, and a change of the curve, with log Bayes factors.
+    Yield possible jumps before each start, and a change of the curves, with log Bayes factors.
     """
     rows = model.rows
     alpha, by_jump = inverse @ rows.y, rows.by_jump
@@ -370,10 +372,10 @@ def _log_bayes_factor(precision: Floats, gradient: Floats, sd: float) -> float:
 @dataclass(frozen=True)
 class Solution:
     """
-    Change of the file's parameters by the rests, and their covariances at the last rest.
+    Change of the calibration file's parameters by the rests, with covariances of the parameters.
 
     shift: change of the parameters
-    prior, posterior: covariances before and after the rests
+    prior, posterior: covariances at the time of the last rest, without and with use of the rests
     future: covariance that is added during the time of use after the last rest
     gains, innovations: the shift is ``gains.T @ innovations``; the shift by the first rows alone
         is the sum over these rows
@@ -397,8 +399,8 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     """
     Condition the parameters of the calibration on the rests.
 
-    `to_file`: derivatives of the file's parameters by the six levels, (n_parameters, 6); `bend`:
-    by a slope of each axis, (n_parameters, 3); `ahead`: time of use after the last rest [days].
+    Derivatives of the file's parameters: `to_file` by the six levels, (n_parameters, 6); `bend` by
+    the bias slope of each axis, (n_parameters, 3). `ahead`: days of use after the last rest.
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

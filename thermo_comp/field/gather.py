@@ -5,8 +5,8 @@ Owns the detection of rests in a stream of samples: windows of 10 s without moti
 
 Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds that
 hold five samples: one second at 5 Hz or more. A cell is still if its standard deviation is that of
-the noise and its mean agrees with the mean of the cell before (thresholds as in
-`online.checks.GravityCheck`). Still cells in a row form a window once they span ten seconds. In a
+the noise and its mean agrees with the means of the cell before and of the window's first cell (as
+in `online.checks.GravityCheck`). Still cells in a row form a window once they span 10 s. In a
 long rest all windows of the first ten minutes are kept, then one window per minute up to an hour,
 then one window per five minutes.
 """

@@ -28,7 +28,7 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node, or a later change of its calibration, with the `start_ns` of the start.
+    A start of the node, or a later change of calibration with the `start_ns` of the node's start.
 
     `start_ns` identifies a start and is not a date: many computers set their clock only later.
     """
@@ -68,7 +68,7 @@ def encode(record: Start | Rest) -> bytes:
         memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
         data: Any = {**vars(record), 'memory': [*memory, rates] if rates else memory}
     else:
-        # Nine digits resolve 0.001 counts of a 24-bit converter.
+        # Nine digits resolve 0.01 counts of a 24-bit converter.
         data = [
             [float(f'{value:.9g}') for value in part] if isinstance(part, tuple) else part
             for part in astuple(record)
@@ -162,7 +162,8 @@ def counted_rests(content: bytes) -> int:
 
 def thinned(content: bytes) -> bytes:
     """
-    Drop every second rest of a file, and damaged lines; the first rest of each start is kept.
+    Drop every second rest of a file, and lines that begin like no record; checksums are not
+    verified. The first rest of each start is kept.
     """
     kept: list[bytes] = []
     n = 0

@@ -3,7 +3,7 @@
 """
 Owns rests as measurements of a calibration: ``|f| - g`` and its derivatives by every parameter.
 
-A rest at an unknown attitude measures one number. With x the axes' forces before the misalignment
+A rest at an unknown attitude measures one number, |f|. With x the axes' forces before the matrix
 M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
 i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order ``|f| - g = H (true
 - calibrated parameters) + noise``.
@@ -46,7 +46,7 @@ class Series:
     """
     Rests in order of the starts, (n,) and (n, ...); accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the start, in order of appearance; `direction`: v;
+    `time`: days since 1970; `start`: number of the node's start, from 0 in order; `direction`: v;
     `force`: x; `gravity`: stated g; `residual`: ``|f| - g``; `by_parameter`: H, (n, n_parameters);
     `by_level`: derivatives by the bias of each axis and by its scale times g, (n, 6); `noise`:
     variance of one rest by samples and thermometers; `by_start`: derivatives by the unknown lag
@@ -108,8 +108,9 @@ def read_rests(
 
     Returns the rests, the provenance of an update aged `ahead` days, and notes for the user.
 
-    Rests before the calibration are left out, unless all rests are before the calibration; rests
-    that an earlier update used are always left out. Raises RecordingError if no rest is left.
+    Rests before the calibration are left out, unless all rests are before the calibration. Rests
+    that an earlier update used are left out if `is_for_update`, else kept. Raises RecordingError
+    if no rest is left.
     """
     files: list[Path] = []
     for path in paths:
@@ -268,7 +269,7 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 
 def _numbered(start: Ints) -> Ints:
-    """Return numbers of the starts, in order of appearance."""
+    """Return the number of each start of the node, from 0 in order of appearance."""
     _, first, start = np.unique(start, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
 
@@ -278,8 +279,8 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     Assign windows to groups of consecutive windows that are averaged, at most 60.
 
     All windows of a group belong to the same start of the node. Direction and temperature of a
-    group's windows differ by less than 1e-3 rad and 1 K from those of the first window; the norm
-    of a mean of vectors is smaller by half the squared angle.
+    group's windows differ by less than 1e-3 rad and 1 K from those of the first window. Different
+    directions reduce the norm of a mean of vectors by a share of half the squared angle.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)
@@ -306,8 +307,8 @@ def _uncertainty(
     x: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """
-    Return the variance of |f| by thermometers and regime, (n,), that of the calibration's claim,
-    (n,), and the sd of the lack of fit of each axis, (n, 3).
+    Return the variance of |f| by thermometers and regime, (n,), the variance of |f| that the
+    calibration claims, (n,), and the sd of the lack of fit of each axis, (n, 3).
     """
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
     bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
@@ -318,8 +319,8 @@ def _uncertainty(
     weight, unknown = states[:, WEIGHT], states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(states[:, BOARD])
-    # The ageing model adds the residuals of the sets itself, so they are subtracted here: those of
-    # both sets while the regime is unknown.
+    # The ageing model has terms for residual and lack of fit, so the variances of both are
+    # subtracted: those of static and dynamic set while the regime is unknown.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]

@@ -40,15 +40,15 @@ AHEAD_DAYS = 1.0
 @dataclass(frozen=True)
 class Moved:
     """
-    Changes of an axis' constants, each with posterior sd; 0 if the rests do not determine the
-    axis.
+    Changes of an axis' constants, each with posterior sd; if the rests do not determine the axis,
+    the changes are 0 and the sds are prior sds.
 
     bias: change of the bias at the temperature of the rests [m/s^2]
     scale: relative change of the scale
     curve: change of the bias curve over the temperatures of the rests [m/s^2]
     reading: change by bias plus scale at the mean force of the rests [m/s^2]
     claimed_sd: sd of the reading that the old calibration claims [m/s^2]
-    present_sd: sd of the reading with the old calibration at the last rest, by its ageing [m/s^2]
+    present_sd: sd of the reading with the old calibration at the last rest, with ageing [m/s^2]
     """
 
     axis: str
@@ -234,7 +234,7 @@ def _axis_changes(
         ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
         is_determined = bool(ratio <= 0.6**2)
         determined[bias.static : scale.end] = is_determined
-        # The old calibration keeps the shift as an error.
+        # Without the update, the shift is an error of the old calibration.
         error = posterior[3, 3] + float(rows[3] @ solution.shift) ** 2
         residual = calibration.static.axes()[axis].residual_sd_m_s2
         scatter = float(np.hypot(ageing.turn_on, ageing.rest))
@@ -251,7 +251,7 @@ def _axis_changes(
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates by earlier rests on each day or, with fewer than five days, on each start."""
+    """Score the update by earlier rests on each day or, with less than five days, each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -308,7 +308,7 @@ def refuse_another_unit(result: Update) -> None:
 
 
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
-    """Add a shift to a calibration's parameters; a shift of a scale's level multiplies K."""
+    """Add a shift to a calibration's parameters; K is multiplied by 1 + shift of scale level."""
     layout = parameter_layout(calibration)
     of_scale = np.array([shift[block.static] for block in layout.scale])
     K = np.array([axis.scale_factor for axis in calibration.axes])

@@ -116,7 +116,8 @@ class Watch:
 
 def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:
     """
-    Compare rests with the claimed sd or a tolerance of ``|f| - g`` [m/s^2]; forecast the excess.
+    Compare rests with the claimed sd or a tolerance of ``|f| - g`` [m/s^2]; forecast the unit's
+    time until the error exceeds the limit.
     """
     names = np.array([str(np.datetime64(int(day), 'D')) for day in series.day])
     ordered = np.unique(names)
@@ -136,9 +137,9 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week follows a change late. One day outside the claim begins an excess if the
-    # ageing model's error at the last rest is outside, too. Two days within the claim end an
-    # excess if the model's error is within, too.
+    # The RMS of a week follows a change late. A unit is outside its claim after one day outside if
+    # the ageing model's error at the last rest is outside, too. A unit is within its claim again
+    # after two days within if the ageing model's error is within, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -150,8 +151,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # The week may be outside only if its last two days are within, so a day within the limit
-        # follows.
+        # For a unit within its claim, a last week above the limit ends with two days within the
+        # limit, so a day follows the last day outside.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -166,8 +167,8 @@ def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
     Return the first index of the window that ends on each day, and the window's robust RMS.
 
-    A window has the days with rests in the week up to a day, and two such days at least. The
-    largest value, perhaps of a disturbed day, is replaced by the second largest.
+    A window has the days with rests in the week up to a day, and at least two days with rests. The
+    largest ratio of a window, perhaps of a disturbed day, is replaced by the second largest.
     """
     n = np.arange(len(day))
     first = np.minimum(

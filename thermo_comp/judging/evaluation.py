@@ -114,11 +114,11 @@ def evaluate(
     progress: Callable[[float], None] = lambda _: None,
 ) -> Evaluation:
     """
-    Judge calibrations of a unit, given with their names, on its recordings.
+    Judge calibrations of a unit, given with their names, on recordings of the unit.
 
     Local gravity and topics default to those of the first calibration; `tolerance` is the largest
     accepted RMS of ``|f| - g`` [m/s^2]; for `serial` see `replay.check_unit`; `force`: the user's
-    options about |f| that is not g.
+    options about rests at which |f| is not g.
 
     Raises RecordingError if a recording cannot be read, or none has a window at rest;
     CalibrationError if a calibration is for another unit.

@@ -24,8 +24,8 @@ from .windows import Windows
 _WIDE_CLAIM = 1e3 * MICRO_G
 # Smallest significant shift of bias or scale, in standard deviations.
 _SIGNIFICANT_SDS = 3.0
-# Smallest sd assumed for a misalignment [rad], and for the relative error of a position's mean
-# |f|.
+# Smallest sd assumed for a misalignment [rad]; smallest relative sd of a position's mean |f|, and
+# smallest claimed sd of a window [m/s^2].
 _SMALLEST_MISALIGNMENT_SD, _SMALLEST_MISS = 1e-5, 1e-8
 # Number of consecutive windows that count as one, since thermal residuals are correlated.
 _CORRELATED_WINDOWS = 6.0
@@ -125,9 +125,9 @@ def judge(
     is_seen: bool = False,
 ) -> Judgement:
     """
-    Judge a calibration by its windows; windows of the fit's bags (`is_seen`) by the RMS on
-    positions left out. If a `tolerance` on the RMS [m/s^2] is given, the tolerance decides instead
-    of the claimed sd.
+    Judge a calibration by corrected windows; for windows of the fit's bags (`is_seen`) also by the
+    RMS on positions left out of the fit. If a `tolerance` on the RMS [m/s^2] is given, the
+    tolerance decides instead of the claimed sd.
     """
     claims = calibration.has_uncertainty
     claimed = windows.claimed_sd if claims else np.full(len(windows), np.nan)
@@ -228,7 +228,7 @@ def distinct_positions(windows: Windows) -> int:
 
 
 def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:
-    """Fit the shifts of nine constants to ``|f| = g``; none with fewer than six positions."""
+    """Fit shifts of bias, scale, misalignment to ``|f| = g``; none for fewer than 6 positions."""
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity

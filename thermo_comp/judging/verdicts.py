@@ -77,12 +77,12 @@ class Sections(dict[str, Section]):
 
     @property
     def regimes(self) -> list[Section]:
-        """The regimes that have enough windows to be judged separately."""
+        """Sections of the regimes that have at least `_FEWEST` windows."""
         return [part for part in (self['static'], self['dynamic']) if part.n >= _FEWEST]
 
     @property
     def worst_ratio(self) -> float:
-        """Largest ratio of RMS error to claimed RMS over the regimes, or of all windows."""
+        """Largest ratio of RMS error to claimed RMS: of the regimes, and of all windows."""
         return max(part.ratio for part in (*self.regimes, self['all']))
 
     def facts(self) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def _section(raw: Floats, residual: Floats, claimed: Floats, rows: Bools | Ints)
 
 @dataclass(frozen=True)
 class RateJudgement:
-    """The judgement of a gyroscope; `sections` judge changes of the rate, all axes [rad/s]."""
+    """The judgement of a gyroscope; `sections` hold changes of the angular rate [rad/s]."""
 
     kind: Verdict
     reason: str
@@ -165,13 +165,13 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     triad = rate_triad(calibration)
     claims, claimed = triad.has_uncertainty, np.full_like(corrected, np.nan)
     if claims:
-        # The claimed variance of the changes follows from the claimed variance of one message's
-        # rate.
+        # The claimed variance of the changes from a rest's mean follows from the claimed variance
+        # of one message's rate.
         correction = Correction(triad, Correction(calibration).memory)
         bias, change = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
-        # The errors by thermometer noise and unknown initial lag states nearly vanish in a rest's
-        # mean.
+        # Errors by thermometer noise and unknown initial lag states nearly vanish in the mean of a
+        # rest, so a change from the mean has their whole variance.
         of_thermometers = np.maximum(variance - np.array(correction.noise) - slow - bias, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]

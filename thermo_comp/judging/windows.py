@@ -84,7 +84,7 @@ class Windows:
 
     @cached_property
     def raw_residual(self) -> Floats:
-        """|f| by the constants alone, less gravity or the known |f|, shape (n,)."""
+        """|f| by the constants at reference temperature, less the known |f| or g, shape (n,)."""
         return norm_residual(self.raw, self.size)
 
     @cached_property
@@ -120,7 +120,7 @@ def corrected_windows(
 ) -> Windows:
     """
     Build the windows of bags, corrected if there is a calibration; RecordingError if the samples
-    are too slow for windows of this length.
+    are too slow for windows of `window_s`.
     """
     if calibration is not None:
         gravity = calibration.gravity_m_s2 if gravity is None else gravity
@@ -264,7 +264,7 @@ def _correct(calibration: Calibration, bag: ReducedBag, sums: _Table) -> None:
     # The checks for stuck samples and gravity do not apply to means of samples.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     compensator = Compensator(calibration, config)
-    # Accept any forward step: the stamp of a partial sum is a mean of many samples.
+    # Accept any forward step of the stamps: the stamp of a partial sum is a mean of many samples.
     compensator.leap_ns = np.iinfo(np.int64).max
     thermal = compensator.thermal
     readings = iter(readings_in_order(bag, thermal.inputs))

@@ -23,8 +23,8 @@ from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
 
-#: Future readings in reverse order; for each reading the number of samples before it, the latest
-#: stamp of its thermometer so far, the thermometer, the stamp [ns] and the temperature [degC].
+#: Readings not queued yet, in reverse order; per reading the number of samples before it, the
+#: latest stamp of its thermometer so far, the thermometer, stamp [ns] and temperature [degC].
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # A full queue applies its oldest readings, as in the node, but after the first sample
-            # only those before the next sample.
+            # A full queue applies its oldest readings, as in the node, but once a sample has been
+            # processed only readings up to the stamp of the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)
@@ -207,7 +207,7 @@ def _apply(
 
 
 def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
-    """Evaluate the slow part of the variance of segments, each held state once."""
+    """Evaluate the slow part of the variance of segments, once for each `SlowState`."""
     held = {id(segment.slow): segment.slow for segment, _ in segments}
     rows = compensator.thermal.model.slow_rows([*held.values()])
     places = {key: place for place, key in enumerate(held)}

@@ -8,8 +8,8 @@ A converter with noise does not repeat three numbers for seconds; three exact ze
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
 calibration, or that of another unit, |f| at rest differs from gravity by more than the claimed
 uncertainty. |f| is averaged over still windows of a second or longer: their scatter is the
-sensor's noise, and their mean is that of the window before. A step of |f| from one rest to another
-is not a motion: the calibration is judged by the step within a second.
+sensor's noise, and their mean agrees with that of the window before. A step of |f| from one rest
+to another is not a motion: the step is judged within a second.
 """
 
 import math
@@ -153,7 +153,7 @@ class GravityCheck:
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        # |f| of the last windows differed from gravity by more than the tolerance.
+        # Whether |f| of the last windows differed from gravity by more than the tolerance.
         self.is_refuted = False
         self._n_agreeing = 0
         self._is_against = False
@@ -175,7 +175,7 @@ class GravityCheck:
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Take a sample, its covariance xx .. zz, and the noise part of the covariance's trace."""
+        """Take a force [m/s^2], its covariance xx .. zz, and the noise part of their trace."""
         self._watch_step(stamp_ns, force, covariance, noise)
         if (
             not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS

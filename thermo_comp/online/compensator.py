@@ -4,10 +4,10 @@
 Owns the correction of a stream of samples: counts and temperatures to specific force, covariance,
 regime and status.
 
-A reading applies from the first later-arriving sample with an equal or later stamp, so stamps and
-order of arrival determine the output, and a node that received everything in order publishes the
-bits of the offline replay. The rate of the samples, and |f| against gravity, are checked at the
-first sample of each segment, so that the checks cost nothing per sample.
+A temperature reading applies from the first later-arriving sample with an equal or later stamp, so
+stamps and order of arrival determine the output, and a node that received all messages in order
+publishes the bits of the offline replay. The rate of the samples, and |f| against gravity, are
+checked at the first sample of each segment, so that the checks cost nothing per sample.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class CompensatorStatus:
     stamp_ns: int | None
     #: Fault of each thermometer, and the size of a rejected step of its readings [K].
     faults: Mapping[str, tuple[Fault, float]]
-    #: Time from the last sample to the latest waiting reading [s].
+    #: Time from the last sample to the latest queued temperature reading [s].
     pending_ahead_s: float
     #: Result of `ThermalTracker.sample`; empty until there is a board temperature.
     state: tuple[float, ...] = ()
@@ -229,7 +229,7 @@ class Compensator:
         self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
         if self.gravity.is_refuted and not is_too_fast:
-            # The dropped samples still feed the gravity check, which may clear the calibration.
+            # Samples dropped for |f| still feed the gravity check, which may accept |f| again.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
@@ -260,7 +260,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take the regime flags since the last call: (stamp of the deciding reading, S)."""
+        """Take the flags since the last call: (stamp of deciding reading [ns], is dynamic)."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
@@ -295,7 +295,7 @@ class Compensator:
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Continue with another model or settings; the original of a copy does not change."""
+        """Continue with another model or settings; if `self` is a copy, the original is kept."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
         self.config, self.thermal = config, copy(self.thermal)
@@ -353,7 +353,7 @@ class Compensator:
 
     @property
     def scale_sd(self) -> tuple[float, ...]:
-        """Sd of the relative scale of each axis in the present segment; empty without one."""
+        """Sd of the relative scale of each axis in the present segment; empty at first."""
         line = self._segment[1]
         return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
 

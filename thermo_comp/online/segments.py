@@ -4,9 +4,9 @@
 Owns the segments: time intervals between temperature readings, with a correction linear in time.
 
 A segment ends at a temperature reading, or after one second. The correction is evaluated in full
-at both ends of a segment, so a sample costs a few operations, the output has no steps, and a batch
-needs one evaluation per segment. The slow part of the variance is evaluated at the first segment
-in each ten seconds.
+at both ends of a segment, so a sample costs a few operations, the output has no steps between two
+readings, and a batch needs one evaluation per segment. The slow part of the variance is evaluated
+at the first segment in each ten seconds.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ from .status import CompensatorConfig, Counters
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000  # time for which the slow part of the variance is held [ns]
-YOUNG_READINGS: Final = 30  # number of readings after a start that determine the rate
+YOUNG_READINGS: Final = 30  # board readings after a start that determine the board's rate
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -74,7 +74,7 @@ class Model:
         self.needs_temperature = calibration.needs_temperature
         self.correction = Correction(calibration)
         self.uncertainty = [SlowUncertainty(calibration, self.correction)]
-        #: Correction of the angular rate, over the same thermal state; None without a gyroscope.
+        #: Correction of the angular rate by the thermal state; None without a gyroscope.
         self.rate_correction: Correction | None = None
         if calibration.gyroscope is not None:
             triad = rate_triad(calibration)
@@ -117,8 +117,8 @@ class ThermalSide:
         self._slow = _NO_STATE
         self._slow_evaluated = _NO_STATE
         self._slow_rows: Floats = np.empty(0)
-        #: End and thermal state of the last segment: without a reading the next segment begins
-        #: there.
+        #: End and thermal state of the last segment: the next segment begins at both if no reading
+        #: is applied in between.
         self._last_end: tuple[int, int, tuple[float, ...]] | None = None
 
     def _new_tracker(self) -> ThermalTracker:
@@ -133,7 +133,7 @@ class ThermalSide:
         return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Continue with another model or configuration; the original of a copy stays unchanged."""
+        """Continue with another model or configuration; if `self` is a copy, keep the original."""
         old, self.queue = self.tracker, copy(self.queue)
         self._use(model, config)
         self.queue.keep(lambda entry: entry[2] in self.inputs)
@@ -209,7 +209,7 @@ class ThermalSide:
 
     def count_unmeasured(self, n_samples: int) -> None:
         """
-        Count samples as dropped: without a board temperature, or too long after the last one.
+        Count samples as dropped: no board temperature yet, or the last one is older than allowed.
         """
         if self.tracker.board.stamp_ns is None:
             self.counters.n_no_temperature += n_samples
@@ -217,7 +217,7 @@ class ThermalSide:
             self.counters.n_stale += n_samples
 
     def segment(self, stamp_ns: int, n_seen: int) -> Segment:
-        """Open the segment of sample number `n_seen`; a new segment checks the rate."""
+        """Open the segment of sample number `n_seen`; check the sample rate in a new segment."""
         start_ns = stamp_ns - (stamp_ns - (self.tracker.updated_ns or 0)) % SEGMENT_NS
         key = (self._n_applied, start_ns)
         is_new = key != self._segment_key
@@ -239,7 +239,7 @@ class ThermalSide:
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def slow_rows(self, slow: SlowState) -> Floats:
-        """Evaluate the slow part of a segment's variance, once while it is held."""
+        """Evaluate the slow part of the variance of a segment, once for each `SlowState`."""
         if slow is not self._slow_evaluated:
             self._slow_evaluated = slow
             self._slow_rows = self.model.slow_rows([slow])[:, 0]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the trial of a calibration: a few samples are corrected with it before it is used.
+Owns the trial of a calibration: a few samples are corrected before the calibration is used.
 """
 
 from collections.abc import Iterator
@@ -26,8 +26,8 @@ def tried(calibration: Calibration, path: str | Path | None = None) -> None:
     """
     Apply a calibration to a few samples; CalibrationError if any of these samples fails.
 
-    The samples are zero and full scale, at the edges of the temperature ranges and far beyond
-    these ranges; each result must be finite, with a positive definite covariance.
+    The samples are near zero and near +- full scale, at the edges of the temperature ranges and
+    far beyond these ranges; each result must be finite, with a positive definite covariance.
     """
     try:
         is_sound = all(map(is_sound_sample, _samples(Model(calibration))))
@@ -47,7 +47,7 @@ def is_sound_sample(row: Corrected) -> bool:
     if min(xx, yy, zz) <= 0.0:
         return False
     # The variances of two axes may differ by more than the 16 digits of a float, so that rounding
-    # would exceed the smaller variance. Correlations are free of units.
+    # would exceed the smaller variance: test the correlations instead.
     sd = np.sqrt((xx, yy, zz))
     correlations = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) / sd / sd[:, np.newaxis]
     return bool(np.linalg.eigvalsh(correlations)[0] > 0.0)

@@ -29,11 +29,11 @@ _PROGRAMS = {
     # The shortest program with the whole temperature range, ramps in both directions and short
     # soaks.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',
-    # Nine and a half hours: slow and fast ramps in both directions; other ramps have rates in
-    # between.
+    # Nine and a half hours: ramps of 0.3 to 1 K/min in both directions, for the chamber test of 18
+    # positions.
     'long': '20 30min, 35@0.5 60min, 5@1 60min, 25@0.3 40min, 10@0.7 45min, 33@0.9 40min, '
     '15@0.35 40min, 20@0.5 19.92063492063492min',
-    # Ramp rates, soak temperatures and their order differ from those of all programs for a fit.
+    # No ramp of this program (start, end and rate) occurs in a program for a fit.
     'held-out': '12 40min, 31@0.35 45min, 17@0.9 30min, 26@0.6 50min, 7@0.7 60min, 22@0.25 40min',
     'slow': '20 60min, 35@0.1 60min, 5@0.2 60min, 20@0.15 60min',
     'fast': '20 45min, 35@3 75min, 5@2 90min, 25@1.5 75min, 10@3 60min',
@@ -44,7 +44,7 @@ _PROGRAMS = {
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Edges of the cube: one per pair of axes with sum 0, their opposites, the other edges.
+# Edges of the cube: three of sum 0, one per pair of axes; their opposites; the other edges.
 _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
@@ -62,8 +62,8 @@ PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# Runs at several rates, times in s: ends of the soaks; time from the start of a run to the end of
-# its soak; time at each rate; time between rates.
+# Runs at several rotation rates, times in s: ends of the soaks; time from the start of a run to
+# the end of the soak; time at each rate; time between rates.
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
 # Radius [m] and rotation rates [rad/s] of the simulated machines. Centrifuge: 1 m, 2 to 10 g
 # horizontally; rate table: 0.25 m, up to 1000 deg/s.
@@ -125,7 +125,7 @@ def positions(n: int, seed: int = 0) -> Floats:
     Return attitudes of a calibration test as unit vectors of the specific force, shape (n, 3).
 
     Six attitudes are the faces of a cube, nine the corners of a three-capped prism, twelve the
-    corners of an icosahedron: for their number the best sets to determine bias, scale and
+    corners of an icosahedron: the best sets of 6, 9 and 12 attitudes to determine bias, scale and
     misalignment. Other numbers of attitudes take the faces of a cube, then its edges, then its
     corners; more than 26 attitudes follow a uniform spiral on the sphere. The sets of 6, 9, 12,
     18, 24 and 26 attitudes are balanced. `seed` tilts each attitude by a small random angle.

@@ -28,7 +28,7 @@ def triple(values: Floats) -> Triple:
 class PartHistory:
     """
     Temperatures of the parts on a uniform grid of `step` seconds: deviations from the reference's
-    steady state [K], shape (m, n_parts), and the temperatures in that state [degC].
+    steady state [K], shape (m, n_parts), and the temperatures in the steady state [degC].
     """
 
     nodes: tuple[str, ...]
@@ -90,9 +90,9 @@ class FlowEffect(Effect):
     Effect of a heat flow in either direction, less its effect at rest.
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent`` times the deviation
-    of `cold` to the `power`: 1.25 for convection in a gap, 1 for the load of a heat pump, 2 for
-    its losses. If `is_limited`, as by the supply of a heat pump, the signal saturates at 1:
-    ``x ** exponent / (1 + x ** exponent)``.
+    of `cold` to the `power`. The exponent is 1.25 for convection in a gap, 1 for the load of a
+    heat pump, 2 for the losses of a heat pump. If `is_limited`, as by the supply of a heat pump,
+    ``x ** exponent / (1 + x ** exponent)`` replaces ``x ** exponent``.
     The second signal is the first times the deviation of `cold`.
     """
 

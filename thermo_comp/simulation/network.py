@@ -50,7 +50,7 @@ class Thermostat:
 
 @dataclass(frozen=True)
 class ThermalNetwork:
-    """Parts with heat capacities [J/K], the paths between them, and their dissipation [W]."""
+    """Parts by heat capacity [J/K], heat paths between parts, dissipation of parts [W]."""
 
     capacity: Mapping[str, float] = field(hash=False)
     links: tuple[Link, ...]
@@ -146,7 +146,7 @@ class ThermalResponse:
 
     `air` are the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
     dissipation between the knots in addition to the constant powers [W], shape (m - 1, n_parts).
-    At the start all powers are on, and all temperatures in equilibrium.
+    At the start all temperatures are in equilibrium with the air and the powers at that time.
     """
 
     def __init__(

@@ -28,20 +28,20 @@ class Specimen:
         return value * (1.0 + 0.05 * self._rng.uniform(-1.0, 1.0))
 
     def between(self, low: float, high: float) -> float:
-        """Draw uniformly."""
+        """Draw a number uniformly between two limits."""
         return float(self._rng.uniform(low, high))
 
     def axes(self, value: float, spread: float) -> Triple:
-        """Draw a number around a value, with the same sign."""
+        """Draw a number for each axis, uniformly within a relative spread around a value."""
         return triple(value * (1.0 + spread * self._rng.uniform(-1.0, 1.0, 3)))
 
     def signed(self, low: float, high: float) -> Triple:
-        """Draw numbers of log-uniform magnitudes with random signs."""
+        """Draw a number for each axis, of log-uniform magnitude and random sign."""
         size = np.exp(self._rng.uniform(math.log(low), math.log(high), 3))
         return triple(size * self._rng.choice((-1.0, 1.0), 3))
 
     def normal(self, sd: float) -> Triple:
-        """Draw numbers from a normal distribution of mean 0."""
+        """Draw a number for each axis from a normal distribution of mean 0."""
         return triple(sd * self._rng.standard_normal(3))
 
     def heat(self, **capacity: float) -> dict[str, float]:
@@ -236,7 +236,7 @@ UNIT_NAMES = tuple(_KINDS)
 
 def unit_preset(name: str, seed: int = 0) -> UnitModel:
     """
-    Return a simulated unit of some kind, different for every seed (>= 0).
+    Return a simulated unit of the kind `name`, with other constants for every seed (>= 0).
 
     'thermostatted' (quartz triad in an oven, the converter's board outside: the board's drift
     dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates), 'mems', or 'demo'

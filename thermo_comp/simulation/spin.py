@@ -34,8 +34,8 @@ class Bend:
 @dataclass(frozen=True, eq=False)
 class Spin:
     """
-    A rotation about a vertical axis: rate [rad/s] linear between times [s], radius [m], and the
-    direction from the unit to the axis, across the vertical, in the frame of the unit.
+    A rotation about a vertical axis: rotation rate [rad/s], linear between the times [s]; radius
+    [m]; horizontal direction from the unit to the axis, in the frame of the unit.
     """
 
     time_s: tuple[float, ...]

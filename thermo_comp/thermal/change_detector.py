@@ -26,7 +26,7 @@ from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
 BEND_SHARES = (1.0, 10.0)  # tuned acceleration of a filter / smallest acceleration at an onset
-TUNING: Final = 1.45  # best memory of a filter in units of (noise / acceleration)^0.4, at 1 Hz
+TUNING: Final = 1.45  # best memory of a filter / (noise sd / acceleration)^0.4, at 1 Hz
 # Noise variance / filter variance for a sensor whose noise is mostly quantization.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING: Final = 5.0  # age of a filter at which its noise is stationary, in filter memories
@@ -40,7 +40,7 @@ SWING_MEMORY_LAGS: Final = 10.0
 
 class ChangeDetector:
     """
-    Baseline, swing and departure of the rate of one sensor.
+    Baseline, swing and departure of the rate of change of one sensor's temperature.
 
     `rate` [K/s] is the output of the filter with the longer memory. `swing` [K/s] is the largest
     distance from the baseline that the rate is known to reach in a soak.
@@ -112,7 +112,7 @@ class ChangeDetector:
         """
         Use the sensor's last accepted reading. The baseline follows the rate at a relative speed
         `pace`: 1 in a soak, 0 in a ramp. Returns the sign of the rate's departure from the
-            baseline, 0 = none.
+        baseline, 0 = none.
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9
@@ -160,7 +160,7 @@ class ChangeDetector:
         self._reading = sensor.reading
 
     def _tune(self, dt: float) -> None:
-        """Set the thresholds, squared and relative to a filter's own variance of the rate."""
+        """Set the squared threshold of each filter, relative to the filter's rate variance."""
         self._dt = dt
         self._thresholds = []
         squared = 1.0
@@ -230,7 +230,7 @@ class ChangeDetector:
 
     def _follow(self, rate: float, dt: float) -> None:
         """
-        Let the baseline follow a rate that lasts for `dt` [s]; its swing and error limit the step.
+        Let the baseline follow a rate that lasts for `dt` [s]; swing and error limit the step.
         """
         baseline, error = self._baseline, self._baseline_error
         limit = self.swing + error

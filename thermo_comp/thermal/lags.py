@@ -4,7 +4,7 @@
 Owns the definitions of lags and play operators, and the covariance of their initial states.
 
 A lag L of an input u obeys ``dL/dt = (u - L) / tau``. The stored state is ``m = u - L``, the input
-less its lag.
+less the lag.
 
 A part may exchange heat with another part that lags the board: the lag then has two stages in
 series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of
@@ -63,7 +63,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def by_board(self) -> float:
-        """Derivative by the board temperature at a given state of the lag."""
+        """Derivative by the board temperature, while the single lags L are constant."""
         if self.input != BOARD_INPUT:
             return 0.0
         return 1.0 if self.second_tau_s else self.shares[0]
@@ -137,8 +137,8 @@ class Play(_Play, Quantity):
 @dataclass(frozen=True)
 class MemorySpec:
     """
-    Contents of the thermal state of a tracker. `sensors`: thermometers by name; the detector uses
-    the first as the leading sensor.
+    Contents of the thermal state of a tracker. `sensors`: names of the thermometers beside the
+    board; the regime detector uses the first as the leading sensor.
     `lags`: in the order of `inputs`. `rates`: sensors whose rate of change is in the state.
     """
 

@@ -18,8 +18,8 @@ import numpy as np
 from ..typing import Floats
 from .lags import BOARD_INPUT, MemorySpec, singles_of
 
-#: Interval between readings / time constant beyond which the input between the readings is
-#: unknown.
+#: Interval between readings / time constant of a lag, beyond which the time at which the input
+#: changed between the readings adds variance.
 SPARSE_SHARE: Final = 0.1
 #: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
 _FADED: Final = 1e-18
@@ -51,7 +51,7 @@ class LagBank:
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
         """
-        Take the input's next value [K], with an error `sd` [K]; between values it is linear.
+        Take the input's next value [K], with an error `sd` [K]; linear in time between values.
         """
         seen_ns = self.stamp_ns
         if seen_ns is None:
@@ -80,8 +80,8 @@ class LagBank:
                 # Between readings far apart, the time at which the input changed is unknown.
                 grown += (change * (1.0 - e)) ** 2
             if sd:
-                # The input's error is the same from step to step, so the standard deviations add,
-                # not the variances.
+                # The input has the same error in all steps, so the standard deviations of the
+                # steps add, not the variances.
                 grown = (math.sqrt(grown) + sd * (1.0 - e)) ** 2
             result.append(grown)
         self.extra = result
@@ -93,7 +93,7 @@ class LagBank:
             self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return ``u - L`` [K] and the extra variance of each lag at a stamp, with u = `value`."""
+        """Return ``u - L`` [K] and the variance `extra` of each lag at a stamp, u = `value`."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -254,7 +254,7 @@ class ThermalMemory:
 
     def start_shares(self, stamp_ns: int) -> list[float]:
         """
-        Return the remaining share of each lag's initial value at a stamp, in the spec's order.
+        Return the share of each lag's initial value that remains at a stamp, in order of the spec.
         """
         ages = {name: bank.age_s(stamp_ns) for name, bank in self.banks.items()}
         return [lag.start_share(min(map(ages.__getitem__, lag.inputs))) for lag in self.spec.lags]

@@ -24,8 +24,8 @@ LARGEST_RATE: Final = 0.2
 #: readings may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: The first reading is wrong if the change after the second reading is less than this share of the
-#: change before.
+#: A sensor's first reading is wrong if the step to the second reading is impossible and the next
+#: change, to the third reading, is less than this share of the step.
 CONTINUED_SHARE: Final = 0.25
 
 #: A sensor's readings count as standing still after this number of equal readings over at least
@@ -110,7 +110,7 @@ class SensorCheck:
         self._first: list[tuple[int, float]] | None = []
 
     def forget_other(self) -> None:
-        """Forget the other sensor's change: its readings were wrong."""
+        """Forget the other sensor's change, because readings of a sensor were wrong."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
@@ -130,13 +130,13 @@ class SensorCheck:
         (first_ns, wrong), (second_ns, second) = first
         step, after = second - wrong, celsius - second
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
-        # In a ramp, or after a real step, the change continues.
+        # Change from the second to the third reading in a ramp of constant rate [K].
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
         is_step = abs(step) > possible + _SIGMAS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
-        """Judge a reading [degC] before it is used: return whether the estimator may use it."""
+        """Judge a new reading [degC]: return whether the estimator may use the reading."""
         sensor = self.sensor
         last_ns, fault = sensor.stamp_ns, self.fault
         self.is_revived = False
@@ -155,8 +155,8 @@ class SensorCheck:
         self._n_same = 0
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
-        # The usual case is decided cheaply: the reading differs from the estimate by less than a
-        # step.
+        # The usual case is decided cheaply: the reading and the estimate differ by less than
+        # `LARGEST_STEP`.
         if (
             fault is Fault.NONE
             and abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP

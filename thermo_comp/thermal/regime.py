@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the causal decision between the static and the dynamic regime; its only clock is the stamps.
+Owns the causal decision between static and dynamic regime; the only clock is the readings' stamps.
 
 The dynamic state *opens* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
@@ -128,7 +128,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Use a new direction once it lasts: with coarse readings the rate changes in steps."""
+        """Use a new direction after half a dwell time: a coarse quantum makes the rate step."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -144,7 +144,7 @@ class RegimeDetector:
         self.direction = direction
         self._turning_ns = None
         self._is_grown = False
-        # The onset is detected long before the rate has grown: hold the dynamic state meanwhile.
+        # The onset is detected long before the rate has grown: hold the dynamic state `hold_ns`.
         hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
         self._held_until_ns = stamp_ns + hold_ns
 
@@ -175,7 +175,7 @@ class _Watch:
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
         """
-        Follow the sensor's rate; return whether it is low, as assumed of a lost or stale sensor.
+        Follow the sensor's rate; return whether the rate is low; without a fresh reading, True.
         """
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:

@@ -50,7 +50,7 @@ class Gradient(Quantity):
 
 class Layout:
     """
-    The numbers of a thermal state: those up to UNKNOWN, pairs of quantity and variance, plays.
+    The numbers of a thermal state: indices to UNKNOWN, then (quantity, variance) pairs, plays.
 
     pairs, lags: index of each pair, and of each lag; the pairs of lags are `lag_pairs`
     variances: places of the pairs' variances in the state

@@ -26,9 +26,9 @@ from typing import Final
 from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
-OUTLIER_LIMITS: Final = 5.0  # innovation / OUTLIER_SIGMAS, beyond which a reading is rejected
+OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a reading is rejected
 RESTART_READINGS: Final = 4  # number of outliers in a row on one side that count as a real change
-# Mean time in the quiet mode [s]; the mean time in the bending mode is the lag.
+# Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
 QUIET_SHARE: Final = 5e-3  # acceleration in quiet / bending mode, for a sensor without wide cells
 CELL_SHARE: Final = 0.2  # acceleration in quiet / bending mode, for a sensor with wide cells
@@ -45,7 +45,7 @@ NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor
 State = tuple[float, float, float, float, float, float, float, float, float]
 """Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance."""
 
-_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # nothing is known
+_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # before a reading
 
 
 class Thermometer:
@@ -68,7 +68,7 @@ class Thermometer:
         self._noise = noise * noise
         self._flat = noise * noise + quantum * quantum / 12.0
         self._noise_scale = 1.0  # actual / declared noise variance
-        self._n_turns = 8.0  # number of innovations in `_noise_scale`; its prior counts as 8
+        self._n_turns = 8.0  # number of innovations in `_noise_scale`, with 8 for the prior
         self._has_cells = settings.has_cells
         self._quantum = quantum
         self._lag = settings.lag_s
@@ -100,7 +100,7 @@ class Thermometer:
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
-        Take a reading [degC]; return False if it is impossible, not newer, or an outlier.
+        Take a reading [degC]; return False if impossible, not newer than the last, or an outlier.
         """
         if not COLDEST <= reading_c <= HOTTEST:
             return False
@@ -286,8 +286,8 @@ class Thermometer:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
         # A repeated reading has no new information: its cell only bounds the variance. If the
-        # estimate is outside the cell, the edge counts as measured, once per time in which the
-        # predicted temperature changes by one sd of the estimate.
+        # estimate is outside the cell, the edge of the cell counts as one measurement per time in
+        # which the predicted temperature changes by one sd of the estimate.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
             return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))

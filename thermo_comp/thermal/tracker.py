@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the tracker of a unit's thermal state: thermometers, regime, memory, weight of the sets.
+Owns the tracker of a unit's thermal state: thermometers, regime, memory, dynamic weight.
 
 The compensator, the fit and the report all run this class, so a regressor means the same when it
 is fitted and when it is applied. The class is causal and reads no clock: each reading has a
@@ -91,7 +91,7 @@ class ThermalTracker:
         rest_gradient_range_k: tuple[float, float],
         stamp_ns: int | None,
     ) -> None:
-        """Use another configuration from a stamp on, without a step in the weight of the sets."""
+        """Use another configuration from a stamp on, without a step in the dynamic weight."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
@@ -101,7 +101,7 @@ class ThermalTracker:
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
     def is_live(self, stamp_ns: int, sensor: Thermometer) -> bool:
-        """Whether a sensor has a reading that is fresh enough at a stamp."""
+        """Whether the last reading of a sensor is at most the case time-out before a stamp."""
         seen_ns = sensor.stamp_ns
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self._case_timeout_s
 
@@ -162,8 +162,7 @@ class ThermalTracker:
         n_before = sensor.n_in_row
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # After a step, a sensor whose readings stay at the new value for long enough starts
-            # again.
+            # A sensor whose readings are rejected as a step starts again after its time-out.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             is_board = sensor is self.board
             patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s

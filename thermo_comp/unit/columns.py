@@ -14,7 +14,7 @@ Each group of the bank has the columns of the kind with the same name, except th
 *product* has the kind board, and *gradient_x_temperature* the kinds gradient and gradient_lag,
 times a power of temperature, for coefficients that change with temperature. *square* also has the
 kind cube, and *gradient_even* the kinds size and square. *part* has the kinds board, square and
-cube: with the curve they sum up to the curves over the temperatures of parts.
+cube: their sum with a curve over the board temperature is a curve over the temperature of a part.
 *gradient_even_about_rest* has the columns of *gradient_even* as functions of the gradient less its
 value at rest.
 
@@ -51,7 +51,7 @@ EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
 #: Lags of the bend columns [s]; smallest distance of the knees of bends [K]; largest number of
-#: knees for a bank of lags, and for known lags of the parts.
+#: knees for a bank of lags, and for given lags of the parts.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -69,7 +69,7 @@ class Part(NamedTuple):
     """
     The lag of a part of the unit behind the board, by the keys of a column.
 
-    tau_s, second_tau_s: time constants of its two stages [s]; the second is 0 for one stage
+    tau_s, second_tau_s: time constants of the two stages [s]; the second is 0 for a single stage
     sensor_share: the part lags the board temperature plus this share of the sensor's gradient
     lead_s: time by which the temperature that the part lags leads the board thermometer [s]
     """
@@ -81,13 +81,13 @@ class Part(NamedTuple):
 
     @property
     def of_gradient(self) -> 'Part':
-        """The time constants of the part alone, which are those of a lag of a gradient."""
+        """The part with its time constants only, as the lag of a gradient has no other keys."""
         return Part(self.tau_s, self.second_tau_s)
 
 
 @dataclass(frozen=True)
 class Column:
-    """One regressor of the thermal response; its keys are the calibration file's."""
+    """One regressor of the thermal response; the fields are keys of the calibration file."""
 
     group: Annotated[_Group, 'Group of columns that the fit keeps or drops together.']
     kind: Annotated[
@@ -194,7 +194,7 @@ def bank(
     """
     Return all columns that a response may have, without limits of range; `at_rest` is the gradient
     of each sensor at rest [K], `span_k` the range of temperatures in the data, from the reference
-    [K]. `parts` are the lags of the part of each axis; if given, there are no other lags.
+    [K]. `parts` are the lags of the part of each axis; if given, no column has another lag.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
@@ -328,7 +328,7 @@ class ColumnTable:
             for term in dict.fromkeys(terms.tolist())
             if term.form is not LINE
         ]
-        # The temperature of a part is the difference of two numbers of a thermal state.
+        # The temperature of a part is the board temperature less a lag: two numbers of a state.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 
@@ -378,7 +378,7 @@ class ColumnTable:
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
         Differentiate u, without limits of range: by the number that u is computed from, and by the
-        board temperature at a given lag; None if no column depends on the board temperature.
+        board temperature at a given lag (None if no column depends on the board temperature).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

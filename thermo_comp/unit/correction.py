@@ -28,11 +28,11 @@ from .functions import hold, in_order
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection, beyond_force
 
-#: Largest rate of change of the output while the two sets are blended [m/s^3], 1 ug per second,
-#: and the number of transition times up to which the blending is lengthened to keep this rate.
+#: Largest rate of change of the force while static and dynamic set are blended [m/s^3], 1 ug per
+#: second; largest factor by which the transition time is lengthened to keep this rate.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which curves and differences of the two sets are evaluated.
+#: Number of board temperatures at which curves, and static - dynamic differences, are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
@@ -65,13 +65,13 @@ class Excess(NamedTuple):
 
 class Correction:
     """
-    Both sets of a calibration, blended by the weight of the thermal state, and its response.
+    Static and dynamic set of a calibration, blended by the dynamic weight, and thermal response.
 
-    memory: memory that the tracker needs for force and angular rate, or the tracker's memory
+    memory: the given memory, else that which the tracker needs for force and angular rate
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
-    misalignment: yx, zx, zy of M
-    beyond: variance of forces beyond those of the fit
+    misalignment: elements yx, zx, zy of the misalignment matrix M
+    beyond: additional variance at forces beyond those of the fit
     """
 
     def __init__(self, calibration: Calibration, memory: MemorySpec | None = None) -> None:
@@ -149,7 +149,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Lengthen a transition time [s], so that the output changes by GENTLE_RATE at most."""
+        """Lengthen a transition time [s] towards GENTLE_RATE, at most by LONGEST_TRANSITION."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         static, dynamic = self.curves.values(board)
         gap = dynamic - static
@@ -177,8 +177,8 @@ class Correction:
 
     def by_pairs(self, slopes: Floats) -> Floats:
         """
-        Differentiate bias and relative scale by `Layout.pairs`, (p, 6, n), given derivatives of
-        phi.
+        Differentiate bias and relative scale by the quantities of `Layout.pairs`, (p, 6, n), given
+        the derivatives of the columns phi by these quantities, (n_columns, n).
         """
         columns = self._pair_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
@@ -199,8 +199,8 @@ class Correction:
         ends.
 
         `slow` is the slow part of the error's covariance, shape (n_slow, n), see
-        `SlowUncertainty.at`. Returns by axis bias and its change over the segment, scale and its
-        change, then the coefficients of the covariance with the noise of a message, see
+        `SlowUncertainty.at`. Returns by axis bias and its change over the segment (1 s), scale and
+        its change, then the coefficients of the covariance with the noise of a message, see
         `covariance.covariance_at`: (52,) or (52, n). With a nonlinearity `slow` has 15 more rows
         and the result 21 more, see `ForceCorrection.rows`.
         """
@@ -253,12 +253,12 @@ class Correction:
         slow: Floats,
     ) -> tuple[Floats, Floats]:
         """
-        Evaluate a, b, c of each axis' error variance, (3, 3, n), without the noise of a message,
-        and the factor (3, n) by which the variance of the parameters grows outside the ranges.
+        Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without noise
+        of a message, and the factor (3, n) of the variance of the parameters outside the ranges.
 
-        The difference of the two sets (`gap`) is added as an error while the sets are blended,
-        outside the ranges, and while the regime is unknown; while it is unknown the variances of
-        both sets are added.
+        The difference of dynamic and static set (`gap`) is added as an error while the sets are
+        blended, outside the calibrated ranges, and while the regime is unknown. While the regime
+        is unknown, the variances of both sets are added.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         static_weight, beyond_range = 1.0 - weight, raw - held
@@ -314,8 +314,8 @@ class Correction:
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
-        Propagate independent errors of variances (p, n) to a, b, c of each axis, shape (3, 3, n);
-        `moved` is the change of bias and relative scale per unit of each error, shape (p, 6, n).
+        Propagate independent errors of variances (p, n) to the variance ``a + b x + c x^2`` of
+        each axis, (3, 3, n); `moved`: bias and relative scale per unit of each error, (p, 6, n).
         """
         variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
         parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))

@@ -11,7 +11,7 @@ misalignment M. To first order the error of the corrected force is ::
     e_y = yx (u0 + x u1) + u2 + y u3 + x u6
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
-so that each element of its covariance is a polynomial of second degree in x, y, z. The
+so that each element of the covariance of e is a polynomial of second degree in x, y, z. The
 coefficients of the polynomials are sums over the elements of the covariance of u, which are called
 rows here: first a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then one
 row for each pair in `BETWEEN`.
@@ -49,7 +49,7 @@ CONSTANTS: Final = tuple(sum(map(len, _TERMS[:element])) for element in (0, 3, 5
 
 
 class CovarianceMap:
-    """The linear map from the rows of a covariance of u to the coefficients of the elements."""
+    """Linear map from the rows of the covariance of u to the coefficients of xx .. zz."""
 
     def __init__(self, misalignment: Sequence[float]) -> None:
         yx, zx, zy = misalignment
@@ -79,15 +79,15 @@ def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
     factors = sums[:, u, w]
     # The row b of an axis is twice the covariance of its two errors.
     factors[:, 1:9:3] /= 2.0
-    # Few rows have a factor in a sum: keep their places and factors only.
+    # In each sum few rows have a factor other than 0: keep the places and factors of these rows.
     n = int((factors != 0.0).sum(axis=1).max())
     used = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
     return used, np.take_along_axis(factors, used, axis=1)[:, :, np.newaxis]
 
 
 def grown(between: Floats, growth: Floats) -> Floats:
-    """Multiply rows `BETWEEN` (36, n) by the factors (3, n) by which the axes' variances grow."""
-    # The misalignment does not depend on the temperature.
+    """Increase the rows `BETWEEN` (36, n) by the growth factors (3, n) of the axes' variances."""
+    # The misalignment does not depend on the temperature, so its errors have the factor 1.
     roots = np.repeat(
         np.concatenate((np.sqrt(growth), np.ones_like(growth))), [2] * 3 + [1] * 3, 0
     )

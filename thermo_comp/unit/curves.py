@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the curves of both sets over the board temperature, within and beyond their ranges.
+Owns the curves of static and dynamic set over board temperature, within and beyond their ranges.
 
 Thermal states and rows of results are laid out as in `correction`; each state is evaluated alone.
 """
@@ -62,8 +62,8 @@ class Curves:
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """
-        Return distances outside the ranges, (2, n): temperature [K], rate [K/s], then both in half
-        ranges.
+        Return the distances outside the ranges of each set, shapes (2, n): temperature [K], rate
+        [K/s], then temperature and rate in half ranges.
         """
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
@@ -157,7 +157,7 @@ class Curves:
 
     @cached_property
     def _families(self) -> list[int]:
-        """Index of the first bias or scale with equal families, for each of the six curves."""
+        """Index of the first curve with the same function families, for each of the six curves."""
         bases = [
             tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
             for functions in zip(*self._functions.rows, strict=True)
@@ -167,7 +167,7 @@ class Curves:
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
         Differentiate values beyond the ranges by the free coefficients of a function, (n_free, n).
-        The values contain the function's tangent, and the held difference of the sets.
+        Values beyond a range contain the function's tangent and the held difference of the sets.
         """
         function = self._functions.rows[regime][place]
         own_range, other_range = (

@@ -239,8 +239,8 @@ class ForceCorrection:
 
     def rows(self, board: Floats, slow: Floats) -> Floats:
         """
-        Return K2, Kq, K3 by axis, then the variance's coefficients of x^3 to x^6 by axis, (21, n);
-        rows of the slow part: by axis the coefficients of x^2 to x^6, shape (15, n).
+        Return K2, Kq, K3 by axis, then the variance's coefficients of x^3 to x^6 by axis, (21, n).
+        `slow`: by axis the coefficients of x^2 to x^6 in the variance of the force, (15, n).
         """
         k = self._of.coefficients(self.held(board)).swapaxes(0, 1)
         higher = slow.reshape(3, 5, -1)[:, 1:]

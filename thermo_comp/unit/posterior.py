@@ -74,7 +74,7 @@ class Posterior:
         return result
 
     def check_size(self, expected: int) -> None:
-        """Raise ValueError, with the key's name, if the number of parameters differs."""
+        """Raise ValueError, with the key's name, if there are not `expected` parameters."""
         if self.n_parameters != expected:
             raise ValueError(
                 f'`posterior.rest` must have one number per parameter ({expected}), '
@@ -116,8 +116,8 @@ def lay_out(
 class ParameterLayout(NamedTuple):
     """
     The order of a calibration's parameters in its posterior: axis by axis the bias [input units],
-    then the scale [relative]; axis by axis from `nonlinear` on the coefficients of its terms, then
-    their changes per kelvin; M[1][0], M[2][0], M[2][1] from `misalignment` on.
+    then the scale [relative]; axis by axis from `nonlinear` on the nonlinear coefficients, then
+    the changes of these per kelvin; M[1][0], M[2][0], M[2][1] from `misalignment` on.
     """
 
     bias: list[Block]

@@ -6,8 +6,8 @@ by lags whose initial state is unknown), and hypothetical states: a soak and a r
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
-stop. In a soak (q = 0) gradients, lags and plays are 0. The gradient of the first sensor includes
-the gradient by self-heating, `soak_gradient_k`. The static set applies in a soak, the dynamic set
+stop. In a soak (q = 0) gradients, lags and plays are 0, apart from self-heating: the gradient of
+the first sensor includes `soak_gradient_k`. The static set applies in a soak, the dynamic set
 in a ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
 """
 
@@ -79,9 +79,9 @@ class SlowUncertainty:
 
     def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         """
-        Differentiate bias [input units] and scale [relative] by the unknowns of a start, which
-        have unit variance, shape (n_unknown, 6, n). `rates`: largest known rate of the board
-        temperature since the start, (n,) [K/s].
+        Differentiate bias [input units] and scale [relative] by the unknown initial lag states, as
+        variables of unit variance, shape (n_unknown, 6, n). `rates`: largest known rate of the
+        board temperature since the start, (n,) [K/s].
         """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
@@ -137,8 +137,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Return the variance of the bias by the parameters at thermal states (n, w), and the
-        variance of the bias less its mean over the rows `mean_of`, shapes (n, 3) [m^2/s^4].
+        Return the variance of the bias by the parameters at thermal states (n, width), and the
+        variance of the bias less its mean by `mean_of`, shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -161,7 +161,7 @@ def in_a_soak(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Return bias [m/s^2], its sd, scale [units per m/s^2], its relative sd, shapes (3,), in a soak
-    at the reference or another temperature.
+    at a board temperature [degC], by default the reference temperature.
     """
     at = np.array([calibration.reference_temperature_c if temperature is None else temperature])
     states = ramp_states(calibration, at)
@@ -209,8 +209,8 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
 
 def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
     """
-    Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3); the
-    gradient of a soak is uncertain by its sd.
+    Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3), including
+    the sd of the self-heating gradient in a soak.
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)

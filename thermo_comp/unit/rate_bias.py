@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bias of a unit's gyroscope, with the columns of the accelerometer; its scale is 1."""
+"""Owns the bias of a unit's gyroscope, over the same columns as the force; the scale is 1."""
 
 import math
 from dataclasses import dataclass, field

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function and its derivative; the bits of a result depend on one x alone."""
+    """A function of x and its derivative; each x is evaluated alone, bit for bit."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -156,7 +156,7 @@ class GradientLag(Term):
 
 
 class Square(Term):
-    """Curves of parts that lag the board; without a lag, losses of a heat flow."""
+    """Curves of parts that lag the board; without a lag, losses quadratic in a heat flow."""
 
     kind, formula = 'square', '(T - lagged T)^2, or q_s^2 without lag'
     groups = (('square', 'curves of parts that lag'),)
