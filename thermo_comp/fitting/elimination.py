@@ -79,7 +79,7 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower: it does not use that they are
+        # `numpy.linalg.inv` of all factors at once is slower: `inv` does not use that factors are
         # triangular.
         root = np.stack([inverse_root(factor).T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)

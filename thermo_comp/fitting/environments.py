@@ -3,8 +3,8 @@
 """
 Owns the exclusion of bags of another environment, and the error that is published for them.
 
-In a chamber with a fan the board temperature follows the case temperature by one law, in still air
-by another. The bias of a part without a thermometer depends on the environment, and no set of
+In still air the board temperature follows the case temperature by another law than in a chamber
+with a fan. The bias of a part without a thermometer depends on the environment, and no set of
 coefficients describes two environments: a bag of still air would increase the error in a chamber
 with a fan. The fit excludes a bag of another environment and publishes the error of its correction
 as a lack of fit.
@@ -125,7 +125,7 @@ def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str
 ) -> tuple[Calibration, Finding]:
     """
-    Add the error of the correction of excluded bags to the lack of fit of both sets; `others`
+    Add the error of the correction of excluded bags to the lack of fit of both regimes; `others`
     names the bags or the prior that these bags contradict.
     """
     windows = thermal_windows(bags, prior_model(calibration))

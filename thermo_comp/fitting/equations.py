@@ -53,7 +53,7 @@ def last_result_kept(
 
 class Effects(NamedTuple):
     """
-    The effect of a state of the unknowns at the reference temperature.
+    The readings that a state of the unknowns predicts at the reference temperature, by parts.
 
     force: specific force along each axis in each position, shape (n_positions, 3)
     by_rotation: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
@@ -293,7 +293,7 @@ class Equations(Series):
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
-        """Return the unknowns less the mean of the prior, 0 for all but the unit's, (n,)."""
+        """Return the unknowns less their prior mean, which is 0 except for the unit's, (n,)."""
         result = as_vector(state, layout)
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean

@@ -274,7 +274,7 @@ def with_terms(state: State, calibration: Calibration) -> State:
 
 
 def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
-    """Add square and cube with their prior sd to a prior that has no nonlinearity."""
+    """Add the terms square and cube, with prior sd, to a calibration without nonlinearity."""
     posterior, at = calibration.posterior, parameter_layout(calibration).misalignment
     if calibration.nonlinearity is not None or posterior is None:
         return calibration

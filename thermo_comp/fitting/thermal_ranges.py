@@ -49,13 +49,13 @@ def temperature_range(windows: ThermalWindows) -> Range:
 
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
-    Return the first sensor's gradient in soaks and its robust scatter [K]; that of a prior
-    calibration if it has one; None without the sensor or a soak.
+    Return the first sensor's gradient in soaks and its robust scatter [K]; both from a prior
+    calibration if it has them; None without the sensor or a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
     rate = 60.0 * np.abs(windows.rate)
-    # If the rate is noisy, take the slowest tenth of the windows.
+    # If the rate is noisy, the slowest tenth of the windows counts as soak.
     slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
     is_soak = rate <= slowest
     if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
