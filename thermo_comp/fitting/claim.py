@@ -37,7 +37,7 @@ from .windows import CURVE, LAGS, PART
 #: Largest usual sd of the offsets of mountings within a turn-on, of turn-ons, and of mountings
 #: that each have their own turn-on, relative to `Prior.offset_scale`. By data sheets, turn-ons
 #: of tactical triads repeat within 0.3 to 1 mg, those of MEMS within some mg: 10 to 20 times that
-#: scale. These factors are smaller, a compromise with units whose turn-ons repeat perfectly.
+#: scale. The factors are smaller, a compromise with units whose turn-ons repeat perfectly.
 LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
@@ -72,7 +72,7 @@ def claim_of(
 
     `candidates`: prior sd of the columns that could take part, shape (2, m); columns that the
     data do not determine are added to the covariance; `gravity_sd`: sd of local gravity [m/s^2];
-    `known_offset_sd`: sd of mounting and turn-on offsets by a prior calibration [m/s^2]; or 0;
+    `known_offset_sd`: sd of mounting and turn-on offsets by a calibration [m/s^2]; 0 for none;
     `informative`: priors from one calibration, with different ageings since that calibration;
     `of_means`: see `Fit`; `lacks_effects`: whether noise does not explain the left-out drift, see
     `Selected` and `jackknife`

@@ -157,7 +157,7 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the best of several sets of rests, each given as mean readings of shape (n, 3).
 
     The best set has the smallest sd of the constants, from the residuals of |f| and the directions
-    of its rests. The first set within 2 % of this sd is taken, since earlier sets have stricter
+    of its rests. The first set within 2 % of the smallest sd is taken: earlier sets have stricter
     thresholds; if no set has six attitudes, the first set of all is taken.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]

@@ -266,7 +266,7 @@ def _candidates(
         fixed[1] = parts[1] & np.isin(groups, (CURVE, PART))
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
-        # All columns of the paper's sets are kept; ten times the largest sd is a flat prior.
+        # All columns of both sets of the paper are kept; ten times the largest sd is a flat prior.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (
         np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, steepest)

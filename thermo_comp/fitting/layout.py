@@ -59,7 +59,7 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Places of radius, misalignment and poses, shared by the axes, at the unit's end."""
+        """Places of radius, misalignment and poses, shared by all axes: the unit's last places."""
         return np.concatenate((self.radius, self.misalignment, self.pose.ravel()))
 
     @property

@@ -39,7 +39,7 @@ from .unknowns import State
 
 # Smallest number of windows of a position for a score of the position's drift.
 _FEWEST_WINDOWS = 8
-# Logarithms of mean square errors that differ by less than this count as equal: 5 % of an RMS.
+# Two logarithms of mean square errors count as equal below this difference: 5 % of an RMS.
 _EQUAL = 0.1
 
 

@@ -125,7 +125,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         largest = float(np.sqrt((square / noise**2).max()))
         if largest < least:
             x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-            # Curves that explain the drift may extrapolate badly to left-out sections.
+            # Curves alone extrapolate badly to left-out sections: allow them 10 times the noise.
             most_drift = 10.0 if is_explained and not shape.has_stress else 2.0
             accepted = Parts((x, y, z), factors, most_drift * float(noise.mean()))
             least = largest
@@ -138,7 +138,7 @@ class _PartCurves:
     """
     Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
 
-    Every k-th window is used, with the largest k that leaves `n_windows` windows or more.
+    Every k-th window is used, so that `n_windows` windows or more are left, if there are as many.
     """
 
     def __init__(

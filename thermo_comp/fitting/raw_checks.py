@@ -111,7 +111,7 @@ def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
 def _judge_units(
     bags: Sequence[ReducedBag], size: float, options: FitOptions
 ) -> Iterator[Finding]:
-    """Check whether samples with this norm at rest are counts; `size`: [input units]."""
+    """Check whether samples with a norm of `size` [input units] at rest are counts."""
     if options.input != 'counts' or all(bag.is_integer for bag in bags):
         return
     for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):

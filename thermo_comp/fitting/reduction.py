@@ -4,8 +4,8 @@
 Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
-second (see `stillness`), and the cells of a still interval to windows of ten seconds; only the
-last window of an interval is shorter. Within a window every thermal regressor is linear in time to
+second (see `stillness`), and the cells of a still interval to windows of ten seconds, or less if
+the interval is short; its last window may be shorter. Within a window every thermal regressor is linear in time to
 far below the noise, so the mean of a window is a sufficient statistic. The noise of the means is
 estimated by the regression, because means of a charge-balancing converter have less noise than the
 scatter of its samples implies.
@@ -54,7 +54,7 @@ class StillInterval:
     begin_s: start of the interval's first window, since the bag's first sample [s]
     n_whole: number of windows of full length; a shorter window may follow
     time, count, mean: mean time [s], number and mean of the samples of each window
-    sample_sd: standard deviation of single samples in each window
+    sample_sd: median over the cells of the standard deviation of single samples, shape (3,)
     angular_rate: mean angular rate of each window [rad/s]; None if a part of the bag has no rate
     """
 
@@ -297,7 +297,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 def is_spike(value: Floats) -> Bools:
     """
-    Return which readings are more than 10 K from the readings before and after, shape (n,).
+    Return which readings are more than 10 K from the median of five neighbours, shape (n,).
 
     A thermometer without contact reads -127 or 85 degC for a moment. The tracker rejects spikes,
     unless spikes have increased the noise that a fit expects of the thermometer.

@@ -105,7 +105,7 @@ class Fit(NamedTuple):
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
-    """Compare the chosen model with each trial in turn, and return the best of all."""
+    """Compare the chosen model with each trial in turn, keep the better, return the last kept."""
     for trial in trials:
         if is_better(chosen.score, trial.score):
             chosen = trial
@@ -195,7 +195,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus a group or set, for the three largest possible gains."""
+        """Fit the chosen model plus one or more groups, for the three largest possible gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []

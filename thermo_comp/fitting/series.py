@@ -68,7 +68,7 @@ class Whitener:
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
     def shows(self, time_s: float) -> bool:
-        """Whether a search may try a correlation time: the candidates up to `_longest_s`."""
+        """Whether a search may try a correlation time: from `times_s[0]` to `_longest_s`."""
         if not self.times_s:
             return False
         # Rounding must not exclude the shortest time.

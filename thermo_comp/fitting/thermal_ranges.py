@@ -60,7 +60,7 @@ def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range |
     is_soak = rate <= slowest
     if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
         return None
-    # While a soak settles, the gradient still changes with the rate.
+    # While a soak settles, the gradient changes with the rate: fit a line over the rate.
     gradient, by_rate = windows.gradient[is_soak], np.vander(windows.rate[is_soak], 2)
     slope, middle = np.linalg.lstsq(by_rate, gradient, rcond=None)[0].tolist()
     scatter = np.abs(gradient - by_rate @ (slope, middle))
