@@ -42,7 +42,7 @@ def _is_far_above(square: Floats | float, usual: float) -> Bools:
 
 def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Find the bag that may be of another environment: a list of one bag, or of none.
+    Find the bag that may be of another environment: a list of one bag, or an empty list.
 
     A bag is suspect if its left-out drift is far above both the median of all bags and the white
     noise of a window. A bag is also suspect if its drift is the only one that the other bags do

@@ -98,7 +98,7 @@ def _updated(
     changes.append(change)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth one.
+        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
         # The elements change their sd only if the data determine more than one element of M.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)

@@ -183,7 +183,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 
 def is_undecided(before: Score, after: Score) -> bool:
-    """Whether left-out data do not decide between two models: equal drifts, no norms in common."""
+    """Whether left-out data do not decide between two models: equal drifts, no common norms."""
     *drift, norms = _gains(before, after)
     return norms is None and all(abs(gain[0]) < _EQUAL for gain in drift if gain)
 

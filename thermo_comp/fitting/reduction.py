@@ -4,11 +4,11 @@
 Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
-second (see `stillness`), and the cells of a still interval to windows of ten seconds, or less if
-the interval is short; its last window may be shorter. Within a window every thermal regressor is linear in time to
-far below the noise, so the mean of a window is a sufficient statistic. The noise of the means is
-estimated by the regression, because means of a charge-balancing converter have less noise than the
-scatter of its samples implies.
+second (see `stillness`), and the cells of a still interval to windows of ten seconds, or less in a
+short interval; the last window of an interval may be shorter. Within a window every thermal
+regressor is linear in time to far below the noise, so the mean of a window is a sufficient
+statistic. The noise of the means is estimated by the regression, because means of a
+charge-balancing converter have less noise than the scatter of its samples implies.
 """
 
 from __future__ import annotations
@@ -192,13 +192,13 @@ def reduce_source(
         return usual
     share = usual.n_still_cells / usual.n_cells
     if share < 0.95 and source.force is None:
-        # If rests are interrupted, shorter cells are used if these add 5 % of the bag to the
-        # rests.
+        # If rests are interrupted, shorter cells are used if shorter cells add 5 % of the bag to
+        # the rests.
         shorter, _ = reduced(10)
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
     if share < 0.5:
-        # If rests are short, shorter cells are used if these show six attitudes.
+        # If rests are short, shorter cells are used if shorter cells show six attitudes.
         shorter, _ = reduced(5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)
