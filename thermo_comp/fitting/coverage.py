@@ -83,14 +83,14 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Find the direction that is farthest from all of `up` (n, 3), and how far [deg]."""
+    """Find the direction farthest from all of `up` (n, 3), and its angle to the nearest [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
 
 
 def distinct_directions(up: Floats) -> Floats:
-    """Return the unit vectors, shape (n, 3), without vectors close to an earlier vector."""
+    """Drop unit vectors, (n, 3), that are within `SAME_DIRECTION_DEG` of an earlier vector."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(SAME_DIRECTION_DEG))
     for direction in up:

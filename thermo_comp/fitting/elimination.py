@@ -3,8 +3,8 @@
 """
 Owns the elimination of the unknowns of positions and bags from the normal equations.
 
-Each position has unknowns (attitude, offsets, tilts) that occur in no other position; they are
-eliminated first, then the initial lag states of each bag. After the elimination, normal equations
+Each position has unknowns (attitude, offsets, tilts) that occur in no other position; these unknowns
+are eliminated first, then the initial lag states of each bag. After the elimination, normal equations
 for the unknowns of the unit remain.
 """
 
@@ -28,7 +28,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     shape (..., n, n).
 
     The matrix is scaled to a unit diagonal, or by the root of `diagonal`, shape (..., n), if it is
-    given; then the smallest jitter that suffices is added to the diagonal.
+    given; then the smallest jitter with which a factor exists is added to the diagonal.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)

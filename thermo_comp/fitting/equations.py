@@ -118,7 +118,7 @@ class Equations(Series):
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
         """
-        Assign a place to every unknown; return the same object for the same unknowns.
+        Assign a place to every unknown; return one `Layout` object for equal arguments.
 
         `used`: active columns of bias and scale, shape (2, m); `nonlinear`: active nonlinear
         coefficients, shape (2 k,); None for all
@@ -285,7 +285,7 @@ class Equations(Series):
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_share
         # The prior of attitudes is flat, so its precision is 0. An angular rate does not depend on
-        # the attitude, and a precision of 1 keeps its equations regular.
+        # the attitude, and a precision of 1 keeps the attitude's equations regular.
         result[layout.up] = 0.0 if self.gravity else 1.0
         result[layout.posed] = prior.pose_sd**-2
         # The prior of a pose is almost flat: its sd is 1 rad.

@@ -46,7 +46,7 @@ _EQUAL = 0.1
 @dataclass(frozen=True)
 class Folds:
     """
-    Left-out errors of the n folds of one kind.
+    Left-out errors of the n folds of one kind, such as positions or sections.
 
     square: mean square error of each fold [(m/s^2)^2], NaN if the fold is not scored, shape (n,)
     windows: number of windows of each fold, shape (n,)

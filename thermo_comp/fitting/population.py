@@ -49,7 +49,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError if there are fewer calibrations, or if they differ in input, reference
+    Raises FitError for fewer calibrations than three, or if they differ in input, reference
     temperature, sensors or curves.
     """
     if len(calibrations) < UNITS_NEEDED:

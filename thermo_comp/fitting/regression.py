@@ -261,7 +261,7 @@ class Point:
         return result
 
     def posterior(self, end: Point) -> Posterior:
-        """Return the posterior at `end`, near this point, with this point's curvature."""
+        """Return the posterior at the point `end`, with the curvature at the near point `self`."""
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
         n, unit_root = layout.n_unit, inverse_root(factor)
@@ -305,7 +305,7 @@ class Regression(Equations):
         return tangent, tangent.normal(self.products_at(grams, state, base))
 
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
-        """Find the posterior at the mode, in at most `n_steps`; with 0 steps at `state`."""
+        """Find the posterior at the mode in at most `n_steps` steps; with 0 steps, at `state`."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
         for _ in range(n_steps):

@@ -39,7 +39,7 @@ LARGE_OFFSETS = 10.0
 @dataclass(frozen=True)
 class Trial:
     """
-    A model that was tried.
+    A model that the selection has fitted.
 
     groups: its groups of columns; () for a model of constants alone
     score: its left-out errors

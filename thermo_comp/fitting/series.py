@@ -80,7 +80,7 @@ class Whitener:
         """
         Run the Kalman filter over series, shape (n, m), for k noises of equally many processes.
 
-        Yields for each step: window of each position, whether the position has it, innovations,
+        Yields for each step: window of each position, whether the position has one, innovations,
         shape (k, n_positions, m), and their variances [sigma^2], shape (k, n_positions).
         """
         times_s = np.array([[noise.times_s] for noise in noises])

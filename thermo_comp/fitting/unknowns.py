@@ -38,7 +38,7 @@ def misalignment_scale(noise: float) -> float:
 @dataclass(frozen=True)
 class Windows:
     """
-    The data: windows sorted by position and time, with every column of the table.
+    The data of a fit: windows sorted by position and time, with every column of the table.
 
     position, bag: numbers from 0; a position lies in one bag, shape (n,)
     section: number of the program section, from 0, rising with time in each bag, shape (n,)
@@ -205,7 +205,7 @@ class InformativePrior:
 @dataclass(frozen=True)
 class Prior:
     """
-    Standard deviations of the prior, and the noises.
+    Standard deviations of the prior of the unknowns, and the noises of the windows.
 
     bias_sd: sd of the bias [m/s^2], shape (3,); its mean is 0
     scale_mean, scale_sd: mean of the scale ratio kappa of each axis, shape (3,), and its sd
@@ -250,7 +250,7 @@ class Prior:
 @dataclass(frozen=True)
 class State:
     """
-    The unknowns.
+    The unknowns of the regression.
 
     kappa, bias: scale ratio and bias [m/s^2], shape (3,)
     weights: weights of the columns in bias and scale, in units of their RMS, shape (2, 3, m)
