@@ -3,9 +3,9 @@
 """
 Owns the elimination of the unknowns of positions and bags from the normal equations.
 
-Each position has unknowns (attitude, offsets, tilts) that occur in no other position; these unknowns
-are eliminated first, then the initial lag states of each bag. After the elimination, normal equations
-for the unknowns of the unit remain.
+Each position has unknowns (attitude, offsets, tilts) that occur in no other position. The
+unknowns of positions are eliminated first, then the initial lag states of each bag. After the
+elimination, normal equations for the unknowns of the unit remain.
 """
 
 from __future__ import annotations
