@@ -68,7 +68,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     if not has_choice or not _may_have_sets(fit.selected):
         return fit
     # The alternative detector ends the dynamic regime once the case temperature is constant; the
-    # default also waits for the board temperature. Only models with two sets depend on the regime.
+    # default detector also waits for the board. Only models with two sets depend on the regime.
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
@@ -116,8 +116,8 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the chosen model, or one as good, has two sets: a model whose left-out error is within
-    one standard error, and its white noise below 80 % of the chosen model's on every axis.
+    Whether the chosen model has two sets, or another model has, whose left-out error is within one
+    standard error, and whose white noise is below 80 % of the chosen model's on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

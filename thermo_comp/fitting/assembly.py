@@ -152,7 +152,7 @@ def _valid_columns(
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
         if k in of_parts and column.term.order % 2:
-            # A part lags as far when it cools as when it warms.
+            # A part lags as far in cooling as in warming: odd powers are valid with both signs.
             valid = union((valid, (-valid[1], -valid[0])))
         # A column used only in the curves over parts' temperatures gets the group of these curves.
         group = PART if k in weighed and not alone[k] else column.group

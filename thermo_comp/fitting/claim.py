@@ -5,9 +5,9 @@ Owns the published uncertainty: the covariance of the fit, widened by the parame
 do not determine, and by the effects that the model lacks.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
-mixture of fits on a grid of this standard deviation. A fit's weight in the mixture is the evidence
-of the norms times a half-Student prior. The standard deviation of gravity is a common error of the
-scale factors. The effects that the model lacks are those of `jackknife`.
+mixture of fits on a grid of this standard deviation. The weight of a fit in the mixture is its
+evidence, limited by the evidence of the positions' norms, times a half-Student prior of the offset
+sd. An error of gravity is common to all axes; `jackknife` adds effects that the model lacks.
 
 References
 ----------
@@ -35,9 +35,9 @@ from .unknowns import InformativePrior, Prior, State
 from .windows import CURVE, LAGS, PART
 
 #: Largest usual sd of the offsets of mountings within a turn-on, of turn-ons, and of mountings
-#: that each have a turn-on of their own, relative to the scale of the fit's prior. By data sheets,
-#: turn-ons of tactical triads repeat within 0.3 to 1 mg, those of MEMS within some mg: 10 to 20
-#: times the scale. The values are a compromise with units whose turn-ons repeat perfectly.
+#: that each have their own turn-on, relative to `Prior.offset_scale`. By data sheets, turn-ons
+#: of tactical triads repeat within 0.3 to 1 mg, those of MEMS within some mg: 10 to 20 times that
+#: scale. The factors are smaller, a compromise with units whose turn-ons repeat perfectly.
 LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
@@ -70,9 +70,9 @@ def claim_of(
     """
     Return the published covariance of the fit of the chosen model.
 
-    `candidates`: prior sd of the columns that could take part, shape (2, m); those that the data
-    do not determine are added to the covariance; `gravity_sd`: sd of the local gravity [m/s^2];
-    `known_offset_sd`: sd of mounting and turn-on by the prior calibration [m/s^2]; 0 for none;
+    `candidates`: prior sd of the columns that could take part, shape (2, m); columns that the
+    data do not determine are added to the covariance; `gravity_sd`: sd of local gravity [m/s^2];
+    `known_offset_sd`: sd of mounting and turn-on offsets by a calibration [m/s^2]; 0 for none;
     `informative`: priors from one calibration, with different ageings since that calibration;
     `of_means`: see `Fit`; `lacks_effects`: whether noise does not explain the left-out drift, see
     `Selected` and `jackknife`
@@ -87,7 +87,7 @@ def claim_of(
         prior = replace(prior, misalignment_sd=prior.unseen_misalignment_sd)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
-    # A stated sd is that of a mounting or of a turn-on: beside the independent offsets of m
+    # A stated offset sd is that of a mounting or a turn-on: beside the independent offsets of m
     # mountings the covariance contains the offsets of n turn-ons with 1 - n / m of the variance.
     shared_variance = offset_sd**2 * (1.0 - n_turn_ons / n_mountings)
     if prior.offset_scale > 0.0:
@@ -103,8 +103,8 @@ def claim_of(
     if shared_variance:
         covariance = covariance + shared_variance * _of_turn_ons(regression, posterior)
     if candidates is not None:
-        # The covariance with unseen columns is computed at the mode's mounting sd. Add the excess
-        # of the mixture's covariance over that of the mode.
+        # The covariance with unseen columns is computed at the mode's mounting sd. Add to it the
+        # excess, by mixtures, jackknife and turn-ons, over the covariance of the mode.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, candidates, of_means)
         at = _places(posterior.layout, layout)
@@ -125,13 +125,13 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     calibration, 0 for none; `kind`: a key of `LARGEST_USUAL`
     """
     if known_sd:
-        # Twelve positions determine an sd to a factor of 1.5.
+        # Twelve positions determine the sd of their mounting offsets to a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
     # By data sheets, turn-ons of navigation grade repeat within some 10 ug at best; mountings
     # within one turn-on repeat better.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # In steps of a third of a decade, over which the log evidence is smooth.
+    # The grid of the sd has steps of a third of a decade: the log evidence is smooth over a step.
     ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)
     small = np.minimum(np.log(ratio / least), 0.0)
     return scale * ratio, _student(ratio / LARGEST_USUAL[kind]) + small
@@ -163,10 +163,10 @@ def _widened(
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
         return with_unseen.layout, with_unseen.covariance.copy()
-    # A warm-up of the unit changes the board in another way than the chamber does. If the drifts
+    # A warm-up of the unit heats the board in another way than a chamber does. If the drifts
     # in bags at rest determine the curve, the curve of the positions' means is an alternative.
     other = _with_curve(regression, state, of_means)
-    # An sd of almost 0 gives the columns of the other curve a place in the covariance.
+    # An sd of 1e-9 gives columns of the means' curve alone a place in the covariance.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -199,7 +199,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
     # Few temperatures do not determine all powers of a curve. One attitude does not separate the
-    # drifts of bias and scale factor, so each of them may have the columns of the other.
+    # drifts of bias and scale factor, so bias and scale factor may each have the columns of both.
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -221,7 +221,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
-        # Curves over temperature deviate from their largest slope by up to a half.
+        # An unseen column of a curve changes its slope by up to half of the largest slope.
         unseen = 0.5 * of_curve
         typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
         sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
@@ -262,7 +262,7 @@ def _over_mountings(
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
     weight = np.minimum(of_data, of_norms + CLEAR_GAIN)
     if n_rests > 1.0:
-        # All rests of a mounting share its offset: only the means of mountings determine the sd.
+        # All rests of a mounting share its offset: only the mountings' means determine its sd.
         fits, weight = solved(n_rests**0.5 * tried), of_norms
     weight = weight + log_density
     weight = np.exp(weight - weight.max())
@@ -335,8 +335,8 @@ def _of_turn_ons(regression: Regression, posterior: Posterior) -> Floats:
     Return the covariance of the unit's unknowns by bias offsets of turn-ons, of unit variance and
     common to the positions of a turn-on, shape (n_unit, n_unit).
 
-    Offsets of turn-ons at different temperatures change the curve; those of turn-ons with one
-    program change the bias by their mean.
+    Offsets of turn-ons at different temperatures change the curve; offsets of turn-ons with one
+    temperature program change the bias by the mean of the offsets.
     """
     point = regression.at(posterior.state, posterior.prior)
     turn_on = regression.windows.turn_on_of_position

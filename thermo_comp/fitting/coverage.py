@@ -62,7 +62,7 @@ def worst_sd(covariance: Floats) -> float:
 
 def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     """
-    Find the direction in which a position of noise `sd` [g] most lowers the mean variance.
+    Find the direction in which a position of noise `sd` [g] most lowers the force's mean variance.
 
     Faces of a cube, which are the easiest to hold, are preferred if their gain is at least half of
     the largest, then edges, then corners. Directions closer than 20 degrees to a direction in
@@ -83,14 +83,14 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Find the direction that is farthest from all of `up` (n, 3), and how far [deg]."""
+    """Find the direction farthest from all of `up` (n, 3), and its angle to the nearest [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
 
 
 def distinct_directions(up: Floats) -> Floats:
-    """Return the unit vectors, shape (n, 3), without vectors close to an earlier vector."""
+    """Drop unit vectors, (n, 3), that are within `SAME_DIRECTION_DEG` of an earlier vector."""
     kept: list[Floats] = []
     limit = np.cos(np.radians(SAME_DIRECTION_DEG))
     for direction in up:
@@ -111,7 +111,7 @@ def rough_centre(means: Floats) -> Floats:
 
     With offset binary codes the angles between raw vectors are meaningless. `means`: mean
     readings, shape (n, 3); with fewer than four readings, or all in a plane, the result is 0.
-    Readings of one pose, which differ by drifts and by small rotations, are no sphere.
+    Readings of one pose, which differ by drifts and small rotations, do not count as a sphere.
     """
     zero = np.zeros(3)
     if len(means) < 4:
@@ -133,11 +133,11 @@ def rough_centre(means: Floats) -> Floats:
     radii = np.linalg.norm(arms - centre, axis=1)
     # The sphere is accepted if the distances from its centre vary by less than 10 %, and if the
     # readings are spread over the sphere: their RMS distance from the mean is at least half of the
-    # radius (it is the radius for six faces, and 0.1 of it for readings within 6 degrees).
+    # radius (1 radius for six faces, and 0.1 radius for readings within 6 degrees).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # There is a sphere through any four readings. The codes at zero force of an analog sensor's
-    # axes agree within 20 % of their mean (ADXL335 data sheet: 1.2 to 1.8 V), while the axes of a
-    # unit in one pose read differently.
+    # There is a sphere through any four readings, so the axes of its centre must also agree: codes
+    # at zero force of an analog sensor's axes agree within 20 % of their mean (ADXL335 data sheet:
+    # 1.2 to 1.8 V), while the axes of a unit in one pose read differently.
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero
@@ -157,7 +157,7 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the best of several sets of rests, each given as mean readings of shape (n, 3).
 
     The best set has the smallest sd of the constants, from the residuals of |f| and the directions
-    of its rests. The first set within 2 % of this sd is taken, since earlier sets have stricter
+    of its rests. The first set within 2 % of the smallest sd is taken: earlier sets have stricter
     thresholds; if no set has six attitudes, the first set of all is taken.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]

@@ -97,7 +97,7 @@ def judge_windows(
         )
         yield advice('case', text)
         return
-    # The case temperature leads, so the gradient has the sign of the board's rate.
+    # The case temperature leads the board's, so the gradient has the sign of the board's rate.
     moving = np.abs(_ramp_rates(windows)) > RAMP_K_MIN
     if windows.data.weight[moving].sum() >= 30.0 * windows.data.weight.max():
         correlation = float(np.corrcoef(windows.gradient[moving], windows.rate[moving])[0, 1])
@@ -172,7 +172,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
         n = 1 + int(is_gap.sum())
         # A slow drift through a range is not a soak.
         has_soaks = steps[~is_gap].sum() < n * max(1.0, 0.1 * steps.sum())
-        # Five temperatures determine a cubic, and show whether it fits.
+        # Five temperatures determine a cubic, and show whether the cubic fits.
         if has_soaks and n < 5:
             yield advice(
                 'soaks',
@@ -264,9 +264,9 @@ def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate M.
 
-    The sd of a parameter, in units of the noise of one position, must be at most 6. The sd is 1
-    for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held three times each
-    by hand.
+    The largest sd of a constant, in units of the noise of one position, must be at most 6. The
+    largest sd is 1 for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held
+    three times each by hand.
     """
     distinct = distinct_directions(up)
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
@@ -309,7 +309,7 @@ def judge_result(
     noise: float,
 ) -> Iterator[Finding]:
     """
-    Check the residuals.
+    Check the residuals of a fit.
 
     slow: sd of the bias that no temperature explains [m/s^2]
     span: span of the board temperature [K]

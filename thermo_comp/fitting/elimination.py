@@ -3,9 +3,9 @@
 """
 Owns the elimination of the unknowns of positions and bags from the normal equations.
 
-Each position has unknowns (attitude, offsets, tilts) that occur in no other position; they are
-eliminated first, then the initial lag states of each bag. After the elimination, normal equations
-for the unknowns of the unit remain.
+Each position has unknowns (attitude, offsets, tilts) that occur in no other position. The
+unknowns of positions are eliminated first, then the initial lag states of each bag. After the
+elimination, normal equations for the unknowns of the unit remain.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     shape (..., n, n).
 
     The matrix is scaled to a unit diagonal, or by the root of `diagonal`, shape (..., n), if it is
-    given; then the smallest jitter that suffices is added to the diagonal.
+    given; then the smallest jitter with which a factor exists is added to the diagonal.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)
@@ -79,7 +79,7 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower: it does not use that they are
+        # `numpy.linalg.inv` of all factors at once is slower: `inv` does not use that factors are
         # triangular.
         root = np.stack([inverse_root(factor).T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)

@@ -3,8 +3,8 @@
 """
 Owns the exclusion of bags of another environment, and the error that is published for them.
 
-In a chamber with a fan the board temperature follows the case temperature by one law, in still air
-by another. The bias of a part without a thermometer depends on the environment, and no set of
+In still air the board temperature follows the case temperature by another law than in a chamber
+with a fan. The bias of a part without a thermometer depends on the environment, and no set of
 coefficients describes two environments: a bag of still air would increase the error in a chamber
 with a fan. The fit excludes a bag of another environment and publishes the error of its correction
 as a lack of fit.
@@ -42,7 +42,7 @@ def _is_far_above(square: Floats | float, usual: float) -> Bools:
 
 def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Find the bag that may be of another environment: a list of one bag, or of none.
+    Find the bag that may be of another environment: a list of one bag, or an empty list.
 
     A bag is suspect if its left-out drift is far above both the median of all bags and the white
     noise of a window. A bag is also suspect if its drift is the only one that the other bags do
@@ -125,7 +125,7 @@ def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str
 ) -> tuple[Calibration, Finding]:
     """
-    Add the error of the correction of excluded bags to the lack of fit of both sets; `others`
+    Add the error of the correction of excluded bags to the lack of fit of both regimes; `others`
     names the bags or the prior that these bags contradict.
     """
     windows = thermal_windows(bags, prior_model(calibration))

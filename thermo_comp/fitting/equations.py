@@ -53,7 +53,7 @@ def last_result_kept(
 
 class Effects(NamedTuple):
     """
-    The effect of a state of the unknowns at the reference temperature.
+    The readings that a state of the unknowns predicts at the reference temperature, by parts.
 
     force: specific force along each axis in each position, shape (n_positions, 3)
     by_rotation: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
@@ -118,7 +118,7 @@ class Equations(Series):
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
         """
-        Assign a place to every unknown; return the same object for the same unknowns.
+        Assign a place to every unknown; return one `Layout` object for equal arguments.
 
         `used`: active columns of bias and scale, shape (2, m); `nonlinear`: active nonlinear
         coefficients, shape (2 k,); None for all
@@ -285,7 +285,7 @@ class Equations(Series):
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_share
         # The prior of attitudes is flat, so its precision is 0. An angular rate does not depend on
-        # the attitude, and a precision of 1 keeps its equations regular.
+        # the attitude, and a precision of 1 keeps the attitude's equations regular.
         result[layout.up] = 0.0 if self.gravity else 1.0
         result[layout.posed] = prior.pose_sd**-2
         # The prior of a pose is almost flat: its sd is 1 rad.
@@ -293,7 +293,7 @@ class Equations(Series):
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
-        """Return the unknowns less the mean of the prior, 0 for all but the unit's, (n,)."""
+        """Return the unknowns less their prior mean, which is 0 except for the unit's, (n,)."""
         result = as_vector(state, layout)
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean

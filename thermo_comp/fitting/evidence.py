@@ -119,8 +119,8 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
 def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...]) -> State:
     """Fit again with some groups of columns only, under a flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
-    # The residuals of a model with few groups are mostly model error, so all windows get equal
-    # weight.
+    # The residuals of a model with few groups are mostly model error, so the fit has white noise
+    # alone and no mounting offsets.
     prior = replace(
         chosen.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],

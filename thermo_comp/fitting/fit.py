@@ -300,7 +300,7 @@ def _judged(
 def _unusable(error: ValueError, up: Floats) -> FitError:
     """Return the FitError for a calibration with values outside their ranges."""
     if 'misalignment' in str(error):
-        # If the positions determine this misalignment, the sensor is not an accelerometer.
+        # If the positions determine a misalignment out of range, the sensor is no accelerometer.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'the angle between two of its axes is less than 60 degrees, which no accelerometer '

@@ -20,8 +20,8 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Squares of the candidate values of a common factor of the columns' prior sd; the best value is
-# used.
+# Squares of the candidate values of a common factor of the columns' prior sd; the candidate with
+# the largest gain is used.
 _SQUARES = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 

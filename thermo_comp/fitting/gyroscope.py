@@ -84,7 +84,7 @@ def add_gyroscope(
         offset_scale=earth_sd,
     )
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
-    # The positions determine the sd of the offsets, so `claim_of` does not marginalise over it.
+    # The positions determine the sd of the offsets, so `claim_of` does not marginalise the sd.
     fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
     chosen = replace(fit.posterior, prior=fixed_sd)
     claim = claim_of(regression, chosen, lacks_effects=fit.selected.lacks_effects)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of prior standard deviations and noises, without columns of too little gain.
+Owns the estimation of prior standard deviations and noises, and drops columns of small gain.
 
 Each column has one prior standard deviation for the bias of all axes and one for the scale, found
 by MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence plus
@@ -15,7 +15,7 @@ References
 .. [2] A. Gelman, Prior distributions for variance parameters in hierarchical models, Bayesian
    Analysis 1 (2006): half-t priors for standard deviations.
 .. [3] J. A. Nelder, A reformulation of linear models, Journal of the Royal Statistical Society A
-   140 (1977): a model with a product has its factors.
+   140 (1977): a model with a product has the product's factors, too.
 
 """
 
@@ -42,7 +42,7 @@ STUDENT_NU = 4.0
 LEAST_GAIN = 1.0
 #: Gain in log evidence from which a model is clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
-#: Variance of the log-normal hyperpriors of the logarithm of an sd: the sd is a factor of ten.
+#: Variance of the logarithm of a prior sd in its log-normal hyperprior: its sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
 
 
@@ -79,7 +79,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: Posterior, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move each sd towards its fixed point; return also the largest change of a logarithm."""
+    """Move each sd towards its fixed point; return also the largest change of the log of an sd."""
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     sd, determined = prior.column_sd, posterior.determined
     moves = (sd > 0.0) & ~candidates.fixed
@@ -98,18 +98,18 @@ def _updated(
     changes.append(change)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth. The
-        # elements of M are used only if the data determine more than one of them.
+        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
+        # The elements change their sd only if the data determine more than one element of M.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
         new_sd = float(np.sqrt(square / (share * gamma + 1.0)))
-        # Misalignments above 2 degrees, as with three single sensors on a printed bracket, would
-        # explain the norms of six faces, to second order.
+        # Limit the sd: misalignments above 2 degrees, as of three single sensors on a printed
+        # bracket, would explain the norms of six faces, to second order.
         misalignment_sd = min(new_sd, 0.03)
     start_share = prior.start_share
     if layout.start.size:
-        # One further state with the variance of the node's prior (`start_share` of 1) is added, so
+        # One lag state with the variance of the node's prior (`start_share` of 1) is added, so
         # that the states of a single bag cannot make `start_share` very small.
         gamma = float(determined[layout.start].sum())
         start_share = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
@@ -142,7 +142,7 @@ def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
     square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
     effective = posterior.determined[posterior.layout.tilt].sum()
     step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
-    # An sd of tilts that is off by 15 % hardly changes the fit, so a third of the change counts.
+    # An sd of tilts that is off by 15 % hardly changes the fit: a third of its log change counts.
     return float(sd * np.exp(step)), float(np.abs(step)) / 3.0
 
 
@@ -168,7 +168,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, at most 2."""
+    """Return Newton's step of log sd to ``power / sd^2 = effective + slope``, within -2 .. 2."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
@@ -177,7 +177,7 @@ def _toward(
 
 def _offset_sd(posterior: Posterior) -> tuple[float, float]:
     """
-    Move the sd of mounting offsets towards its mode, see `claim` for its prior; return also the
+    Move the sd of mounting offsets towards its mode, under a half-Student prior; return also the
     change of its logarithm, 0 if the data do not determine the offsets.
     """
     prior, places = posterior.prior, posterior.layout.offset
@@ -189,7 +189,7 @@ def _offset_sd(posterior: Posterior) -> tuple[float, float]:
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, prior.offset_sd, slope, bend + 0.1)
-    # Bounds of the sd [m/s^2]: 1/1000 of the prior's scale; 5 mg, as of the cheapest MEMS.
+    # Bounds of the offset sd [m/s^2]: 1/1000 of the prior's scale; 5 mg, as of the cheapest MEMS.
     new = float(np.clip(prior.offset_sd * np.exp(step), 1e-3 * prior.offset_scale, 0.05))
     return new, float(np.abs(np.log(new / prior.offset_sd))) if effective > 1.0 else 0.0
 
@@ -217,8 +217,8 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     # At least 1e-8 m/s^2, below any sensor's noise: the estimate for constant samples is 0.
     least = np.full(3, 1e-8)
     if not regression.windows.has_drifts:
-        # If no column changes within a position, the slow noise explains the whole drift, and the
-        # white noise would be estimated as zero. A drift cancels in second differences.
+        # If no column changes within a position, slow noise explains the whole drift, and white
+        # noise would be estimated as 0: it is at least that of differences, where a drift cancels.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 
@@ -241,8 +241,8 @@ def with_slow_noise(
         return replace(fitted, prior=trial)
 
     # The parameters absorb a part of the noise, so residuals underestimate the noise; the log
-    # evidence does not. All accelerometers have flicker noise, so a single correlation time needs
-    # more evidence.
+    # evidence does not. All accelerometers have flicker noise, so a single correlation time is
+    # chosen only if its log evidence is larger by `CLEAR_GAIN`.
     kinds = (estimated._replace(n_times=n) for n in (1, regression.whitener.n_flicker))
     single, best = (_likeliest(with_noise, regression.whitener.shows, noise) for noise in kinds)
     if single.log_evidence > best.log_evidence + CLEAR_GAIN:
@@ -291,7 +291,7 @@ def pruned_fit(
 def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates) -> Prior:
     """
     Drop columns with a log Bayes factor below `LEAST_GAIN`, one at a time, the smallest first;
-    after each the factors of the other columns are calculated again.
+    after each removal the Bayes factors of the other columns are calculated again.
     """
     layout, prior, covariance = posterior.layout, posterior.prior, posterior.covariance.copy()
     mode = as_vector(posterior.state, layout)[: layout.n_unit]
@@ -335,7 +335,7 @@ def downweigh(regression: Regression, posterior: Posterior) -> None:
     """
     Reduce the weight of disturbed windows: those more than 3 sd from the local median.
 
-    The reduced weight is that at which the distance of the window is 3 sd.
+    The weight is reduced so that the distance of the window from the median becomes 3 sd.
     """
     windows = regression.windows
     if windows.undisturbed is None:
@@ -344,7 +344,7 @@ def downweigh(regression: Regression, posterior: Posterior) -> None:
 
 
 def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
-    """Return the factors, up to 1, of the weights of windows with some residuals, (n, 3)."""
+    """Return factors, up to 1, of the weights of windows, by their residuals of shape (n, 3)."""
     size = residual * np.sqrt(weight)[:, None]
     side = 3  # windows on each side whose median is the local level
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):

@@ -35,9 +35,9 @@ from .windows import CURVE, PART, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-#: Factor of the prior sd of the scale factor's slopes with two to eight attitudes. A tilt of the
-#: support then explains a drift that the scale factor of a nearly level axis explains only by a
-#: slope of several hundred ppm/K.
+#: Factor of the prior sd of the scale factor's slopes with two to eight attitudes. In so few
+#: attitudes a tilt of the support explains a drift that the scale factor of a nearly level axis
+#: explains only by a slope of several hundred ppm/K.
 OF_FEW_ATTITUDES = 0.5
 
 
@@ -46,7 +46,7 @@ class Problem:
     """
     The input of a regression, beside its windows.
 
-    start: the triad without temperature
+    start: initial calibration of the triad, without effects of temperature
     up: directions of the positions, shape (n_positions, 3)
     """
 
@@ -93,15 +93,15 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     """Fit the windows; `is_at_rest`: whether columns are constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
-    # A prior separates the drifts of bias and scale, also in one attitude.
+    # A prior calibration separates the drifts of bias and scale factor, also in one attitude.
     is_bench = known is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
         data = replace(data, pose=rests.poses_of(windows, problem.up))
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
-        # In one attitude a tilt of the support cannot be distinguished from a drift of the unit,
-        # and in a pose to which the unit is returned not from an error of the next attitude. In
-        # the paper's model tilts would absorb errors of its two sets.
+        # In one attitude a tilt of the support looks like a drift of the unit; in a pose to which
+        # the unit is returned, a tilt looks like an error of the next attitude. In the paper's
+        # model, 'golovach', tilts would absorb errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
@@ -130,7 +130,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
-    # Slopes of the scale factor that no position shows are claimed in full.
+    # The covariance has the full prior sd of slopes of the scale factor that no position shows.
     full, used = (
         _typical_slopes(steepness, limits, options)
         for limits in (STEEPEST, _steepest(n_directions))
@@ -212,8 +212,7 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
 
     The effect of a slow column is nearly collinear with the curve, and its final value would be
-    extrapolated. No model uses slow columns; those linear in temperature enter the covariance, see
-    `claim`.
+    extrapolated. `select` does not use slow columns; slow lags enter the covariance, see `claim`.
     """
     model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])
@@ -263,17 +262,17 @@ def _candidates(
     slopes = _typical_slopes(steepness, steepest, options)
     fixed = np.zeros(parts.shape, dtype=bool)
     if is_bench:
-        # One attitude cannot separate scale and bias: the curve of the scale keeps its prior.
+        # One attitude cannot separate scale and bias: the curve of the scale keeps its prior sd.
         fixed[1] = parts[1] & np.isin(groups, (CURVE, PART))
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
-        # All columns of the paper's sets are kept; ten times the largest sd is a flat prior.
+        # All columns of both sets of the paper are kept; ten times the largest sd is a flat prior.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (
         np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, steepest)
     )
     if not windows.was_measured:
-        # Without a thermometer the slope is unknown: its whole prior goes into the covariance.
+        # Without a thermometer the slope is unknown: its full prior sd enters the covariance.
         typical[:, 0] = largest[:, 0] = STEEPEST
         forced[0] = fixed[:, 0] = True
     return Candidates(typical, largest, forced, fixed)
@@ -281,7 +280,7 @@ def _candidates(
 
 def _steepest(n_directions: int) -> Floats:
     """Return the largest prior sd of slopes of bias and scale by the number of attitudes, (2,)."""
-    # In one attitude the slope of the scale keeps its prior, so nothing is taken for it.
+    # In one attitude the slope of the scale factor keeps its full prior sd.
     is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
     return STEEPEST * (1.0, OF_FEW_ATTITUDES if is_few else 1.0)
 
@@ -296,7 +295,7 @@ def _typical_slopes(steepness: float, steepest: Floats, options: FitOptions) -> 
 def _steepness(
     windows: ThermalWindows, start: ConstantCalibration, options: FitOptions, *, is_at_rest: bool
 ) -> float:
-    """Return the RMS change of the readings per kelvin, as if it were the bias's [m/s^2 per K]."""
+    """Return the RMS change of the readings per kelvin, as of the bias alone [m/s^2 per K]."""
     data = windows.data
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())

@@ -5,7 +5,7 @@ Owns the uncertainty by effects that the model lacks: a jackknife over the secti
 
 The covariance of a fit contains the errors by noise alone. If the model lacks an effect, each
 section of the program requires other weights, and the error in another program is as large as the
-differences between these weights. The jackknife [1]_ estimates them from fits without one section.
+differences of weights, which the jackknife [1]_ estimates from fits without one section.
 
 References
 ----------

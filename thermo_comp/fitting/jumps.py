@@ -5,9 +5,9 @@ Owns the detection of jumps: steps in the reading of a sensor at rest.
 
 The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
-a jump distorts the whole curve. Three criteria distinguish a jump from a rotation of the unit. The
-noise beside the jump is normal. The norm of the reading, which is almost constant in a rotation,
-changes. The gyroscope, if there is one, shows no rotation.
+a jump distorts the whole curve. Two criteria distinguish a jump from a rotation of the unit: the
+noise of the samples beside a jump is normal; and a jump changes the norm of the reading, which is
+almost constant in a rotation, or the gyroscope, if there is one, measures no rotation.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
 hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares
@@ -129,8 +129,8 @@ def _examine(
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = sd * relative_sd * _correlation(residual, sd)
     if r:
-        # At least half of the step must last, and the lasting part must exceed four of its own
-        # standard deviations.
+        # At least half of the step must remain in the mean level, and the change of the mean level
+        # must exceed four of its standard deviations.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -252,7 +252,7 @@ def _trend(time: Floats, r: float = 0.0) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the angle of rotation within 1 s of the step, about the level on each side [rad]."""
+    """Return the angle of rotation within 1 s of a step, by the rate about its medians [rad]."""
     about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     turned = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(turned[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

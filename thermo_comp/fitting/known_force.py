@@ -109,7 +109,7 @@ class ForceOptions:
 
     magnitude: |f| as a value with unit, or the path of a table
     rotation: topic of the rotation rate, as TOPIC or TOPIC:FIELD
-    radius, radius_sd: distance of the unit from the axis and its sd [m]
+    radius, radius_sd: distance of the unit from the rotation axis and its sd [m]
     """
 
     magnitude: str | None = None
@@ -122,7 +122,7 @@ class ForceOptions:
             raise ValueError('a rotation topic needs a radius, and no other specific force')
 
 
-#: Without options the bags' metadata apply.
+#: The options without any entry: the bags' metadata about |f| apply.
 USUAL_FORCE = ForceOptions()
 
 

@@ -6,8 +6,8 @@ Owns the lack of fit: the excess of the left-out errors over the published covar
 The lack of fit per regime and temperature is the mean square of the left-out drift less the
 published variance of this drift. The lack of fit covers effects that no column describes, such as
 a kink of the curve, a tilt of the support or a drift of the bias. Models within one standard error
-of the chosen model contribute half of the squared difference of their drift to that of the chosen
-model.
+of the chosen model contribute half of the largest squared difference between their drifts and that
+of the chosen model.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def drift_variance(
 def _points(
     temperature: Floats, excess: Floats, model_error: Floats, rows: Bools
 ) -> tuple[LackOfFit, ...]:
-    """Average the excess in at most 5 bins of temperature, each of 10 windows or more."""
+    """Average the excess of squared drifts in up to 5 temperature bins of 10 windows or more."""
     n_bins = min(5, int(rows.sum()) // 10)
     if not n_bins:
         return ()

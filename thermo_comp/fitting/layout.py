@@ -59,7 +59,7 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Places of radius, misalignment and poses, which the axes share; the last of the unit."""
+        """Places of radius, misalignment and poses, shared by all axes: the unit's last places."""
         return np.concatenate((self.radius, self.misalignment, self.pose.ravel()))
 
     @property

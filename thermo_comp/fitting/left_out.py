@@ -39,14 +39,14 @@ from .unknowns import State
 
 # Smallest number of windows of a position for a score of the position's drift.
 _FEWEST_WINDOWS = 8
-# Logarithms of mean square errors that differ by less than this count as equal: 5 % of an RMS.
+# Two logarithms of mean square errors count as equal below this difference: 5 % of an RMS.
 _EQUAL = 0.1
 
 
 @dataclass(frozen=True)
 class Folds:
     """
-    Left-out errors of the n folds of one kind.
+    Left-out errors of the n folds of one kind, such as positions or sections.
 
     square: mean square error of each fold [(m/s^2)^2], NaN if the fold is not scored, shape (n,)
     windows: number of windows of each fold, shape (n,)
@@ -75,11 +75,11 @@ class Folds:
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
         """
         Return the log ratio of the mean square error to that of another model, and its standard
-        error, over the folds that both have; None without such folds.
+        error, over the folds that both models have; None without common folds.
 
         There are two estimates: the mean over folds of their log ratios, robust to a few large
         folds, and the log ratio of the sums with its jackknife error, robust to small folds. The
-        more significant estimate is returned if the signs of both are equal, else 0.
+        more significant estimate is returned if both estimates have the same sign, else 0.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -89,7 +89,7 @@ class Folds:
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
             # The standard error of a single fold is unknown: take the smallest difference that
-            # counts.
+            # counts, `_EQUAL`.
             return of_sums, _EQUAL
         each = np.log(before / after)
         without = np.log((before.sum() - before) / (after.sum() - after))
@@ -100,7 +100,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains the errors in the folds that the other model has, too."""
+        """Whether white noise explains the errors in the folds that are scored for both models."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
         # Errors of up to 1.7 times the noise count as noise: in a soak, changes of the temperature
@@ -145,8 +145,8 @@ class Score:
 
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
     """
-    Whether the second model is better on left-out data by more than the standard error;
-    `by_halves`: whether left-out halves count, which limit the number of columns.
+    Whether the model of `after` is better on left-out data by more than the standard error;
+    `by_halves`: whether the error of left-out halves counts, which limits the number of columns.
     """
     return gain(before, after, by_halves=by_halves) > 0.0
 
@@ -156,8 +156,8 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     Return the gain by a model if the gain exceeds its standard errors, else 0.
 
     The gain is the sum of the log gains of the drift of positions and of sections. If the drifts
-    are equal, the gain is the log gain of the norms of left-out positions, which must exceed two
-    standard errors.
+    of both models are equal, the gain is the log gain of the norms of left-out positions, which
+    must exceed two standard errors.
     """
     *drifts, norms = _gains(before, after)
     drift = [gain for gain in drifts if gain]
@@ -183,7 +183,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 
 def is_undecided(before: Score, after: Score) -> bool:
-    """Whether left-out data do not decide between two models: equal drifts, no norms in common."""
+    """Whether left-out data do not decide between two models: equal drifts, no common norms."""
     *drift, norms = _gains(before, after)
     return norms is None and all(abs(gain[0]) < _EQUAL for gain in drift if gain)
 
@@ -243,7 +243,7 @@ def _by_positions(
 
 
 def _mean(values: Floats, weights: Floats) -> Floats:
-    """Average windows by the sums of `np.average`, whose checks take longer than its sums."""
+    """Average windows like `np.average`, without its checks, which take longer than the sums."""
     share = weights.reshape(-1, *[1] * (values.ndim - 1))
     return np.asarray(np.sum(values * share, axis=0) / np.sum(share, axis=0))
 

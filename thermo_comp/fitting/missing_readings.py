@@ -15,7 +15,7 @@ from .windows import ThermalWindows, Track
 if TYPE_CHECKING:
     from .reduction import ReducedBag
 
-# Smallest part of the time at rest whose loss is reported.
+# Smallest lost share of the time at rest that is reported.
 _LEAST = 0.1
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns |f| that is not 1 g in all positions, and the choice of the nonlinear terms over |f|.
+Owns the known |f| of positions that are not at 1 g, and the choice of the nonlinear terms.
 
 A nonlinear term that the data determine is removed if it lowers the log evidence, or if it does
 not improve the left-out norms. A term that the data do not determine stays near its prior, with
@@ -247,7 +247,7 @@ def blank_term(kind: Kind, sd: float, *evidence: float) -> NonlinearTerm:
 def of_file(
     regression: Regression, terms: Sequence[NonlinearTerm], options: FitOptions
 ) -> Nonlinearity | None:
-    """Return the nonlinearity for a file, with all coefficients 0."""
+    """Return the nonlinearity for a calibration file, with all coefficients 0."""
     forces = regression.forces
     if forces is None:
         return None
@@ -274,7 +274,7 @@ def with_terms(state: State, calibration: Calibration) -> State:
 
 
 def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
-    """Add square and cube with their prior sd to a prior that has no nonlinearity."""
+    """Add the terms square and cube, with prior sd, to a calibration without nonlinearity."""
     posterior, at = calibration.posterior, parameter_layout(calibration).misalignment
     if calibration.nonlinearity is not None or posterior is None:
         return calibration

@@ -33,12 +33,12 @@ from ..unit.nonlinearity import K2_SD, Kind
 from .reduction import ReducedBag
 from .windows import Sets
 
-#: Largest code of the converter of the paper's unit: 16 bits in two's complement.
+#: Largest code of the converter of the unit in Golovach's paper: 16 bits in two's complement.
 COUNTS_FULL_SCALE = 32767.0
 # Families of curves over temperature that are polynomials, of order 1, 2 and 3.
 _POLYNOMIALS = ('linear', 'quadratic', 'cubic')
-#: Groups of columns that the fit selects: the curve, the difference of the two sets, the curves
-#: over the temperatures of parts, the groups of the thermal response.
+#: Groups of columns that the fit selects: the curve, the difference of the static and dynamic
+#: sets, the curves over the temperatures of parts, the groups of the thermal response.
 GROUPS = (
     'curve',
     'set',
@@ -55,24 +55,24 @@ class FitOptions:
     Options of a fit; ValueError if an option is outside its range.
 
     gravity: local gravity [m/s^2]; FitError if it does not occur on Earth
-    model: 'response' selects from all columns; 'golovach' is the paper's model: a linear static
-        and a quadratic dynamic set, no response
-    static_curve, dynamic_curve: family of each set's curve; None for the model's default
-    groups, forced: groups of columns that may take part (None: all), and that are not selected but
-        always kept
+    model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper: a
+        linear static and a quadratic dynamic set, no response
+    static_curve, dynamic_curve: families of the two sets' curves; None: the model's default
+    groups, forced: groups of columns that may take part (None: all); groups that are kept without
+        a selection
     prior: calibration of this unit or of its type; its columns are the model
-    ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior; both
-        0: estimated from the bags
+    ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
+        calibration; if both are 0, the change is estimated from the bags
     mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2]; None: estimated
     gravity_sd: standard deviation of `gravity` [m/s^2]
     k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], as in a data sheet;
-        None: 100 ug/g^2 and 10 ug/g^3 if positions are not at 1 g, else no such terms
-    serial: unit serial; None for that of the sources
+        None: 100 ug/g^2 and 10 ug/g^3 if positions are not at 1 g, else no nonlinear terms
+    serial: serial of the unit; None: the serial of the sources
     input: unit of the samples
     full_scale: magnitude of a saturated sample; None: 32767 for counts, and for m/s^2 the smallest
         usual range that contains the data
     offset: code at zero force, such as 32768; None: estimated from the bags
-    reference_temperature: T_ref [degC]; the paper uses 20
+    reference_temperature: T_ref [degC]; Golovach's paper uses 20
     detector: thermometer and detector settings; None: estimated from the bags
     min_rest_s: length of the shortest rest [s]; None: chosen, see `reduction`
     still_sd: largest scatter of the samples at rest [m/s^2]
@@ -162,7 +162,7 @@ class FitOptions:
 
 
 def sets_of(options: FitOptions, bags: Sequence[ReducedBag]) -> Sets:
-    """Choose the families of curves of the two sets."""
+    """Choose the families of curves of the static and the dynamic set."""
     celsius = np.concatenate([bag.board.value for bag in bags])
     if not len(celsius):
         line = _family('linear', 0.0, 0.0)

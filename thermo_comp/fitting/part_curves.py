@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the curves over the temperatures of parts: each is a sum of columns with a common weight.
+Owns the curves over the temperatures of parts: a curve is a sum of columns with a common weight.
 
 The temperature of the part of an axis is ``x = t - m``, t being that of the board and m the lag of
 the part. By the binomial theorem x^p is a sum of the columns t^p, t^(p-1) m, ..., m^p, which the
-bank has. If all bags repeat the same warm-up, t and m are functions of each other, and separate
-weights of the columns would not describe the part.
+bank of columns has. If all bags repeat the same warm-up, t and m are functions of each other, and
+separate weights of the columns would not describe the part.
 """
 
 from __future__ import annotations

@@ -5,12 +5,12 @@ Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit. Here t is the board temperature T less the reference
-temperature, and m = T - L(T + v G) is the difference between T and the temperature of the part.
-The part lags a temperature between board and case: that of the board plus the share v of the
-gradient G. The lag has one stage or, for a part that is heated through another part, two stages in
-series. Without a case thermometer, the temperature that the part lags may lead that of the board.
-The time constants, v and the lead minimise the RMS residual of a spline of the bias and a cubic of
-the scale factor, over x.
+temperature, and m = T - L(T + v G) is the difference between T and the temperature of the part,
+L being the lag operator. The part lags a temperature between board and case: T plus the share v of
+the gradient G, the case temperature less T. The lag has one stage or, for a part that is heated
+through another part, two stages in series. Without a case thermometer, the temperature that the
+part lags may lead that of the board. The time constants, v and the lead minimise the RMS residual
+of a spline of the bias and a cubic of the scale factor, over x.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class _Steps(NamedTuple):
 
 # Ratio of the RMS residual to white noise below which no other shape is tried.
 _EXPLAINED = 1.1
-# Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so the
-# residual must be noise.
+# Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so noise
+# must explain its residual.
 _SHAPES = (
     _Shape(4, _EXPLAINED),
     _Shape(4, _EXPLAINED, has_gradient=True),
@@ -105,7 +105,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     for shape in _SHAPES:
         if shape.has_gradient and not windows.gradient.any():
             continue
-        # 500 windows are sufficient for the search, 3000 for its result.
+        # 500 windows are sufficient to search the lags, 3000 to refine them.
         searched = _PartCurves(windows, start, shape, 500).lags(noise)
         if searched is None:
             continue
@@ -116,16 +116,16 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
         square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
-        # A residual above the limit has another cause, for example slow noise: the lags are then
-        # accepted only if they reduce the RMS residual of each axis to an eighth or less of the
-        # residual without a lag.
+        # A residual above `most_noise` times the white noise has another cause, for example slow
+        # noise: the lags are then accepted only if they reduce the RMS residual of each axis to an
+        # eighth or less of the residual without a lag.
         is_explained = bool((square <= (shape.most_noise * noise) ** 2).all())
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 8.0:
             continue
         largest = float(np.sqrt((square / noise**2).max()))
         if largest < least:
             x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-            # Curves alone explain the drift, but extrapolate to left-out sections.
+            # Curves alone extrapolate badly to left-out sections: allow them 10 times the noise.
             most_drift = 10.0 if is_explained and not shape.has_stress else 2.0
             accepted = Parts((x, y, z), factors, most_drift * float(noise.mean()))
             least = largest
@@ -136,8 +136,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags,
-    in every k-th window, so that `n_windows` or more are used.
+    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
+
+    Every k-th window is used, so that `n_windows` windows or more are left, if there are as many.
     """
 
     def __init__(
@@ -274,7 +275,7 @@ class _PartCurves:
         """
         Return the lag of the smallest RMS residual by the simplex method, begun at `first`.
 
-        `accuracy`: of the values that `steps` change
+        `accuracy`: half the tolerance in the searched values, which are logarithms and ratios
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -315,7 +316,7 @@ class _PartCurves:
         return Part(tau, 0.0, sensor_share) if square(tau) < square(0.0) else Part(0.0)
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
-        """Whether time constants longer or shorter by `_STEP` add 5 % to the RMS residual."""
+        """Whether `_STEP` times longer or shorter time constants add 5 % to the RMS residual."""
         tau, second, share, lead = lag
         others = [
             Part(ratio * tau, ratio * second, share, ratio * lead)

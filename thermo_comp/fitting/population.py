@@ -40,7 +40,7 @@ from .thermal_ranges import union
 UNITS_NEEDED = 3
 #: Smallest share by which correlations of the curves are reduced, so that a covariance is regular.
 LEAST_SHARE = 0.01
-#: The keys of a column of a single lag of the board alone, and its shortest time constant [s].
+#: Fields of a column of a one-stage lag of the board alone; shortest time constant of it [s].
 _ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
 _LEAST_BEHIND_S = 1.0
 
@@ -49,7 +49,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError if there are fewer calibrations, or if they differ in input, reference
+    Raises FitError for fewer calibrations than three, or if they differ in input, reference
     temperature, sensors or curves.
     """
     if len(calibrations) < UNITS_NEEDED:
@@ -131,7 +131,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     share = np.sum(variance, where=others) / max(np.sum(correlation**2, where=others), 1e-300)
     is_pair = (kind == 0) & ~np.eye(len(kind), dtype=bool)
     scatter[is_pair] *= 1.0 - np.clip(share, LEAST_SHARE, 1.0)
-    # The inverse: where the differences subtract the static curve, it adds the static curve.
+    # `to_curves`, the inverse of `to_differences`, adds the static curve to the differences.
     to_curves = 2.0 * np.eye(len(kind)) - to_differences
     return np.asarray(to_curves @ scatter @ to_curves.T)
 
@@ -139,7 +139,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
 def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     """
     Return the deviations, multiplied so that each kind of parameter, such as a slope of the bias,
-    has the same scatter on all axes on which any unit has it. The scatter is that of the next unit
+    has the same scatter on all axes on which any unit has it. The scatter is that of a future unit
     by Student's distribution [2]_, because three units can be alike by chance.
     """
     size = deviations.shape[1]
@@ -171,8 +171,8 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     The parts of two units of a type differ in their time constants. A lag is interpolated between
     the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
     a lag behind a temperature between board and sensor, and a lag with a lead are sums of single
-    lags. The powers of such a sum are approximated by the powers of one lag of the board that is
-    the same time behind in a long ramp.
+    lags. The powers of a sum of lags are approximated by powers of one lag of the board, which is
+    the same time behind as the sum in a long ramp.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE

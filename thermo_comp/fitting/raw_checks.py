@@ -20,7 +20,7 @@ from .reduction import ReducedBag
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """Refuse a prior of another unit: a unit's small uncertainties do not apply to another."""
+    """Refuse a prior of another unit: its small uncertainties do not apply to this unit."""
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:
@@ -111,7 +111,7 @@ def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
 def _judge_units(
     bags: Sequence[ReducedBag], size: float, options: FitOptions
 ) -> Iterator[Finding]:
-    """Check whether samples with this norm at rest are counts; `size`: [input units]."""
+    """Check whether samples with a norm of `size` [input units] at rest are counts."""
     if options.input != 'counts' or all(bag.is_integer for bag in bags):
         return
     for unit, one_g in (('m/s^2', STANDARD_GRAVITY), ('g', 1.0)):
@@ -141,12 +141,12 @@ class _DeadAxis(NamedTuple):
 def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     """Explain constant readings: an axis is clipped at the largest reading, or dead."""
     largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
-    # The limits of a two's complement differ by one count.
+    # The magnitudes of the two limits of a two's complement code differ by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
         return 'the axis is dead there, leave out a bag with a dead axis'
-    # A limit below the clipped reading, so that rounding does not exclude the reading.
+    # The limit is below the clipped reading, so that rounding does not exclude the reading.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
         'the largest reading of the bags, with both signs or on several axes, is the full scale: '

@@ -4,11 +4,11 @@
 Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
-second (see `stillness`), and the cells of a still interval to windows of ten seconds; only the
-last window of an interval is shorter. Within a window every thermal regressor is linear in time to
-far below the noise, so the mean of a window is a sufficient statistic. The noise of the means is
-estimated by the regression, because that of a charge-balancing converter is smaller than the
-scatter of its samples implies.
+second (see `stillness`), and the cells of a still interval to windows of ten seconds, or less in a
+short interval; the last window of an interval may be shorter. Within a window every thermal
+regressor is linear in time to far below the noise, so the mean of a window is a sufficient
+statistic. The noise of the means is estimated by the regression, because means of a
+charge-balancing converter have less noise than the scatter of its samples implies.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class StillInterval:
     begin_s: start of the interval's first window, since the bag's first sample [s]
     n_whole: number of windows of full length; a shorter window may follow
     time, count, mean: mean time [s], number and mean of the samples of each window
-    sample_sd: standard deviation of single samples in each window
+    sample_sd: median over the cells of the standard deviation of single samples, shape (3,)
     angular_rate: mean angular rate of each window [rad/s]; None if a part of the bag has no rate
     """
 
@@ -77,12 +77,12 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite or out of order
     n_cells, n_still_cells: number of cells in the bag, and in its rests
-    window_s: length of a window; longer than the option if the samples are slow
-    cycle_s: typical interval between samples
+    window_s: length of a window [s]; longer than the option if the samples are slow
+    cycle_s: typical interval between samples [s]
     middle: code at zero force of the samples if the codes are unsigned, else 0
     max_abs: largest magnitude of a reading without outliers, see `_max_abs` [input units]
     since_s: time from the bag's first sample to the part of the bag that was read [s]
-    restless: reason why the bag has no rests; '' if it has some
+    restless: reason why the bag cannot be used, such as no rests; '' if it can be used
     angular_rate: whether none, a part or the whole of the bag has finite angular rates
     n_spikes: number of readings of each thermometer that are spikes, see `is_spike`
     n_glitches: number of single samples far from their neighbours, which are left out
@@ -177,9 +177,10 @@ def reduce_source(
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
-    is chosen in the same way. Slow samples make cells so long that a bias which changes within
-    minutes looks like a motion, and that short rests are lost. Slow samples therefore get shorter
-    cells, of 10 or 5 samples, if shorter cells interrupt or lose fewer rests.
+    is chosen so that the rests determine bias and scale best. Slow samples make cells so long that
+    a bias which changes within minutes looks like a motion, and that short rests are lost. Slow
+    samples therefore get shorter cells, of 10 or 5 samples, if shorter cells interrupt or lose
+    fewer rests.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -191,13 +192,13 @@ def reduce_source(
         return usual
     share = usual.n_still_cells / usual.n_cells
     if share < 0.95 and source.force is None:
-        # If rests are interrupted, shorter cells are used if these add 5 % of the bag to the
-        # rests.
+        # If rests are interrupted, shorter cells are used if shorter cells add 5 % of the bag to
+        # the rests.
         shorter, _ = reduced(10)
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
     if share < 0.5:
-        # If rests are short, shorter cells are used if these show six attitudes.
+        # If rests are short, shorter cells are used if shorter cells show six attitudes.
         shorter, _ = reduced(5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)
@@ -264,7 +265,7 @@ def _cycle_s(cells: Cells) -> float:
     if not len(cells.count):
         return np.nan
     # The numbers of samples of two cells may differ by one. Cells with lost samples are left out,
-    # unless the numbers of most cells differ, as for samples in bursts.
+    # unless most cells have other numbers of samples, as in bursts.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
@@ -276,7 +277,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     """
     Keep plausible readings with rising stamps; average readings that are less than 0.2 s apart.
 
-    No thermometer is faster than 0.2 s, and the recursion over all readings, in Python, is slow.
+    No thermometer is faster than 0.2 s, and the tracker's loop over readings, in Python, is slow.
     """
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
@@ -296,7 +297,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 def is_spike(value: Floats) -> Bools:
     """
-    Return which readings are more than 10 K from the readings before and after, shape (n,).
+    Return which readings are more than 10 K from the median of five neighbours, shape (n,).
 
     A thermometer without contact reads -127 or 85 degC for a moment. The tracker rejects spikes,
     unless spikes have increased the noise that a fit expects of the thermometer.
@@ -332,10 +333,10 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
     """Find the rests, with the thresholds at which the rests best determine the triad."""
     candidates: list[list[tuple[int, int]]] = []
     # Candidates of the largest ratio of a rest's variance to that of the quietest rest, the
-    # strictest first.
+    # smallest ratio first.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
-    # Candidates of the smallest length of a rest [s], the strictest first.
+    # Candidates of the smallest length of a rest [s], the longest first.
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
         for runs in of_ratios:
             ranges = stillness.long_enough(cells, runs, shortest_s)

@@ -5,7 +5,7 @@ Owns the regression: the posterior of all unknowns under a given prior, by Gauss
 
 All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode; the
 inverse of the Hessian is the covariance. The unknowns of each bag are eliminated first, so the
-information of a bag about the unit is one matrix and one vector; subtracting these leaves the bag
+information of a bag about the unit is one matrix and one vector; their subtraction leaves the bag
 out.
 
 References
@@ -261,7 +261,7 @@ class Point:
         return result
 
     def posterior(self, end: Point) -> Posterior:
-        """Return the posterior at `end`, near this point, with this point's curvature."""
+        """Return the posterior at the point `end`, with the curvature at the near point `self`."""
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
         n, unit_root = layout.n_unit, inverse_root(factor)
@@ -305,7 +305,7 @@ class Regression(Equations):
         return tangent, tangent.normal(self.products_at(grams, state, base))
 
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
-        """Find the posterior at the mode, in at most `n_steps`; with 0 steps at `state`."""
+        """Find the posterior at the mode in at most `n_steps` steps; with 0 steps, at `state`."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
         for _ in range(n_steps):
@@ -325,7 +325,7 @@ class Regression(Equations):
         return point.posterior(end if end.energy <= point.energy else point)
 
     def inactive(self, posterior: Posterior, wanted: Bools) -> Inactive:
-        """Return sparsity and quality factors of inactive columns, (m,), at the mode."""
+        """Return sparsity and quality factors of inactive `wanted` columns, (m,), at the mode."""
         point = self.at(posterior.state, posterior.prior)
         state, layout, sigma, n = point.state, point.layout, point.prior.sigma, point.layout.n_unit
         part, column = np.nonzero(self.windows.parts & wanted & ~layout.used)
@@ -356,8 +356,8 @@ class Regression(Equations):
 def _damped(normal: Normal, layout: Layout) -> Normal:
     """
     Hold the nonlinear unknowns of normal equations to a millionth of their step, by a factor on
-    their diagonal. With a prior, which correlates the unknowns, a larger factor would exceed the
-    range of double precision.
+    their diagonal. With an informative prior, which correlates the unknowns, a larger factor would
+    exceed the range of double precision.
     """
     local, unit = normal.local.copy(), normal.unit.copy()
     at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns what the rests of a test can show: whether temperatures and readings change in a rest, which
-attitudes were heated, and to which attitudes the unit was returned.
+Owns the properties of the rests of a test: whether temperatures and readings change in a rest,
+which attitudes were heated, and to which attitudes the unit was returned.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
     Return the positions that show an effect of temperature, shape (n_positions,): a position whose
-    temperature changes by more than a tenth of the span of all temperatures, or whose mean is this
+    temperature changes by more than a tenth of the span of all temperatures, or whose mean is as
     far from the median. Rests of a tumble in a room, in which the room or the unit warms up by
     some kelvins, do not count: their short drifts hardly separate bias and scale factor.
     """
@@ -55,8 +55,8 @@ def is_steady(windows: ThermalWindows) -> Bools:
     (RMS), shape (n_positions,).
 
     The noise of the temperature would act as a change without a drift, as if the unit had no
-    thermal response in the attitudes of short rests. At three sd a ninth of the apparent change is
-    noise, and a slope would be that much too small.
+    thermal response in the attitudes of short rests. At three sd a ninth of the mean square change
+    is noise, and a slope would be a ninth too small.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]

@@ -32,16 +32,16 @@ from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalW
 
 GRADIENT = 'gradient'
 #: Large sd of mounting offsets relative to the prior's scale: turn-ons of tactical triads repeat
-#: within 0.3 to 1 mg by data sheets, 10 to 20 times the scale.
+#: within 0.3 to 1 mg by data sheets, which is 10 to 20 times the scale of the prior.
 LARGE_OFFSETS = 10.0
 
 
 @dataclass(frozen=True)
 class Trial:
     """
-    A model that was tried.
+    A model that the selection has fitted.
 
-    groups: its groups of columns; () for constants
+    groups: its groups of columns; () for a model of constants alone
     score: its left-out errors
     posterior: its fit
     typical: typical prior sd of its columns, shape (2, m)
@@ -105,7 +105,7 @@ class Fit(NamedTuple):
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
-    """Compare the chosen model with each trial in turn, keep the better model, return the last."""
+    """Compare the chosen model with each trial in turn, keep the better, return the last kept."""
     for trial in trials:
         if is_better(chosen.score, trial.score):
             chosen = trial
@@ -132,8 +132,8 @@ class Growth:
         is_wanted = np.isin(self._names, groups)
         prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
         if self.regression.windows.n_poses:
-            # A large sd would attribute the effect of the new columns to the rests: begin with
-            # small sd, which the data increase, of attitudes and, unless stated, of mountings.
+            # Large prior sd of the rests would absorb the effect of new columns: begin with
+            # small sd of attitudes and (unless stated) mounting offsets, which the data increase.
             prior = replace(prior, pose_sd=0.1 * POSE_SD)
             if prior.offset_scale > 0.0:
                 least = float(min(prior.offset_sd, prior.sigma.mean()))
@@ -156,7 +156,7 @@ class Growth:
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
     def added(self, chosen: Trial, progress: Callable[[float], None]) -> tuple[Trial, list[Trial]]:
-        """Add groups as long as left-out data improve; return the last model and all tried."""
+        """Add groups as long as left-out errors decrease; return the last model and all trials."""
         trials: list[Trial] = []
         part = 1.0
         while True:
@@ -178,7 +178,7 @@ class Growth:
     def lowest_degree(self, constants: Trial) -> Trial:
         """
         Fit the curve with its first column, and with more columns if they gain more than
-        `CLEAR_GAIN` in log density: norms alone are explained by many curves.
+        `CLEAR_GAIN` in log density: many curves explain the norms of the positions.
         """
         prior = constants.posterior.prior
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
@@ -195,7 +195,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus each free group of a large possible gain in log evidence."""
+        """Fit the chosen model plus one or more groups, for the three largest possible gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -246,10 +246,10 @@ class Growth:
 
 def better_start(fits: Sequence[Trial]) -> Trial:
     """
-    Choose the fit that is better on left-out data: begun with a small or with a large prior sd of
-    mounting offsets. If neither is better, the large sd is taken only if its log density is larger
-    by `CLEAR_GAIN`. Mounting offsets and misalignments explain the norms of few positions equally
-    well, but only misalignments predict the norm of another position.
+    Choose by left-out data between fits begun with a small and with a large prior sd of mounting
+    offsets. If neither fit is better, that with the large sd is chosen only if its log density is
+    larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the norms of few positions
+    equally well, but only misalignments predict the norm of another position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
@@ -310,7 +310,7 @@ def select(
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
 ) -> tuple[Trial, list[Trial]]:
-    """Add groups to the curve, or to the curves of parts; return the best model and all tried."""
+    """Add groups to the curve, or to the curves of parts; return the best model and all trials."""
     chosen, trials = first, []
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND])]
@@ -406,7 +406,7 @@ def _with_large_offsets(
     Fit a model again from a large sd of mounting offsets; [] if its offsets are large already.
 
     The drift of an axis is proportional to the specific force along the axis, as far as the scale
-    factor drifts. So the drifts, too, show the offsets of mountings, if the model describes the
+    factor drifts. Drifts therefore also show the offsets of mountings, if the model describes the
     drifts completely: nine constants explain the norms of nine positions, but not their drifts.
     """
     posterior = fitted.posterior

@@ -4,7 +4,7 @@
 Owns the estimation of thermometer and detector settings from bags, and the bags' thermal states.
 
 Rates are central differences over two minutes, which are not causal and need a recording. The
-causal thermometers and the detector are set to the noise, lag and ramps of the recorded test.
+settings of causal thermometers and detector are the noise, lag and ramps of the recorded test.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def learn_thermometer(
     if not with_ramps:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
     fastest = max(history.fastest for history in with_ramps)
-    # At the beginning of a ramp the lagged temperature has the second derivative ramp / lag. The
+    # At the beginning of a ramp the lagged temperature has the second derivative rate / lag. The
     # second derivative is estimated from the difference of two rates one minute apart.
     lags = []
     for history in with_ramps:
@@ -119,7 +119,7 @@ def _noise_of(values: Sequence[Floats], quantum: float) -> float:
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
     # Most rounded readings equal their neighbours, so the median of the differences is 0: use
-    # their mean square without the largest 1 %, less the variance of rounding.
+    # the differences' mean square without the largest 1 %, less the variance of rounding.
     square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
     variance = max(float(square.mean()) / 6.0 - quantum**2 / 12.0, (0.1 * quantum) ** 2)
     return float(np.sqrt(variance))
@@ -252,7 +252,7 @@ def thermal_states(
     """
     Run a tracker over a bag and sample it on a grid.
 
-    Returns the start of the grid [s], the states, and which of them have recent readings.
+    Returns the start of the grid [s], the states, and which states have recent readings.
     """
     readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
     reading = next(readings, None)

@@ -10,7 +10,7 @@ the regression.
 The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
 stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952,
-Annex B.4.3); a random walk is its limit for a long T. Flicker noise, the bias instability of a
+Annex B.4.3); a random walk is the limit for a long T. Flicker noise, the bias instability of a
 sensor, is the sum of such processes of equal variance, with the correlation times T, 10 T, 100 T
 and so on [2]_. The innovations of a Kalman filter for white plus Gauss-Markov noise, divided by
 their standard deviations, are white and contain the same information, so samples and columns that
@@ -63,12 +63,12 @@ class Whitener:
             time_s *= 10.0**0.5
         #: The correlation time after the longest candidate, up to which a search may go [s].
         self._longest_s = time_s
-        #: Number of processes of flicker noise: the longest correlation time exceeds the length of
-        #: a position.
+        #: Number of processes of flicker noise, so many that the longest correlation time exceeds
+        #: the length of a position.
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
     def shows(self, time_s: float) -> bool:
-        """Whether a correlation time is within the range of the candidates."""
+        """Whether a search may try a correlation time: from `times_s[0]` to `_longest_s`."""
         if not self.times_s:
             return False
         # Rounding must not exclude the shortest time.
@@ -80,7 +80,7 @@ class Whitener:
         """
         Run the Kalman filter over series, shape (n, m), for k noises of equally many processes.
 
-        Yields for each step: window of each position, whether the position has it, innovations,
+        Yields for each step: window of each position, whether the position has one, innovations,
         shape (k, n_positions, m), and their variances [sigma^2], shape (k, n_positions).
         """
         times_s = np.array([[noise.times_s] for noise in noises])
@@ -121,8 +121,8 @@ class Whitener:
         Find the Gauss-Markov noise of residuals, shape (n, 3), by their profile likelihood.
 
         The axes have a common variance ratio and correlation time; their white variances are
-        profiled out. The result is white noise unless twice the log likelihood gains 9.2, the 1 %
-        point of a chi-square with two degrees of freedom.
+        profiled out. The result is white noise unless slow noise raises twice the log likelihood
+        by 9.2, the 1 % point of a chi-square with two degrees of freedom.
         """
         # Candidates of the ratio of the Gauss-Markov variance to the white variance of a window.
         ratios = 10.0 ** np.arange(-2.5, 3.6, 0.5)
@@ -164,13 +164,13 @@ def _vertex(values: Floats, at: int) -> float:
 class Base:
     """
     The base series of some columns, in this order: 1; the columns; for each column with a lag its
-    derivative by the lag's initial state; t; the temperatures of the support; the measured values
-    of the three axes less their mean in the position.
+    derivative by the lag's initial state; t of the nonlinear terms; the temperatures of a support
+    (`Windows.tilt`); the measured values of the three axes less their mean in the position.
 
     columns: the active columns; moved: places in `columns` of the columns with a lag
     lag: number of the lag of each moved column
     at_start, t, tilts, measured: places of the derivatives by the initial lag states, of t for the
-        nonlinear terms, shape (1,) or (0,), of the temperatures, and of the measured values
+        nonlinear terms, shape (1,) or (0,), of a support's temperatures, of the measured values
     """
 
     columns: Ints
@@ -228,7 +228,7 @@ class Products:
 
 class Series:
     """
-    The series of the windows, in m/s^2 of the nominal scale factor.
+    The series of the windows, in m/s^2 by the nominal scale factors.
 
     windows: the data
     nominal_scale: nominal scale factors [input units per m/s^2], shape (3,)

@@ -56,7 +56,7 @@ def fit_sources(
     Make sources of recordings; each recording is opened by this function and again by the fit.
 
     Raises RecordingError if a recording cannot be read or lacks a topic; FitError if a recording
-    is given twice, or if some have counts and some Imu messages.
+    is given twice, or if some recordings have counts and some have Imu messages.
     """
     sources: list[FitSource] = []
     kinds: dict[str, str] = {}

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ranges of temperatures, rates and gradients in the data of a fit, and the board's lag.
+Owns the ranges of temperatures, rates and gradients in a fit's data, and the lag of the board.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ def temperature_range(windows: ThermalWindows) -> Range:
 
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
-    Return the first sensor's gradient in soaks and its robust scatter [K]; that of a prior
-    calibration if it has one; None without the sensor or a soak.
+    Return the first sensor's gradient in soaks and its robust scatter [K]; both from a prior
+    calibration if it has them; None without the sensor or a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
     rate = 60.0 * np.abs(windows.rate)
-    # If the rate is noisy, take the slowest tenth of the windows.
+    # If the rate is noisy, the slowest tenth of the windows counts as soak.
     slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
     is_soak = rate <= slowest
     if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
         return None
-    # While a soak settles, the gradient still changes with the rate.
+    # While a soak settles, the gradient changes with the rate: fit a line over the rate.
     gradient, by_rate = windows.gradient[is_soak], np.vander(windows.rate[is_soak], 2)
     slope, middle = np.linalg.lstsq(by_rate, gradient, rcond=None)[0].tolist()
     scatter = np.abs(gradient - by_rate @ (slope, middle))

@@ -38,7 +38,7 @@ def misalignment_scale(noise: float) -> float:
 @dataclass(frozen=True)
 class Windows:
     """
-    The data: windows sorted by position and time, with every column of the table.
+    The data of a fit: windows sorted by position and time, with every column of the table.
 
     position, bag: numbers from 0; a position lies in one bag, shape (n,)
     section: number of the program section, from 0, rising with time in each bag, shape (n,)
@@ -59,7 +59,7 @@ class Windows:
     undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,); None if the fit
         estimates them
     acts_on: axes that each column acts on, shape (m, 3); None for all
-    turn_on: number of the turn-on of each bag, shape (n_bags,); None: each bag has one
+    turn_on: number of the turn-on of each bag, (n_bags,); None: each bag has a turn-on of its own
     pose: number of the pose to which the unit was returned in each position, -1 for none, shape
         (n_positions,); None without such poses
     """
@@ -91,7 +91,7 @@ class Windows:
 
     @cached_property
     def share(self) -> Floats:
-        """Prior sd of each axis's weights / prior sd of the column; 1e-6 for no weight, (3, m)."""
+        """Prior sd of each axis's weights / column_sd; 1e-6 where `acts_on` is false, (3, m)."""
         acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(acts.T, 1.0, 1e-6)
 
@@ -161,10 +161,10 @@ class Windows:
 class Noise(NamedTuple):
     """
     The slow noise: one Gauss-Markov process; or flicker noise (bias instability), the sum of
-    several such processes of equal variance, each with ten times the correlation time of the last.
+    several such processes of equal variance, whose correlation times rise by factors of ten.
 
     ratio: stationary variance of each process / white variance of a typical window; 0 without
-        this part
+        slow noise
     time_s: the shortest correlation time [s]
     n_times: number of processes
     """
@@ -205,7 +205,7 @@ class InformativePrior:
 @dataclass(frozen=True)
 class Prior:
     """
-    Standard deviations of the prior, and the noises.
+    Standard deviations of the prior of the unknowns, and the noises of the windows.
 
     bias_sd: sd of the bias [m/s^2], shape (3,); its mean is 0
     scale_mean, scale_sd: mean of the scale ratio kappa of each axis, shape (3,), and its sd
@@ -216,17 +216,17 @@ class Prior:
     sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
     noise: slow noise
     offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0: offset_sd is constant
-    misalignment_scale: misalignment_sd before the data [rad]
+    misalignment_scale: value of misalignment_sd before the data are used [rad]
     unseen_misalignment_sd: sd of the elements of M in the covariance, if the positions do not show
-        them; `misalignment_sd` is then constant and smaller [rad]; 0 else
+        M [rad]: `misalignment_sd` is constant and smaller in such a fit; 0 for other fits
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
     pose_sd: sd of the attitude of a position about its pose [rad]; the prior of other attitudes is
         flat
     start_share: variance of the initial lag states / their variance in the node's prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive coefficient, shape (2 k,)
-    informative: replaces all other sd of the unit's parameters; column_sd then only gives the
-        active columns
+    informative: prior that replaces all sd of the unit's parameters; with an informative prior
+        column_sd only marks the active columns
     """
 
     bias_sd: Floats
@@ -250,7 +250,7 @@ class Prior:
 @dataclass(frozen=True)
 class State:
     """
-    The unknowns.
+    The unknowns of the regression.
 
     kappa, bias: scale ratio and bias [m/s^2], shape (3,)
     weights: weights of the columns in bias and scale, in units of their RMS, shape (2, 3, m)
@@ -288,8 +288,8 @@ class State:
     @cached_property
     def tangents(self) -> Floats:
         """
-        Two unit vectors perpendicular to each attitude, shape (n, 3, 2). In a pose they are those
-        of the pose, projected, so that equal steps turn the pose and its attitudes alike.
+        Two vectors perpendicular to each attitude, shape (n, 3, 2). The vectors of an attitude in
+        a pose are the pose's tangents, projected: equal steps turn pose and attitudes alike.
         """
         result = tangent_basis(self.up)
         if self.pose.size:
@@ -305,7 +305,7 @@ class State:
 
     @property
     def from_pose(self) -> Floats:
-        """Rotation of each attitude in a pose from the pose, along its tangents, (k, 2) [rad]."""
+        """Rotation from a pose to each attitude in it, along the pose's tangents, (k, 2) [rad]."""
         posed = self.pose_of[self.pose_of >= 0]
         change = self.up[self.pose_of >= 0] - self.pose[posed]
         return np.asarray(np.einsum('pi,pij->pj', change, self.pose_tangents[posed]))

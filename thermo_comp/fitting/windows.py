@@ -31,12 +31,12 @@ from .reduction import ReducedBag, StillInterval
 from .sensors import thermal_states
 from .unknowns import Windows
 
-#: Groups of columns: the curve, the difference of the sets, bends (changes of slope at a
-#: temperature), and the curves over the temperatures of parts.
+#: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
+#: slope at a temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
 #: Groups whose columns, with those of the curve, are summed in a curve over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
-#: Groups that are linear in a temperature difference; their products with temperature and powers.
+#: Groups linear in a temperature difference; products of it with temperature, and its squares.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Smallest number of windows of a short rest: fewer windows do not determine the rest's noise.
 FEWEST_WINDOWS = 20
@@ -50,7 +50,7 @@ N_SECTIONS = 6
 @dataclass(frozen=True)
 class Sets:
     """
-    The families of the curves of the two sets; the coefficients of the curves are not used.
+    Families of the curves of the static and of the dynamic set; their coefficients are not used.
 
     is_shared: whether the dynamic curve is the static curve plus a difference, or a separate curve
     """
@@ -60,7 +60,7 @@ class Sets:
     is_shared: bool = True
 
     def columns(self, t: Floats, weight: Floats) -> list[Floats]:
-        """Evaluate the columns of the curves of the two sets."""
+        """Evaluate the columns of the curves of the static and the dynamic set."""
         static, dynamic = self.static.basis(t), self.dynamic.basis(t)
         if not self.is_shared:
             static = [(1.0 - weight) * value for value in static]
@@ -126,12 +126,12 @@ class Model:
 
 class Track(NamedTuple):
     """
-    The thermal states of a tracker over a bag, without thermal memory.
+    The thermal states of a tracker over a bag, without lags and plays.
 
     start_s, step_s: start and step of the time grid [s]
     states: thermal states, shape (n, width); is_known: which states are known, shape (n,)
-    settled_s: time from which the estimate of the board temperature is settled [s]: in the first
-        step of coarse readings, the temperature is only known to this step
+    settled_s: time from which the estimate of the board temperature is settled [s]: until coarse
+        readings change, the temperature is only known to a step of the readings
     """
 
     start_s: float
@@ -151,7 +151,7 @@ class ThermalWindows:
     temperature, rate: of the board [degC, K/s], shape (n,); weight: of the dynamic set, shape (n,)
     gradient: T_case - T_board [K], shape (n,)
     raw: columns of the response without powers of t and ranges, shape (n, k)
-    angular_rate: mean angular rate [rad/s], shape (n, 3); (n, 0) if a bag lacks it
+    angular_rate: mean angular rate [rad/s], shape (n, 3); (n, 0) if a bag has none
     typical_count: number of samples of a typical window
     rests: bag and interval of each position
     tracks: thermal states of each bag
@@ -275,7 +275,7 @@ def _rows(
     """
     Average the used windows of a rest to windows of 60 s, or shorter windows in a short rest.
 
-    `states`: thermal states of the windows, shape (width, n); `begin_s`: start of the memory [s]
+    `states`: thermal states of the windows, (width, n); `begin_s`: time at which lags begin [s]
     """
     time, count = interval.time[use], interval.count[use]
     window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
@@ -368,7 +368,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The level of the dynamic set is an effect of ramps, so it corresponds to the RMS gradient.
+    # The level of the dynamic set is an effect of ramps: it corresponds to the RMS gradient [K].
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)
