@@ -318,7 +318,7 @@ def lags_of(calibration):
 
 @pytest.mark.slow
 def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
-    # A hidden node makes no axis a curve of one part.
+    # With a part without a thermometer no axis is a curve of the temperature of one part.
     study = next(third_node(0))
     # The groups that a fit of all groups chooses take two thirds of its time.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
@@ -327,8 +327,8 @@ def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
 
 
 def test_soaks_alone_do_not_tell_lags_or_a_loose_thermometer():
-    # Soaks determine no time constant. Nor do they show the lag of the board, so the gradient of
-    # a ramp does not indicate a fault.
+    # Soaks determine no time constant. Soaks do not show the lag of the board either, so the
+    # gradient of a ramp does not indicate a fault.
     study = next(soaks(1))
     calibration = strangers.fitted(replace(study, bags=study.bags[:9]))
     assert lags_of(calibration) <= {*FINE_TAUS}

@@ -51,8 +51,8 @@ test_of.__test__ = False
 @cache
 def fitted(number):
     """
-    Fit a sibling on nine of its twelve positions, which determine everything but how well
-    mountings repeat: it is stated.
+    Fit a sibling on nine of its twelve positions, which determine all parameters but the sd
+    of mountings; the sd of mountings is stated.
     """
     options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
@@ -111,7 +111,7 @@ def test_three_units_that_are_alike_by_chance_do_not_determine_an_axis(rng):
 
 
 def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(rng):
-    # WHY: with one position and a prior of twelve units the error was 4.7 mg, its sd 0.9 mg.
+    # WHY: with one position and a prior of twelve units the error was 4.7 mg, the sd 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 

@@ -119,7 +119,7 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
 def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # The 1420 s after the last jump are cut into parts; each is corrected by a fit of the others.
+    # The 1420 s after the last jump are cut into parts, each corrected by a fit of other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [Part(start, start + length) for start in starts]
