@@ -296,7 +296,7 @@ def test_a_prior_without_covariance_is_refused():
 
 @pytest.mark.slow
 def test_the_calibration_of_another_unit_is_no_prior():
-    # WHY: the nine constants of a sibling have small sd, and were taken for this unit's.
+    # WHY: the constants of a sibling have small sd, and were taken for those of the new unit.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)
     with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit-9'):

@@ -42,7 +42,7 @@ def means_of(result):
 
 def test_the_residual_of_handheld_units_is_their_noise(unit):
     assert 21 <= len(unit.positions) <= 23
-    # The noise is 0.48 to 0.57 mg in windows of 1 s, and higher in these windows of 0.5 s.
+    # The noise is 0.48 to 0.57 mg in windows of 1 s, and higher in the fit's windows of 0.5 s.
     assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9
     assert unit.residuals[-1].left_out.rms < 1.15 * unit.residuals[-1].fitted.rms
 
