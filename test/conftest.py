@@ -25,12 +25,13 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Use one BLAS thread: several wait for each other on a busy machine. Set before numpy's import.
+# Use one BLAS thread: several BLAS threads wait for each other on a busy machine. The variable
+# must be set before numpy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
-# The DDS domain follows from the id of the run and the number of the worker. Domain 0 is the
-# user's, domains from 81 are the benchmarks'.
+# The DDS domain follows from the id of the run and the number of the worker. DDS domain 0 is the
+# user's, DDS domains from 81 are the benchmarks'.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
 _WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
 os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WORKER % 4)

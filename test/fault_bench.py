@@ -32,8 +32,8 @@ from thermo_comp.ros.waitloop import WaitLoop
 
 #: Longest wait for any event [s]; reached only if the bench is broken.
 TIMEOUT_S = 60.0
-#: Length of bag [s] and largest number of messages in one lot: the shared memory of Fast DDS holds
-#: 512, and Fast DDS sends further messages again seconds later, out of order.
+#: Length of bag [s] and largest number of messages in one lot: the shared memory of Fast DDS has
+#: room for 512 messages; Fast DDS sends further messages again seconds later, out of order.
 LOT_S, LOT_SIZE = 10.0, 400
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 FRAME = b'sensor\0'

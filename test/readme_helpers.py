@@ -24,7 +24,7 @@ _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
 def shown():
-    """Return the page's console examples: sub-command -> (words of the command, output)."""
+    """Return docs/cli.md's console examples: sub-command -> (words of the command, output)."""
     collected = {}
     for kind, text in FENCE.findall(CLI_PAGE.read_text(encoding='utf-8')):
         if kind == 'console':
@@ -50,7 +50,7 @@ def is_alike(got, expected):
 
 
 def refresh():
-    """Write the real output of the console examples into their page."""
+    """Write the real output of the console examples into docs/cli.md."""
     environment = {**os.environ, 'PYTHONPATH': str(ROOT), 'COLUMNS': '80'}
     with tempfile.TemporaryDirectory() as folder:
         for name in ('bags', 'benchmarks'):

@@ -164,7 +164,7 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
 
 def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
     # WHY: bags of soaks have rates below 0.1 K/min, and a ramp multiplied the variance of all
-    # parameters by several hundred, although that of the lag grew with the ramp already.
+    # parameters by several hundred, although the variance of the lag grew with the ramp already.
     axis = axis_set(residual_sd_m_s2=1e-5)
     soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
     sds = []

@@ -202,7 +202,7 @@ def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g 1 ug/K is 33 ppm/K of the scale factor, in the difference of two rests 47 ppm/K.
+    # At 0.03 g a slope of 1 ug/K is 33 ppm/K of the scale factor, for two rests 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
@@ -286,7 +286,7 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
     # WHY: positions of one recording have the same turn-on: the claimed sd was 1/6 of the error.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # The prior of a MEMS with a noise of 0.02 m/s^2 in a sample at 100 Hz, and a stated sd.
+    # `least`: sd of turn-ons by the prior for a noise of 0.02 m/s^2 at 100 Hz, or the stated sd.
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration
@@ -294,7 +294,7 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
         bias = [block.static for block in parameter_layout(calibration).bias]
         assert (sd[bias] > 0.9 * least).all()
         assert calibration.static.x.residual_sd_m_s2 > 0.9 * least
-    # Eight recordings show their turn-ons: the sd of eight numbers is determined to 25 %.
+    # Eight recordings have eight turn-on offsets, which determine the sd of turn-ons to 25 %.
     bags = [turned(rng, ups + offset / GRAVITY) for offset in offsets]
     assert 2.5e-3 < fit(bags, OPTIONS).calibration.static.x.residual_sd_m_s2 < 1e-2
 
@@ -371,7 +371,7 @@ def test_a_calibration_has_the_date_of_its_test(rng):
 
 
 def test_a_prior_tells_how_well_turn_ons_repeat(rng):
-    # WHY: with a prior of 8 ug, the sd of mountings was 43 ug, as for a unit without a prior.
+    # WHY: with a prior sd of mountings of 8 ug, the fitted sd was 43 ug, as without a prior.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=2e-4)).calibration
     assert known.static.x.residual_sd_m_s2 == pytest.approx(2e-4)
     six = [turned(rng, positions(6, 4))]
@@ -380,7 +380,7 @@ def test_a_prior_tells_how_well_turn_ons_repeat(rng):
         for prior in (None, known)
     )
     assert alone.static.x.residual_sd_m_s2 > 1e-3
-    # The scale of the prior's density is a factor of 1.5, and its tails are wide.
+    # The prior density of the turn-on sd has a scale of a factor of 1.5, and wide tails.
     assert 2e-4 < helped.static.x.residual_sd_m_s2 < 4e-4
 
 

@@ -47,7 +47,7 @@ def left_by(groups):
 def test_a_knee_of_the_bias_is_found():
     unit, left = left_by(('curve', 'bend'))
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
-    # Trial knees are 1 K apart: the fit uses the two around the true knee.
+    # Trial knees are 1 K apart: the fit uses the two trial knees around the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
     # A mean slope between two knees instead of the kink gives an error of at most 20 ug/K times
     # 0.25 K, within 1 K of the 22 K.

@@ -135,7 +135,7 @@ def test_six_faces_do_not_determine_the_misalignment(good):
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
     assert not determines_misalignment(np.vstack((faces, tilted)))
-    # Five positions determine less; positions in a plane do not determine the misalignment.
+    # Five positions do not separate bias and scale; positions in a plane do not determine M.
     message = findings_of(windows, up[:5])['positions'].message
     assert '5 positions: bias and scale cannot be separated' in message
     flat = np.column_stack((np.cos(np.arange(12.0)), np.sin(np.arange(12.0)), np.zeros(12)))

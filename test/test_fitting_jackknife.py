@@ -31,8 +31,8 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 def ratios_to_sd(seed, effect_sd):
     """
-    Return errors of the weights / sd of the fit, and / claimed sd. An effect that the model lacks
-    changes the biases in each section of the program, equally in all positions.
+    Return the errors of the weights divided by the fit's sd, and divided by the claimed sd. An
+    effect that the model lacks changes the biases by section, equally in all positions.
     """
     truth, rng = Truth(), np.random.default_rng(seed)
     windows, up = table_of(truth, 12, rng, n_windows=24)
@@ -53,7 +53,7 @@ def ratios_to_sd(seed, effect_sd):
 def test_the_claimed_sd_contains_effects_that_the_model_lacks(effect_sd):
     ratios = np.array([ratios_to_sd(seed, effect_sd) for seed in range(10)])
     of_fit, of_claim = np.sqrt(np.mean(ratios**2, axis=(0, 2, 3)))
-    # 120 errors, those of an axis correlated: their RMS is known to some 15 %.
+    # The RMS of 120 errors, of which those of an axis are correlated, is known to some 15 %.
     assert 0.7 < of_claim < 1.3
     if effect_sd:
         assert of_fit > 2.5
@@ -97,5 +97,5 @@ def test_the_claimed_sd_agrees_with_a_jackknife(real_data):
     if not all(path.is_file() for path in logs):
         pytest.skip('the logs of the MPU-9150 units are not there')
     ratios = [ratio(path) for path in logs]
-    # About 20 positions each, nine parameters: a jackknife determines the sd to 15 %.
+    # A jackknife over about 20 positions determines the sd of nine parameters to 15 %.
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4, ratios

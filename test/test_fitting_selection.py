@@ -168,7 +168,7 @@ def test_flicker_noise_has_several_correlation_times():
             assert 0.6 < noise.ratio / truth.noise.ratio < 1.6
             assert 0.6 < noise.time_s / truth.noise.time_s < 1.6
         errors.append(truth.errors(regression, chosen.posterior)['bias'])
-    # The 1 % point of a chi-square of twelve errors.
+    # The limit of the RMS is the 1 % point of a chi-square of twelve errors.
     assert np.sqrt(np.mean(np.square(errors))) < 1.48
 
 
@@ -223,7 +223,7 @@ def test_the_truth_of_a_table_is_within_the_claimed_sd(noisy):
 
 
 def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_without_it():
-    # Savage-Dickey against a solution without the group: exact except for the directions.
+    # The Savage-Dickey ratio equals the loss of evidence exactly, except for the directions.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)

@@ -265,7 +265,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # A claim refers to the error in sample, a tolerance to that of left-out positions.
+        # A claim refers to the error in sample, a tolerance to the error of left-out positions.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'

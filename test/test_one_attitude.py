@@ -55,7 +55,7 @@ def test_a_pose_is_an_attitude_to_which_the_unit_was_returned():
 
 
 def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
-    # WHY: the fit of rests in one pose began with a smaller sd, at which a stated sd stayed.
+    # WHY: the fit of rests in one pose began with a smaller sd than stated, and kept this sd.
     study = next(returned(1))
     calibration = strangers.fitted(study, mounting_sd=0.01)
     for axis in calibration.static.axes():

@@ -222,7 +222,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # The groups that a fit of all groups chooses take a third of its time.
+    # A fit of the groups that a fit of all groups chooses takes a third of the time.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The fit approximates a bell with an sd of 0.85 K by lines between knees every 0.5 K.
@@ -244,7 +244,7 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     for record in (*records, *tests):
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
             setattr(record, name, getattr(record, name)[::10])
-    # The groups of the unit's physics halve the time.
+    # A fit of the groups of the unit's physics alone takes half of the time.
     groups = ('curve', 'board', 'part', 'product', 'square')
     result = fit_and_correct(records, tests, full_scale=FULL_SCALE['full_scale'], groups=groups)
     least, _ = second_simulator.floor_of(tests)
@@ -318,17 +318,17 @@ def lags_of(calibration):
 
 @pytest.mark.slow
 def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
-    # A hidden node makes no axis a curve of one part.
+    # With a part without a thermometer no axis is a curve of the temperature of one part.
     study = next(third_node(0))
-    # The groups that a fit of all groups chooses take two thirds of its time.
+    # A fit of the groups that a fit of all groups chooses takes two thirds of the time.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}
 
 
 def test_soaks_alone_do_not_tell_lags_or_a_loose_thermometer():
-    # Soaks determine no time constant. Nor do they show the lag of the board, so the gradient of
-    # a ramp does not indicate a fault.
+    # Soaks determine no time constant. Soaks do not show the lag of the board either, so the
+    # gradient of a ramp does not indicate a fault.
     study = next(soaks(1))
     calibration = strangers.fitted(replace(study, bags=study.bags[:9]))
     assert lags_of(calibration) <= {*FINE_TAUS}

@@ -112,7 +112,7 @@ print(digest.hexdigest())
 
 
 def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng):
-    # The bag has more messages than the middleware holds (5000), too fast for rclpy's callback.
+    # The bag has more messages than the middleware holds (5000), sent too fast for a callback.
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')

@@ -51,8 +51,8 @@ test_of.__test__ = False
 @cache
 def fitted(number):
     """
-    Fit a sibling on nine of its twelve positions, which determine everything but how well
-    mountings repeat: it is stated.
+    Fit a sibling on nine of its twelve positions, which determine all parameters but the sd
+    of mountings; the sd of mountings is stated.
     """
     options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
@@ -111,7 +111,7 @@ def test_three_units_that_are_alike_by_chance_do_not_determine_an_axis(rng):
 
 
 def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(rng):
-    # WHY: with one position and a prior of twelve units the error was 4.7 mg, its sd 0.9 mg.
+    # WHY: with one position and a prior of twelve units the error was 4.7 mg, the sd 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 
@@ -296,7 +296,7 @@ def test_a_prior_without_covariance_is_refused():
 
 @pytest.mark.slow
 def test_the_calibration_of_another_unit_is_no_prior():
-    # WHY: the nine constants of a sibling have small sd, and were taken for this unit's.
+    # WHY: the constants of a sibling have small sd, and were taken for those of the new unit.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)
     with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit-9'):

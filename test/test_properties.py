@@ -202,7 +202,7 @@ def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tre
             assert min(rate[3:]) > 0.0
     counters = compensator.counters
     assert counters.n_unsound == 0
-    # No sample is published only if samples are too fast or temperatures stale or missing.
+    # The output is empty only if samples are too fast, or temperatures are stale or missing.
     assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
     status = compensator.status()
     assert all(map(math.isfinite, status.state))

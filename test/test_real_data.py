@@ -42,7 +42,7 @@ def means_of(result):
 
 def test_the_residual_of_handheld_units_is_their_noise(unit):
     assert 21 <= len(unit.positions) <= 23
-    # The noise is 0.48 to 0.57 mg in windows of 1 s, and higher in these windows of 0.5 s.
+    # The noise is 0.48 to 0.57 mg in windows of 1 s, and higher in the fit's windows of 0.5 s.
     assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9
     assert unit.residuals[-1].left_out.rms < 1.15 * unit.residuals[-1].fitted.rms
 
@@ -119,7 +119,7 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
 def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # The 1420 s after the last jump are cut into parts; each is corrected by a fit of the others.
+    # The 1420 s after the last jump are cut into parts, each corrected by a fit of other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [Part(start, start + length) for start in starts]

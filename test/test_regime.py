@@ -4,8 +4,8 @@
 The detector on short runs: early, few false alarms, no missed ramps; long runs are in
 benchmarks/regime.py.
 
-All runs are seeded. The limits allow for the scatter of medians: that of 12 delays at 1 mK
-scatters by 1.4 s, with coarse steps by 4 s.
+All runs are seeded. The limits allow for the scatter of medians: the median of 12 delays scatters
+by 1.4 s at 1 mK, and by 4 s with coarse steps.
 """
 
 import math

@@ -53,7 +53,7 @@ def rms(values):
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     # WHY: with a lag's products and squares, but without the lag, the fit had the same left-out
-    # errors. At twice the rates its errors were larger than the effect of the lag, 1.7 mg.
+    # errors. At twice the rates the errors of this fit exceeded the effect of the lag, 1.7 mg.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
