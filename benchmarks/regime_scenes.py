@@ -19,7 +19,7 @@ SENSORS = ((0.001, 0.0), (0.01, 0.0), (0.001, 0.0625), (0.01, 0.0625), (0.01, 1.
 
 @dataclass(frozen=True)
 class Scene:
-    """One cell of the matrix: a ramp, a lag, a sensor."""
+    """One cell of the matrix of runs: a ramp, a lag, a sensor."""
 
     ramp_k_min: float
     lag_s: float

@@ -30,7 +30,7 @@ from ..typing import Bytes, Ints
 from .serialized import Messages, gather, number_at
 
 PREFIX = struct.Struct('<BQ')  # opcode and length in front of each record
-HEAD_BYTES = 160  # the head of a chunk's record lies in these first bytes
+HEAD_BYTES = 160  # number of bytes that contain the head of a chunk's record
 _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each

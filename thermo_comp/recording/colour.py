@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the effect of coloured noise on cells at rest: spread of their variances and changes."""
+"""Owns the effect of coloured noise on cells at rest: spread of their variance and roughness."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from .topics import PLAIN, Topics, shown
 KELVINS = (180.0, 480.0)
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
-_GAP_INTERVALS = 5.0  # pause that counts as a gap, in median intervals
+_GAP_INTERVALS = 5.0  # shortest gap, in median intervals between samples
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name yours with '
     '--topic counts=TOPIC or --topic imu=TOPIC'
@@ -63,7 +63,7 @@ class Survey:
 def thermal_findings(
     thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
 ) -> list[str]:
-    """List missing thermometers, span and ramps; `candidates` are unused topics."""
+    """List what the thermometers lack: topic, span, ramps, unit; `candidates`: unused topics."""
     findings = []
     among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')

@@ -63,7 +63,7 @@ class Part:
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
-        """Return begin and end as stamps; `first_ns`: stamp of the first sample, inf before it."""
+        """Return begin and end as stamps; `first_ns`: stamp of the first sample, inf if unknown."""
         origin = 0 if self.is_stamped else first_ns
         begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
         return begin, inf if self.end is None else origin + round(self.end * 1e9)

@@ -34,7 +34,7 @@ RAW = 'raw'
 CHOSEN = 'calibration'
 #: For each position of a fit: the calibration fitted to the other positions.
 LEFT_OUT = 'left out'
-# Rate of a set's range below which the set has no ramps in this direction [K/min].
+# Largest heating (or cooling) rate of a set's bags below which they have no such ramps [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
 #: Key of a bag's metadata in which the simulator stores the truth.
 _SIMULATED = 'truth'

@@ -13,7 +13,7 @@ from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states, sd_of_states
 
 _N_CURVE = 61
-#: Steps of a table over temperature [K], and the largest number of its temperatures in a state.
+#: Steps of a table over temperature [K], and the largest number of temperatures in a table.
 _STEPS_K = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 _MOST_TEMPERATURES = 8
 

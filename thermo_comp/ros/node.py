@@ -53,7 +53,7 @@ parameters:
 #: Prefix that the launch file gives to a parameter whose argument was not given.
 NOT_GIVEN = 'not_given.'
 
-#: Errors of files, values, the environment and the middleware (which raises RuntimeError, too).
+#: Errors that are no bug of the node: of files, values, environment, middleware (RuntimeError).
 _NOT_OURS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
