@@ -82,7 +82,7 @@ def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
 
 
 def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
-    """Find the units of a fleet, repeated under other names if there are too few."""
+    """Find the units of a fleet, and repeat them if there are fewer than `n_units`."""
     units = find_units(Storage(str(folder)))
     return [units[i % len(units)] for i in range(n_units)]
 
@@ -186,7 +186,7 @@ def bytes_written() -> int:
 
 
 def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
-    """Compare one worker with two, for the same units and for twice as many."""
+    """Compare one worker with two workers, for equal units and for twice as many units."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
     options = FleetOptions(fit, certificates=False)

@@ -248,7 +248,7 @@ def _cpu_time(pid: int) -> float:
 
 
 def _machine_time() -> tuple[int, int]:
-    """Return the time that the host took from this machine, and the total time, of all cores."""
+    """Return the time stolen by the host from all cores, and their total time [ticks]."""
     file = Path('/proc/stat')
     if not file.is_file():
         return 0, 0

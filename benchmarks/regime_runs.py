@@ -89,7 +89,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     """Run the shipped detector over ramps of one scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
-    # The soak lasts until the coarsest sensor has crossed three edges of its quanta.
+    # The ramp lasts four quanta of the sensor and two lags, within 40 min and 2 h.
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)

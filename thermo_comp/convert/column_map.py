@@ -37,7 +37,7 @@ _STEPS_S = (5e-5, 0.5)
 #: A turn by `_TURN` rad between successive blocks of `_BLOCK` still samples (scatter below
 #: `_QUIET` g) excludes times in ms; intervals are then plausible up to `_SLOW_S` s.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
-_FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
+_FASTEST_RAD_S = 20.0  # largest rate of a gyroscope that is turned by hand [rad/s]
 #: Range of stamps since 1970 [s], 2000 to 2038, and their largest interval; a count of us since
 #: power-up may be in this range, but its intervals are longer.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0

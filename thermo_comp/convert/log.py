@@ -332,7 +332,7 @@ def inferred_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
-    """Return why a stated unit cannot be true; None if it may be."""
+    """Return why a stated unit cannot be true; None if the unit can be true."""
     if not np.isfinite(magnitude):
         return None
     believed, reason = inferred_unit(magnitude)

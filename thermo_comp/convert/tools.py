@@ -110,7 +110,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None if there are none."""
+    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for another text."""
     values = _Parameters(text)
     numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not numbers:
@@ -138,7 +138,7 @@ def _read_px4(text: str, number: int | None) -> Content | None:
 
 
 def _read_ardupilot(text: str, number: int | None) -> Content | None:
-    """Read ArduPilot parameters (Mission Planner, MAVProxy); None if there are none."""
+    """Read ArduPilot parameters (Mission Planner, MAVProxy); None for another text."""
     values = _Parameters(text)
     numbers = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
     if not numbers:

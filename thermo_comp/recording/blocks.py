@@ -156,7 +156,7 @@ class Block:
     """
     Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
     `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu; `imu`
-    holds the other fields of that message. `temperatures` are by thermometer; `log_ns` and, if
+    holds the other fields of sensor_msgs/Imu. `temperatures` are by thermometer; `log_ns` and, if
     requested, the serialized messages `raw` are by role.
     """
 

@@ -83,7 +83,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 class Span:
     """
     A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `position` and `length` [bytes] exclude the message indexes after it; `size` is the size of the
+    `position` and `length` [bytes] exclude the indexes after the span; `size` is the size of the
     decompressed content [bytes].
     """
 

@@ -96,7 +96,7 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Turn an unfinished bag into a bag with this number, or the next free number, and delete the
+    Turn an unfinished bag into a bag with `number`, or the next free number, and delete the
     unfinished bag; None if it has no message. RecordingError if nothing can be read.
     """
     with open_recording(path, require=()) as reader:

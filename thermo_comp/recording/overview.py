@@ -223,7 +223,7 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
     stamp_ns, celsius = stamp_ns[use], celsius[use]
     if not len(celsius):
         return None
-    # Rates of two-minute means, so that a quantum does not look like a ramp.
+    # Take rates between two-minute means, so that a quantum does not look like a ramp.
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
     _, place = np.unique(bins, return_inverse=True)

@@ -81,7 +81,7 @@ class CompensationNode:
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
         self._loop.call_every(config.diagnostics_period, self._report)
         topics = [self.node.resolve_topic_name(sample.name) for sample in SAMPLES.values()]
-        # Accept QoS overrides of both inputs: the input that is not in use may be opened later.
+        # Accept QoS overrides of counts and Imu: the input that is not in use may be opened later.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in overrides(self.node):
             if not (self.node.has_parameter(name) or name.startswith(known)):

@@ -90,7 +90,7 @@ def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCa
         except Exception as error:  # noqa: BLE001 - raised by `result`
             answer.set_exception(error)
 
-    # A daemon thread, so that the process can end while a file hangs.
+    # Use a daemon thread, so that the process can end while a file hangs.
     threading.Thread(target=run, name='first reading', daemon=True).start()
     if not wait([answer], limit_s).done:
         raise _hanging(name, limit_s)

@@ -78,7 +78,7 @@ class Sources:
         """Return the index of the first message that is surely from the only active publisher."""
         was_contested, n_before, self._n_known = self.is_contested, self._n_known, n_known
         if n_known <= 1:
-            # Messages of this batch may still be from a publisher that has left.
+            # The first batch after a second publisher has left may hold its last messages.
             self.is_contested, self._number = False, numbers[-1]
             return len(numbers) if was_contested else 0
         if n_known > n_before:
