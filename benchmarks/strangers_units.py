@@ -182,7 +182,7 @@ def signed(rng: np.random.Generator, low: float, high: float) -> Floats:
 
 
 def spread(n: int, rng: np.random.Generator) -> Floats:
-    """Choose attitudes, shape (n, 3): each far from the earlier ones, in a random frame."""
+    """Choose attitudes, unit vectors (n, 3), each far from all before it, in a random frame."""
     many = rng.standard_normal((2000, 3))
     many /= np.linalg.norm(many, axis=1)[:, None]
     chosen = [many[0], -many[0]][:n]

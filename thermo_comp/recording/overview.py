@@ -32,7 +32,7 @@ _NO_SAMPLES = (
 
 @dataclass(frozen=True)
 class ThermometerSurvey:
-    """A thermometer: range [degC], largest mean rates over two minutes, smallest step."""
+    """A thermometer: range [degC], largest two-minute rates [K/min], smallest step [K]."""
 
     n: int
     rate_hz: float

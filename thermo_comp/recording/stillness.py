@@ -3,12 +3,12 @@
 """
 Owns still intervals: raw samples -> short cells (count, mean, variance) -> where nothing moved.
 
-Two tests are relative to the quiet level of the bag: the variance inside a cell (vibration,
-handling) and the step between adjacent cells (a turn, a knock). A step starts a new interval,
-because a tilt of one microradian is already one micro-g. Temperature tilts a unit at rest, too: a
-steady change over several cells, slower than the Earth rotates, is a drift and not a step. Two
-tests have absolute limits, because the quietest tenth of a flight is not a rest: a sensor at rest
-scatters by no more than its noise, and does not rotate.
+Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
+(vibration, handling) and the step between adjacent cells (a turn, a knock). A step starts a new
+interval, because a tilt of one microradian is already one micro-g. Temperature tilts a unit at
+rest, too: a steady change over several cells, slower than the Earth rotates, is a drift and not a
+step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest: a
+sensor at rest scatters by no more than its noise, and does not rotate.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class Curve(NamedTuple):
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """List a soak and, where they differ from it, ramps at half of the fastest rate calibrated."""
+    """List a soak and, if ramps differ from a soak, ramps at half the fastest calibrated rate."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:
