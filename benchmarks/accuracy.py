@@ -42,7 +42,8 @@ N_SIBLINGS = 10  # number of siblings that make the prior
 @dataclass(frozen=True)
 class Goal:
     """
-    Limits for the worst unit: RMS of |g| and of the vector, in micro-g or relative to the floor.
+    Limits for the worst unit: RMS of |f| - g and of the error vector [ug], or relative to the
+    floor.
     """
 
     norm: float
@@ -91,14 +92,14 @@ def block(record: SimulatedRun) -> Block:
 @dataclass(frozen=True)
 class Corrected:
     """
-    Test records corrected with a calibration, and its constants at the reference.
+    Test records corrected with a calibration, and its constants at its reference temperature.
 
     Parameters
     ----------
     specific_force, sd : list of ndarray, shape (w, 3)
         Means over 60 s of each test record, and their claimed standard deviations, m/s^2.
     constants, constants_sd : ndarray, shape (2, 3)
-        Bias [counts/cycle] and ln K at the reference, and their claimed standard deviations.
+        Bias [counts/cycle] and ln K at the reference temperature, and their claimed sd.
     fit_s : float
         Time of the fit, s.
     calibration : Calibration
@@ -197,13 +198,13 @@ def corrected_by_truth(run: SimulatedRun) -> Floats:
 
 
 def floor(tests: Sequence[SimulatedRun]) -> Errors:
-    """Return the residual of the true model with the same noise."""
+    """Return the errors of the true thermal model, by the noise of the test records alone."""
     forces = [corrected_by_truth(record) for record in tests]
     return errors(forces, [np.ones_like(force) for force in forces], tests)
 
 
 def judged(result: Errors, goal: Goal | None, least: Errors) -> str:
-    """Return RMS of |g| and of the vector as a cell, marked if they exceed the limits."""
+    """Return RMS of |f| - g and of the error vector as a cell, marked above the limits."""
     cell = f'{result.norm:.2f} / {result.vector:.2f}'
     if goal is None:
         return cell

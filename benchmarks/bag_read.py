@@ -3,7 +3,7 @@
 """
 Owns the measurement of reading: bag to columns, by this package, rosbags and mcap in one run.
 
-All readers get the same counts and temperatures (400 Hz and 2 x 10 Hz) from the same files.
+All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap get shorter bags.
 `rosbags` reads and deserializes each message; `mcap` reads each message and does not decode it at
 all. Rates are messages with counts per second of wall time, the best of the repeats; only their
 ratios hold on other machines.

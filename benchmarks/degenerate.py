@@ -4,8 +4,8 @@
 Owns the table of every command on every degenerate input: exit code, seconds, peak memory.
 
 For any recording or table a command must end within a time limit, in bounded memory, and with a
-sentence instead of a traceback. The exit code may be 0 only if no data are lost. Any other run is
-marked ``!``, and the exit code of the benchmark is then 1.
+sentence instead of a traceback. The exit code may be 0 only if no data are lost. A run that
+breaks a rule is marked ``!``, and the exit code of the benchmark is then 1.
 
     python benchmarks/degenerate.py --only jump --json degenerate.json
 """

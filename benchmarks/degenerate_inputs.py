@@ -114,7 +114,7 @@ def _by_turns(force: np.ndarray) -> np.ndarray:
 
 
 def _without_gravity(force: np.ndarray) -> np.ndarray:
-    """Subtract the mean of each position."""
+    """Subtract from the samples of each position their mean, which is gravity."""
     positions = force.reshape(POSITIONS, -1, 3)
     return (positions - positions.mean(axis=1, keepdims=True)).reshape(-1, 3)
 

@@ -47,7 +47,7 @@ from thermo_comp.field.series import Series, series_of
 from thermo_comp.field.update import update
 from thermo_comp.unit.calibration import Calibration
 
-#: Attitudes and temperatures at which the errors are taken.
+#: Number of attitudes and temperatures at which the errors are taken.
 N_PROBES = 200
 LABORATORY = calibration()
 

@@ -205,7 +205,7 @@ class BestFilter:
         """
         Update the filter with a rest.
 
-        now: time [days]; counts: mean [counts / `K`]; variance: that of the norm of the mean
+        now: time [days]; counts: mean [counts / `K`]; variance of the norm of the mean
         """
         process = self.process
         if start != self._start:

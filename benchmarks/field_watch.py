@@ -52,8 +52,8 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
     """
     Compare forecasts and recalibration intervals with simulated times of leaving the claim.
 
-    Each row has the share of these times in the forecast's 10 to 90 % interval, the median of the
-    times, and the forecast's quantiles.
+    Each row has the share of simulated times in the forecast's 10 to 90 % interval, the median of
+    the times, and the forecast's quantiles.
     """
     rng, process = np.random.default_rng(3), Process()
     found: dict[str, list[tuple[float, ...]]] = {'forecast': [], 'interval': []}

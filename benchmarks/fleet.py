@@ -41,7 +41,7 @@ from thermo_comp.simulation.presets import unit_preset
 from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-#: An hour over 35 K at a sample per second, so that hundreds of units are simulated in minutes.
+#: Program over 35 K with a sample per second, so that hundreds of units are simulated in minutes.
 PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
 #: The smallest thermal test that can be fitted: it gives the scheduler the highest load.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
@@ -82,7 +82,7 @@ def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
 
 
 def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
-    """Find the units of a fleet, repeated under other names if there are too few."""
+    """Find the units of a fleet, and repeat them if there are fewer than `n_units`."""
     units = find_units(Storage(str(folder)))
     return [units[i % len(units)] for i in range(n_units)]
 
@@ -99,9 +99,9 @@ class Measured:
     tasks : tuple of float
         Time of each task on its worker [s].
     own_cpu_s : float
-        Processor time of this process: client and scheduler.
+        Processor time of the benchmark's process, which is client and scheduler [s].
     rest_cpu : float
-        Share of a processor that this process uses without tasks: heartbeats, watching.
+        Share of a processor that the benchmark's process uses without tasks, as for heartbeats.
     n_bytes : int
         Number of bytes that all processes wrote to their connections.
     cpu_s : float
@@ -118,7 +118,7 @@ class Measured:
 
     @property
     def per_task_s(self) -> float:
-        """Return the cost of a task for client and scheduler."""
+        """Return the processor time of client and scheduler for a task [s]."""
         return max(self.own_cpu_s - self.rest_cpu * self.seconds, 0.0) / len(self.tasks)
 
     def busy(self, n_workers: int) -> float:
@@ -186,7 +186,7 @@ def bytes_written() -> int:
 
 
 def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
-    """Compare one worker with two, for the same units and for twice as many."""
+    """Compare one worker with two workers, for equal units and for twice as many units."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
     options = FleetOptions(fit, certificates=False)

@@ -27,9 +27,9 @@ discovered.
 
 An idle core sleeps and needs time to wake up, and an idle virtual core may be given away. If the
 system allows it (Linux, as root) all cores are kept awake for all relays alike, by a request for
-no latency in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` they may sleep. The host may
-stop a virtual machine with all its processes. The share of stolen time is at the end of each row
-("stolen"): latencies are meaningful if it is small.
+no latency in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the cores may sleep. The host
+may stop a virtual machine with all its processes. The share of stolen time is at the end of each
+row ("stolen"): latencies are meaningful if it is small.
 """
 
 from __future__ import annotations
@@ -248,7 +248,7 @@ def _cpu_time(pid: int) -> float:
 
 
 def _machine_time() -> tuple[int, int]:
-    """Return the time that the host took from this machine, and the total time, of all cores."""
+    """Return the time stolen by the host from all cores, and their total time [ticks]."""
     file = Path('/proc/stat')
     if not file.is_file():
         return 0, 0

@@ -62,7 +62,7 @@ def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def left(bags: list[Path], held: list[Path], calibration: Path, *options: str) -> dict[str, float]:
-    """Fit, and return RMS of |f| - g on the held-out run, raw and corrected [m/s^2]."""
+    """Fit bags; return RMS of |f| - g on the held-out bags, raw and corrected [m/s^2]."""
     command('fit', *bags, '-o', calibration, '--gravity', '9.80665', *options)
     found: dict[str, float] = command('evaluate', *held, '-c', calibration)['sections_m_s2']['all']
     return found

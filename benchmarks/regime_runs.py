@@ -89,7 +89,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     """Run the shipped detector over ramps of one scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
-    # The soak lasts until the coarsest sensor has crossed three edges of its quanta.
+    # The ramp lasts four quanta of the sensor and two lags, within 40 min and 2 h.
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)
@@ -102,7 +102,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
 
 
 def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
-    """Count openings and switches in a soak; return also the share of decided readings."""
+    """Count switches to dynamic, and all switches, in a soak; share of readings with a flag."""
     scene, hours, seed = job
     rng = rng_of(seed, 7, scene)
     t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)

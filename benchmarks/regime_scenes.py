@@ -19,7 +19,7 @@ SENSORS = ((0.001, 0.0), (0.01, 0.0), (0.001, 0.0625), (0.01, 0.0625), (0.01, 1.
 
 @dataclass(frozen=True)
 class Scene:
-    """One cell of the matrix: a ramp, a lag, a sensor."""
+    """One cell of the matrix of runs: a ramp, a lag, a sensor."""
 
     ramp_k_min: float
     lag_s: float
@@ -88,8 +88,8 @@ def known_signature_delays(
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz
     bend = scene.ramp_k_min / 60.0 / scene.lag_s
-    # Within `length` readings an onset accumulates 4.5 sigma; twice as many readings detect it
-    # reliably.
+    # An onset accumulates 4.5 sigma within half of `longest` readings, and is detected reliably
+    # within `longest` readings.
     longest = round(2.0 * (20.0 * dt * (4.5 * scene.noise_sd / bend) ** 2) ** 0.2 / dt)
     signature = scene.ramp_k_min / 60.0 * first_order(np.arange(1, longest + 1) * dt, scene.lag_s)
 

@@ -155,7 +155,7 @@ def program_of(program: Program) -> tuple[Floats, Floats]:
 def states_of(unit: SimpleNamespace, air_c: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """
     Integrate the temperatures of case and board, shape (n, bags), and of the pendulums, and sum
-    the outputs of the plays, shape (n, bags, 3).
+    the outputs of the play operators, shape (n, bags, 3).
     """
     n, n_bags = air_c.shape
     air, heat = air_c[0].copy(), unit.own_heat_k

@@ -41,7 +41,8 @@ STAMP = struct.Struct('<iI')
 SECOND_NS = 1_000_000_000
 READINGS_HZ = 10
 RELOAD_S, LATENCY_S, REPORT_S = 2.0, 10.0, 0.25
-#: A ramp, a rest, the ramp back, a rest; the lags are short enough for the regime to follow.
+#: Lengths of ramps and rests [s], which alternate, rate of a ramp [K/s], and lags of case and
+#: board [s], which are short enough for the regime to follow.
 RAMP_S, REST_S, RAMP_K_S, CASE_LAG_S, BOARD_LAG_S = 30.0, 60.0, 0.1, 5.0, 10.0
 TIMEOUT_S = 30.0
 

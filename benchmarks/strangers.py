@@ -104,7 +104,7 @@ def chosen_by(calibration: thermo_comp.Calibration) -> str:
 def corrected(
     calibration: thermo_comp.Calibration, bag: Bag, config: CompensatorConfig | None = None
 ) -> Corrected:
-    """Correct a bag and average it."""
+    """Correct a bag and average the corrected forces over each minute."""
     known = ('board', *calibration.sensors)
     given = {key: value for key, value in bag.temperatures.items() if key in known}
     out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
@@ -125,7 +125,7 @@ def corrected(
 
 
 def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool) -> Score:
-    """Compare corrected means of a minute with the truth and with their claim."""
+    """Compare corrected means over a minute with the true force and with their claimed sd."""
     published = [np.isfinite(out.force).all(axis=1) for out in outs]
     if np.mean(np.concatenate(published)) < LEAST_PUBLISHED:
         return Score(np.inf, np.inf, np.inf, np.inf, np.inf)
@@ -200,7 +200,7 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
         key: (read_s, celsius + unit.reading_sd * rng.standard_normal(len(read_s)))
         for key, celsius in rest.items()
     }
-    # Switch off two checks of the node: the samples here are constant, and |f| is not gravity.
+    # Switch off two checks of the node, because the samples are constant and |f| is 0.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     out = corrected(calibration, Bag('zero', time_s, zero, temperatures), config)
     # The samples have no noise, so the white noise is subtracted from the claimed variance.
@@ -262,15 +262,15 @@ def run(
     ----------
     case, unit, study : str, int, Study
         The fitted study.
-    done : dict of str to Calibration Fits of this unit by study, for studies with a prior; the new
-        fit is added.
+    done : dict of str to Calibration
+        Fits of this unit by study, for studies with a prior; the new fit is added.
     earlier : mapping of (str, int) to mapping of str to Score
-        Scores of the baselines by title and unit, from an earlier run; others are computed.
+        Scores of the baselines by title and unit, from an earlier run; if missing, computed.
 
     Returns
     -------
     list of Result
-        One for each set of held-out bags.
+        One result for each set of held-out bags.
 
     """
     title = f'{case} {study.label}'.strip()
@@ -322,7 +322,7 @@ def run_case(
     path: Path | None,
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Run all studies of a case, or the studies with the label."""
+    """Run all studies of a case or, with a label, only the studies with this label."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}
@@ -359,7 +359,7 @@ HEAD = (
 
 
 def pair(score: Score | None) -> str:
-    """Format the two errors of a model."""
+    """Format the errors of a model [ug], of the norm and of the vector."""
     if score is None:
         return '-'
     return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (score.norm, score.vector))

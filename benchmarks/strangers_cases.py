@@ -78,7 +78,7 @@ class Study:
         Whether the evaluated error is that of each axis less its mean over the bag, as for one
         pose.
     baseline_bags : tuple of Bag
-        Bags at rest for the curves by scipy; if empty, these are the bags of the fit.
+        Bags at rest for the curves by scipy; if empty, the bags of the fit are used.
     bound : Bound or None
         Cramer-Rao bound of the bias, for studies that evaluate the bias instead of the force.
 
@@ -197,7 +197,7 @@ def returned(number: int) -> Iterator[Study]:
         for celsius in (-15.0, 22.0, 45.0, 5.0):
             for number_of_pose, up in enumerate(ups, 1):
                 turned = up + np.cross(2e-4 * rng.standard_normal(3), up)
-                # At 10 Hz the noise of a sample is a quantum: means resolve parts of a quantum.
+                # At 10 Hz the noise of a sample is as large as a count: means resolve parts of it.
                 fit += (record(unit, program(celsius, 30), turned / np.linalg.norm(turned), rng,
                                name=f'{celsius:g} degC, pose {number_of_pose}', rate_hz=10.0,
                                is_cold=True),)  # fmt: skip
@@ -381,7 +381,7 @@ def third_node(number: int) -> Iterator[Study]:
 
 
 def bench3(number: int) -> Iterator[Study]:
-    """Record 18 positions on a bench and 3 in a chamber, 2 K short of the range of use."""
+    """Record 18 positions on a bench, and 3 in a chamber over a range 2 K short of that of use."""
     rng = rng_of('bench3', number)
     unit = navigation(rng)
     bench = positions(unit, ROOM, spread(18, rng), rng)

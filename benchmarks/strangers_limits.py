@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the limits of the benchmark `strangers.py`: rows over several units, and the limits that each
-row exceeds.
+Owns the limits of the benchmark `strangers.py`: rows of figures over several units, and the
+limits that each row exceeds.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Score:
     norm_ratio, ratio : float
         Error / claimed sd along the norm, and of the three axes together.
     claim : float
-        Claimed sd, of the same length as `vector` [ug].
+        Claimed sd of the error whose length is `vector` [ug].
     bound_ratio : float
         Error of the bias / its Cramer-Rao bound.
 
@@ -48,7 +48,7 @@ class Result:
     Parameters
     ----------
     title : str
-        The row: case, study and held-out bags.
+        Title of the row: case, study and held-out bags.
     unit : int
         The unit's number.
     scores : dict of str to Score
@@ -74,7 +74,7 @@ class Result:
 class Limit:
     """
     The limits of a row; the defaults limit the error by that of the best baseline, and the ratio
-    of error to claim.
+    of error to claimed sd.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ class Limit:
     best : float
         Largest error / smallest error of the baselines, both for norm and for vector.
     low, high : float
-        Smallest and largest ratio over all units.
+        Smallest and largest RMS over all units of error / claimed sd.
     unit : float
-        Largest ratio of one unit.
+        Largest error / claimed sd of a single unit.
     claim : float
         Largest claimed sd / error.
     than, times : str, float
@@ -121,7 +121,7 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # The variance at the reference temperature, which `score` subtracts, is here that of a slope.
+    # In 'returned' the variance that `score` subtracts, at the reference, is that of a slope.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
@@ -132,10 +132,10 @@ LIMITS = {
     'bump': Limit(norm=60.0),
     'carry': Limit(),
     'support': Limit(vector=60.0),
-    # The data do not show a wrong gravity, which the baselines also use: limit only the ratio.
+    # The baselines use the same wrong gravity, which no data show: limit only error / claimed sd.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
-    # The claim contains changes over times that are longer than the recordings.
+    # The claimed sd contains flicker noise over times that are longer than the recordings.
     'flicker': Limit(low=0.5, high=1.4, unit=2.0),
     'slow-thermometer': Limit(),
     # A further bag of another environment must not increase the error by more than the noise of
@@ -164,7 +164,7 @@ class Row:
     scores : dict of str to Score
         By model, RMS over the units that the model did not refuse.
     worst : float
-        Largest ratio of one unit.
+        Largest error / claimed sd of a single unit.
     fit_s : float
         Mean CPU time of a fit [s].
     chosen : str
@@ -188,7 +188,7 @@ def rms(values: Floats | Sequence[float]) -> float:
 
 
 def judged_ratio(score: Score) -> float:
-    """Return the limited ratio: of three axes or, without a known truth, of the norm."""
+    """Return error / claimed sd: of three axes or, without a known true force, of the norm."""
     return score.norm_ratio if np.isnan(score.ratio) else score.ratio
 
 

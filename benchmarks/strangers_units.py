@@ -3,11 +3,11 @@
 """
 Owns the units and recordings of the benchmark `strangers.py`: physics by numpy and scipy alone.
 
-Case, board, the part of each axis and one hidden node are nodes of a linear thermal network. The
-input of the network is the air temperature of the chamber, which is linear in time between two
-steps, so the state at each step is exact. Bias and scale are functions of the temperature of an
-axis's part. This module shares no code with the package, so an error of the package is not an
-error of the simulated truth.
+Case, board, the sensing part of each axis and one hidden node are the nodes of a linear thermal
+network. The input of the network is the air temperature of the chamber, which is linear in time
+between two steps, so the state at each step is exact. Bias and scale of an axis are functions of
+the temperature of its sensing part. This module shares no code with the package, so an error of
+the package is not an error of the simulated truth.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Floats = npt.NDArray[np.float64]
 
 GRAVITY = 9.80665  # standard gravity [m/s^2]
 UG = 1e-6 * GRAVITY  # one micro-g [m/s^2]
-REFERENCE_C = 20.0  # curves of bias and scale are zero here [degC]
-STEP_S = 5.0  # step of the network, over which the air temperature is linear in time [s]
+REFERENCE_C = 20.0  # temperature at which the curves of bias and scale are zero [degC]
+STEP_S = 5.0  # step of the thermal network; the air temperature is linear within a step [s]
 SOAK_S = 5400.0  # time of the unit in the chamber before a recording [s]
 CASE, BOARD, PARTS, HIDDEN = 0, 1, slice(2, 5), 5
 
@@ -58,27 +58,29 @@ class Unit:
     Parameters
     ----------
     bias, gain, misalignment : ndarray, shape (3,)
-        Bias [ug] and relative error of the scale at the reference; the lower triangle of M.
+        Bias [ug] and relative error of the scale at `REFERENCE_C`; elements of M below its
+        diagonal.
     bias_curve, scale_curve : ndarray, shape (order, 3)
-        Powers 1, 2, ... of the part's temperature less the reference [ug/K^n], [ppm/K^n].
+        Coefficients of powers 1, 2, ... of the sensing part's temperature less `REFERENCE_C`
+        [ug/K^n], [ppm/K^n].
     kink, kink_c : ndarray, shape (3,), float
         Change of the slope of the bias [ug/K] above a temperature [degC].
     bump, bump_c, bump_k : ndarray, shape (3,), float, float
         Height [ug] of a bell in the bias, its middle [degC] and its full width at half height [K].
     hidden_bias : ndarray, shape (3,)
-        Bias per temperature of the hidden node above the board [ug/K].
+        Bias per kelvin by which the hidden node is warmer than the board [ug/K].
     gradient_bias : ndarray, shape (3,)
-        Bias per temperature of the case above the board [ug/K].
+        Bias per kelvin by which the case is warmer than the board [ug/K].
     case_s, board_s, part_s, hidden_s : float or ndarray, shape (3,)
-        Time constants [s]; a part that lags by 0 s is the board itself.
+        Time constants [s]; a part with a time constant of 0 s has the board's temperature.
     case_share : ndarray, shape (3,)
-        Share of the heat that a part exchanges with the case; the rest is with the board.
+        Share of a part's thermal coupling that is to the case; the other share is to the board.
     heat_k : float
         Temperature of the board above that of the case at rest, by self-heating [K].
     counts : float
         Counts per m/s^2; 0 for samples in m/s^2.
     carries : bool
-        Whether the converter carries its remainder on to the next sample.
+        Whether the converter adds its rounding remainder to the next sample.
     density : float
         White noise [ug/sqrt(Hz)].
     flicker : float
@@ -122,7 +124,8 @@ class Unit:
 
     def bias_at(self, part_c: Floats, hidden_k: Floats | float = 0.0) -> Floats:
         """
-        Evaluate the bias [ug] of parts [degC], shape (n, 3); `hidden_k`: hidden node less board.
+        Evaluate the bias [ug] at the parts' temperatures [degC], shape (n, 3); `hidden_k`:
+        temperature of the hidden node less that of the board [K].
         """
         x = part_c - REFERENCE_C
         bias = self.bias + sum(c * x ** (k + 1) for k, c in enumerate(self.bias_curve))
@@ -131,13 +134,13 @@ class Unit:
         return np.asarray(bias + self.bump * bell + self.hidden_bias * hidden_k)
 
     def scale_at(self, part_c: Floats) -> Floats:
-        """Evaluate the relative scale of parts [degC], shape (n, 3)."""
+        """Evaluate the relative scale at the parts' temperatures [degC], shape (n, 3)."""
         x = part_c - REFERENCE_C
         curve = sum(c * x ** (k + 1) for k, c in enumerate(self.scale_curve))
         return np.asarray((1.0 + self.gain) * (1.0 + 1e-6 * curve))
 
     def sensed(self, force: Floats) -> Floats:
-        """Project forces, shape (n, 3), on the sensitivity axes: the inverse of M."""
+        """Project forces, shape (n, 3), on the sensitivity axes, by the inverse of M."""
         a, b, c = self.misalignment
         M = np.array([[1.0, 0.0, 0.0], [a, 1.0, 0.0], [b, c, 1.0]])
         return np.asarray(force @ np.linalg.inv(M).T)
@@ -151,7 +154,7 @@ class Bag:
     Parameters
     ----------
     name : str
-        Name in messages.
+        Name of the bag in messages.
     time_s, samples : ndarray, shapes (n,), (n, 3)
         Times of the samples [s], and counts or m/s^2.
     temperatures : dict of str to (ndarray, ndarray)
@@ -174,12 +177,12 @@ def rng_of(*words: object) -> np.random.Generator:
 
 
 def signed(rng: np.random.Generator, low: float, high: float) -> Floats:
-    """Draw three magnitudes within limits, each of either sign."""
+    """Draw three magnitudes within limits, each with a random sign."""
     return np.asarray(rng.uniform(low, high, 3) * rng.choice([-1.0, 1.0], 3))
 
 
 def spread(n: int, rng: np.random.Generator) -> Floats:
-    """Choose attitudes, shape (n, 3): each far from the earlier ones, in a random frame."""
+    """Choose attitudes, unit vectors (n, 3), each far from all before it, in a random frame."""
     many = rng.standard_normal((2000, 3))
     many /= np.linalg.norm(many, axis=1)[:, None]
     chosen = [many[0], -many[0]][:n]
@@ -191,7 +194,7 @@ def spread(n: int, rng: np.random.Generator) -> Floats:
 def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:
     """Return A, b, h of ``x' = A x + b air + h``; x: case, board, parts, hidden node [degC]."""
     A, b, h = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    # The case is heavier than the board: heat from the board warms the case a tenth as fast.
+    # The case is heavier than the board: it is coupled to the board by 0.1, to the air by `film`.
     A[CASE, CASE] = -environment.film - 0.1
     A[CASE, BOARD] = 0.1
     b[CASE] = environment.film
@@ -228,8 +231,8 @@ def integrate(A: Floats, b: Floats, h: Floats, air: Floats, step_s: float, x: Fl
 
 def program(start_c: float, soak_min: float, *ramps: tuple[float, float, float]) -> Floats:
     """
-    Return the corners of a program, shape (n, 2) [s, degC]; `ramps`: target [degC], rate [K/min],
-    soak [min].
+    Return the corners of a chamber program, shape (n, 2) [s, degC]; `ramps`: target [degC], rate
+    [K/min], soak [min].
     """
     corners = [(0.0, start_c), (60.0 * soak_min, start_c)]
     for target_c, rate, rest_min in ramps:
@@ -275,7 +278,7 @@ def record(
     shift : ndarray, shape (3,)
         Additional bias of this bag [ug].
     tilt : ndarray, shape (3,) or None
-        Rotation of the support per square of the case's temperature about the reference [rad/K^2].
+        Rotation of the support per square of the case's temperature less `REFERENCE_C` [rad/K^2].
     is_cold : bool
         Whether the unit is switched on at the start of the recording, at the temperature of the
         air.
@@ -334,7 +337,8 @@ def record(
 def flicker_noise(n: int, interval_s: float, floor: float, rng: np.random.Generator) -> Floats:
     """
     Draw noise, shape (n, 3), of the one-sided spectrum ``h / f`` down to a quarter of the lowest
-    frequency of a recording. Its Allan deviation is ``floor = sqrt(2 ln(2) h)`` at all times.
+    frequency of a recording. The noise's Allan deviation is ``floor = sqrt(2 ln(2) h)`` at all
+    averaging times.
     """
     whole = 4 * n
     frequency = np.fft.rfftfreq(whole, interval_s)[1:, None]
@@ -349,7 +353,7 @@ def lagged(node: Floats, tau_s: float) -> Floats:
     if not tau_s:
         return node
     decay = np.exp(-STEP_S / tau_s)
-    # Late in a ramp the lagged temperature is behind by rate times `tau_s`; before the ramp by 0.
+    # Late in a ramp the lagged temperature is behind the node's by rate times `tau_s`.
     gain = tau_s / STEP_S * (1.0 - decay)
     behind = lfilter([gain], [1.0, -decay], np.diff(node, prepend=node[0]))
     return np.asarray(node - behind)

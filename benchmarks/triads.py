@@ -27,7 +27,7 @@ from thermo_comp.simulation.unit import Stream, SwitchedLoad, UnitModel, generat
 from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G
 
-#: Kinds of triads, each with one kind of physics in addition to tempcos that lag. The order of
+#: Kinds of triads, each with one kind of physics beside temperature coefficients. The order of
 #: the kinds numbers the streams of random numbers, after those of the instruments.
 TRIAD_NAMES = (
     *('own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load'),
@@ -38,7 +38,7 @@ FIRST_KIND = 3
 
 @dataclass(frozen=True)
 class LeakageEffect(Effect):
-    """Leakage of a junction: ``exp(d / growth) - 1`` with the part's deviation `d`."""
+    """Leakage of a junction: ``exp(d / growth) - 1`` with the part's deviation `d` [K]."""
 
     part: str
     growth: float
@@ -81,7 +81,8 @@ def _only(axis: int, value: float) -> Triple:
 
 def triad(kind: str, seed: int = 0) -> UnitModel:
     """
-    Return a triad of bare heads on a board, with lagging tempcos and the physics of its kind.
+    Return a triad of bare heads on a board, with temperature coefficients of parts that lag, and
+    the physics of its kind.
     """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
@@ -96,7 +97,7 @@ def triad(kind: str, seed: int = 0) -> UnitModel:
         if to_case:
             links.append(Link('case', head, 0.02 * to_case))
     if kind == 'convection':
-        # Convection in the gap carries part of the heat.
+        # Convection carries part of the heat between case and board.
         links[1] = Link('case', 'board', 0.15)
         links.append(Link('case', 'board', draw.between(0.15, 0.35), exponent=1.25))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})

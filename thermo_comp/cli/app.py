@@ -3,9 +3,9 @@
 """
 Owns the entry point of the command line: its commands and exit codes.
 
-0: done. 1: the data or the result is bad. 2: the command line is wrong. 3: an update gains
-nothing. 70: a bug of this program, whose traceback goes into a file. Every error is one line on
-stderr.
+Exit code 0: done; 1: the data or the result is bad; 2: the command line is wrong; 3: an update
+gains nothing; 70: a bug of this program, whose traceback goes into a file. Every error is one line
+on stderr.
 
 Heavy libraries are imported by the commands when they run, so that ``--help`` is fast.
 """

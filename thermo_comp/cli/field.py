@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``update``, and ``evaluate`` on a rest log: a calibration in use."""
+"""Owns the commands for a calibration in use: ``update``, and ``evaluate`` on a rest log."""
 
 from datetime import datetime, timezone
 from pathlib import Path

@@ -146,7 +146,7 @@ def _end(
     offset: float | None,
     is_stopped: bool,
 ) -> None:
-    """Print the result of the test, and the command that fits it."""
+    """Print the result of the test, and the command that fits a calibration to its bags."""
     rested = [position for position in account.positions if position.n_rests]
     out.table(_COLUMNS, _rows(rested))
     for line in _lines(account):
@@ -198,7 +198,7 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print each change since the last call on a line."""
+    """Print each change of the account since the last call on a line."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)

@@ -76,7 +76,7 @@ def expanded(command: Callable[..., Any]) -> Any:
 
 @contextmanager
 def usage_of(what: str = '') -> Iterator[None]:
-    """Turn a ValueError of the block into a usage error."""
+    """Turn a ValueError of a `with` block into a usage error."""
     try:
         yield
     except ValueError as mistake:

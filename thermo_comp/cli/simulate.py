@@ -158,7 +158,7 @@ def _metadata(
 
 
 def _write_rate(writer: 'BagWriter', spin: 'Spin', duration_s: float) -> None:
-    """Write the rate of the table, along the vertical z."""
+    """Write the rotation rate of the rate table, about the vertical axis z [rad/s]."""
     import numpy as np
 
     from ..simulation.run import START_NS

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the logs of autopilots, behind the extras ``px4`` and ``ardupilot``: one IMU, one barometer.
+Owns the logs of autopilots, by the extras ``px4`` and ``ardupilot``: one IMU and one barometer are
+read from a log.
 
 An IMU's thermometer lags the surroundings: its readings become the board temperature. The readings
 of the barometer's thermometer follow the surroundings: they become the case temperature, and the
@@ -16,7 +17,8 @@ temperature.
 ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
 with an instance number ``I`` in new logs; the IMU's temperature is ``T`` or ``Temp``. Samples
 logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected.
-While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets 1 at the end.
+While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets
+``INS_TCALn_ENABLE`` to 1 after learning.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
 https://ardupilot.org/copter/docs/logmessages.html
@@ -43,7 +45,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects drift, with its changes, and advice."""
+    """A parameter that is 1 while the autopilot corrects drift: times, values, and advice."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -56,7 +58,7 @@ _Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, _Co
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
-_NO_NOISE = 1e-6  # noise below this is rounding, as in a simulator [g]
+_NO_NOISE = 1e-6  # smaller noise is rounding, as in a simulator's log [g]
 _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}

@@ -5,8 +5,9 @@ Owns tables with a column map: the content and unit of each column, and the mess
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table of numbers alone, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed. Times rise. Readings at rest are gravity, which gives the unit. An
-angular rate that would be faster in rad/s than any turn by hand is in deg/s.
+wz]`` as for imu_tk, is guessed: times rise from row to row, readings at rest are gravity, which
+gives their unit, and an angular rate that would be faster in rad/s than any turn by hand is in
+deg/s.
 """
 
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ _STEPS_S = (5e-5, 0.5)
 #: A turn by `_TURN` rad between successive blocks of `_BLOCK` still samples (scatter below
 #: `_QUIET` g) excludes times in ms; intervals are then plausible up to `_SLOW_S` s.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
-_FASTEST_RAD_S = 20.0  # no gyroscope is turned by hand faster than this [rad/s]
+_FASTEST_RAD_S = 20.0  # largest rate of a gyroscope that is turned by hand [rad/s]
 #: Range of stamps since 1970 [s], 2000 to 2038, and their largest interval; a count of us since
 #: power-up may be in this range, but its intervals are longer.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
@@ -47,7 +48,7 @@ _FASTEST_K_S = 0.5
 # sensor numbers, whose rows alternate, changes in more rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
-#: Share of a counter's range at each end: a step from the upper to the lower is an overflow.
+#: Share of a counter's range at each end: a step from the upper to the lower end is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
 _GIVE_MAP = f'give {_A_MAP}'
@@ -335,7 +336,7 @@ def _stamp(
     steps = np.diff(times)
     if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
         step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # In a slow log of a unit that never turns, large temperature changes prove a long log.
+        # Large temperature changes show that a slow log of a unit without turns is long.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
         # Take the largest unit with a plausible interval of samples: 5 ms is plausible, 5 s is
@@ -351,7 +352,7 @@ def _stamp(
 
 
 def _no_time(column: Column | None, steps: Floats) -> str:
-    """Return the fault of the times of a column."""
+    """Describe the fault of a column of times."""
     if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
         shown = f'{(steps == 0.0).mean():.0%}'
         return (

@@ -85,7 +85,7 @@ def read_headings(
     headings: Sequence[str], is_plausible: Callable[[str, str], bool] = lambda *_: False
 ) -> Headings | None:
     """
-    Find the columns by their names; None where no accelerometer is among them.
+    Find the columns by their names; None if no accelerometer is among the columns.
 
     `is_plausible`: whether the values of a column, in a unit, can be those of a thermometer
     """

@@ -49,8 +49,8 @@ NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row without a stamp
 PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # number of rows processed at a time, to bound the memory
 _EXAMPLES = 5
-_RESTART_NS = 10**9  # a larger backward step is a restart of the clock, as for the compensator
-SLOW_HZ = 5.0  # slower logs are only good for soaks
+_RESTART_NS = 10**9  # a larger backward step restarts the clock [ns], as in the compensator
+SLOW_HZ = 5.0  # logs with a lower sample rate are only good for soaks
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ForeignLog:
     clip: tuple[float, float] | None = None  # readings from which on the sensor is saturated
     frame_id: str = 'imu_link'
     serial: str = ''
-    n_short: int = 0  # number of rows left out
+    n_short: int = 0  # number of rows dropped for missing cells
     not_used: tuple[str, ...] = ()  # columns of a table that are in no message
     continued: tuple[int, ...] = ()  # lines where a 32-bit counter began again, and was continued
     metadata: Mapping[str, str] = field(default_factory=dict)
@@ -101,9 +101,9 @@ class Finding:
 class ConversionReport:
     """Summary of a conversion."""
 
-    log: ForeignLog  # the part that was written
+    log: ForeignLog  # the part of the log that was written
     rows: int
-    messages: Mapping[str, int]  # by the name of the input
+    messages: Mapping[str, int]  # number of messages by the name of the input
     rate_hz: float
     duration_s: float
     findings: dict[str, Finding]
@@ -332,7 +332,7 @@ def inferred_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
-    """Return why a stated unit cannot be true; None if it may be."""
+    """Return why a stated unit cannot be true; None if the unit can be true."""
     if not np.isfinite(magnitude):
         return None
     believed, reason = inferred_unit(magnitude)

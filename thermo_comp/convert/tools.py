@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the files of other tools, `TOOLS`: writing and reading of each.
+Owns the files of other tools: `TOOLS` writes and reads the file of each tool.
 
 Autopilots only correct each axis' bias, by a cubic of the sensor's temperature held at the edges
 of a range, in m/s^2 or, for a gyroscope, in rad/s; ``raw`` is in m/s^2, scaled by the driver::
@@ -15,9 +15,10 @@ triad at one temperature; with the reading N and the specific force a::
     imu_tk      a = T K (N - B)      T upper triangular, unit diagonal; K diagonal    (.calib)
     imu_calib   a = SM N - bias      SM any matrix                                    (YAML)
     Kalibr      N = M a + b          M lower triangular                               (YAML)
-    here        a = M K^-1 (N - b)   M lower triangular, unit diagonal; K diagonal
+    thermo_comp a = M K^-1 (N - b)   M lower triangular, unit diagonal; K diagonal
 
-A tool whose matrix is not lower triangular has a frame that is rotated relative to ours.
+A tool whose matrix is not lower triangular has a frame that is rotated relative to that of
+thermo_comp.
 """
 
 import re
@@ -54,18 +55,18 @@ class Content:
 
     matrix: Floats  # shape (3, 3); the identity in an autopilot's file
     bias: Floats  # coefficients of each axis, in units of N, shape (3, 4)
-    reference_c: float  # origin of the cubics
+    reference_c: float  # temperature at the origin of the cubics
     range_c: tuple[float, float]
     notes: list[str]  # lost or missing parts
     source: str = ''  # the tool and the set that was read
-    # For export: white noise [m/s^2/sqrt(Hz)], walk [m/s^2/sqrt(h)], samples per second.
+    # For export: white noise [m/s^2/sqrt(Hz)], bias walk [m/s^2/sqrt(h)], samples per second.
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate_bias: Floats | None = None  # like `bias`, for the angular rate [rad/s]
     text: str = ''  # the written file
 
 
 def _write_px4(content: Content, number: int | None, device_id: int) -> str:
-    """Write PX4 parameters, in QGroundControl's format; ``TC_An`` has n from 0."""
+    """Write PX4 parameters in QGroundControl's format; n in ``TC_An`` counts from 0."""
     instance = _within(number, 0)
     lower, upper = content.range_c
     lines = ['# Vehicle-Id Component-Id Name Value Type']
@@ -85,7 +86,7 @@ def _write_px4(content: Content, number: int | None, device_id: int) -> str:
 
 
 def _write_ardupilot(content: Content, number: int | None, _device_id: int) -> str:
-    """Write ArduPilot parameters; ``INS_TCALn`` has n from 1."""
+    """Write ArduPilot parameters; n in ``INS_TCALn`` counts from 1."""
     imu = _within(number, 1)
     lower, upper = content.range_c
     content.notes.append(
@@ -109,7 +110,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None if there are none."""
+    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for another text."""
     values = _Parameters(text)
     numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not numbers:
@@ -137,7 +138,7 @@ def _read_px4(text: str, number: int | None) -> Content | None:
 
 
 def _read_ardupilot(text: str, number: int | None) -> Content | None:
-    """Read ArduPilot parameters (Mission Planner, MAVProxy); None if there are none."""
+    """Read ArduPilot parameters (Mission Planner, MAVProxy); None for another text."""
     values = _Parameters(text)
     numbers = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
     if not numbers:
@@ -186,7 +187,7 @@ class _Parameters(dict[str, float]):
 
 
 def _choose(numbers: set[int], number: int | None, is_in_use: Callable[[int], bool]) -> int:
-    """Choose the set `number`, or the only set in use."""
+    """Choose the parameter set `number`, or the only set in use."""
     if number is None:
         live = [n for n in sorted(numbers) if is_in_use(n)] or sorted(numbers)
         if len(live) > 1:
@@ -212,7 +213,7 @@ def _qr(matrix: Floats) -> tuple[Floats, Floats]:
 
 def turned(rotation: Floats) -> list[str]:
     """
-    Describe the rotation from the other tool's frame to ours, for tf; empty without rotation.
+    Describe the rotation from another tool's frame to thermo_comp's, for tf; empty without it.
     """
     if np.abs(rotation - np.eye(3)).max() < 1e-9:
         return []

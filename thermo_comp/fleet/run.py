@@ -198,7 +198,7 @@ def render_fleet(
             [spread.limit for spread in summary.spreads],
         ),
     )
-    # With few units the spread is not known.
+    # With fewer than eight units all limits of outliers are infinite.
     is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
     return render(
         'fleet.html',
@@ -226,7 +226,7 @@ class Results:
             raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files, which is always inside the fleet's."""
+        """Return the folder of a unit's files, which is always inside the folder of results."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 

@@ -180,7 +180,7 @@ def fitted_cells(
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
-    # Without a prior, fewer positions do not separate the slope of a bias from that of a scale.
+    # Without a prior, too few positions do not separate the slopes of bias and scale.
     is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
     for quantity, unit, slope, sd in _slopes(calibration):
         parts[f'{quantity}_slope_{{0}}_{unit}'] = slope
@@ -224,7 +224,7 @@ def fitted_cells(
 
 def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats]]:
     """
-    Yield quantity, unit, slopes of its static curves at T_ref and their sd, shapes (3,).
+    Yield quantity, unit, slopes of the static curves of a quantity at T_ref and sd, shapes (3,).
 
     The sd is NaN where the fit has left out the curve of an axis: its slope of 0 is the prior's.
     """

@@ -31,13 +31,13 @@ class StoredFile(NamedTuple):
     stamp: str
 
 
-#: Files of each bag by the bag's path relative to the fleet's folder; several for a directory.
+#: Files of each bag by the bag's path relative to the fleet's folder; several for a rosbag2 bag.
 Bags = dict[str, list[StoredFile]]
 
 
 @dataclass(frozen=True)
 class FoundUnit:
-    """The bags of one thermal test; the name is a folder or serial, the lot the folder above."""
+    """The bags of one thermal test; `name`: its folder, or serial; `lot`: top folder, or ''."""
 
     name: str
     lot: str

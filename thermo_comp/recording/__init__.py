@@ -3,5 +3,5 @@
 """
 Owns bags: reading into columns and writing from columns, streaming, in bounded memory.
 
-The only package that imports `rosbags` and `mcap`.
+No other package of thermo_comp imports `rosbags` or `mcap`.
 """

@@ -57,7 +57,7 @@ class Topic(NamedTuple):
 class BagFile:
     """
     An open file of a bag: topics by channel number, encoding and text of message types, log times,
-    and the missing part. Errors name the file by its `path`.
+    and a text on missing data. Errors name the file by its `path`.
     """
 
     storage = 'mcap'
@@ -156,7 +156,7 @@ class Block:
     """
     Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
     `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu; `imu`
-    holds the other fields of that message. `temperatures` are by thermometer; `log_ns` and, if
+    holds the other fields of sensor_msgs/Imu. `temperatures` are by thermometer; `log_ns` and, if
     requested, the serialized messages `raw` are by role.
     """
 
@@ -252,10 +252,10 @@ def joined(blocks: Sequence[Block]) -> Block:
 
 def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
-    Give readings without a stamp the stamp of the sample before them (`last_ns` before the block);
-    return the block and its newest stamp. Readings before any sample are dropped.
+    Give readings without a stamp the newest stamp of the samples before them (`last_ns` before the
+    block); return the block and its newest stamp. Readings before any sample are dropped.
 
-    Node and reader use the samples' clock, as it does not depend on the speed of a playback.
+    Node and reader take stamps of samples, which do not depend on the speed of a playback.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -287,7 +287,7 @@ def unstamped(stamp_ns: int) -> str:
 
 
 def clocks_apart(block: Block) -> str:
-    """Name a thermometer whose stamps are far from those of the samples around it, and why."""
+    """Describe samples with one stamp, or a thermometer stamped far from the samples around it."""
     stamps = block.accel_stamp_ns
     if len(stamps) >= _FEWEST_READINGS and (stamps == stamps[0]).all():
         return unstamped(int(stamps[0]))

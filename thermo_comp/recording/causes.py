@@ -37,7 +37,7 @@ class CauseCounter:
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
     def cause(self, cells: Cells, still_sd: float) -> str:
-        """Describe the fault of the samples; empty if they may be an accelerometer's."""
+        """Describe the fault of the samples; empty if an accelerometer may have sent them."""
         if self._n_absent > _FAULT_SHARE * self._n:
             return (
                 'its messages say that they hold no acceleration '

@@ -30,7 +30,7 @@ from ..typing import Bytes, Ints
 from .serialized import Messages, gather, number_at
 
 PREFIX = struct.Struct('<BQ')  # opcode and length in front of each record
-HEAD_BYTES = 160  # the head of a chunk's record lies in these first bytes
+HEAD_BYTES = 160  # number of bytes that contain the head of a chunk's record
 _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
@@ -83,7 +83,7 @@ def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
 class Span:
     """
     A part of a file: a chunk, a chunk without end ('torn'), or messages outside chunks ('loose').
-    `position` and `length` [bytes] exclude the message indexes after it; `size` is the size of the
+    `position` and `length` [bytes] exclude the indexes after the span; `size` is the size of the
     decompressed content [bytes].
     """
 

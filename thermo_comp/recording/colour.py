@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the effect of coloured noise on cells at rest: spread of their variances and changes."""
+"""Owns the effect of coloured noise on cells at rest: spread of their variance and roughness."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 # Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
 _TENTH, _NEVER = -1.2816, 6.7
 # Ratio of the degrees of freedom to those of white noise, below which noise is coloured; smallest
-# number of degrees of freedom of a cell; number of iterations, and of candidates in a search.
+# number of degrees of freedom of a cell; number of iterations in `spread_of_variances`, and of
+# candidates in `roughest_at_rest`.
 _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 
 

@@ -5,7 +5,7 @@ Owns the reading of a number inside messages of any type, by the type's definiti
 
 A topic is named ``TOPIC:FIELD``, as for ``ros2 topic echo --field``. In plain CDR a field begins
 at a multiple of its size after the encapsulation; the length of a string or sequence, a uint32,
-precedes it. The positions in all messages advance together, field by field.
+precedes its content. A batch of messages is read field by field, in all messages at once.
 """
 
 import re

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns live recording: new messages of a bag that another program writes, and our numbered bags.
+Owns live recording: new messages of a bag that another program writes, and numbered bags.
 
 Each pass reads the growing bag from its beginning, so the pauses grow with the duration of a pass.
 The messages are written to a folder of bags, `01.mcap`, ... with the node's topic names. The end
@@ -27,7 +27,7 @@ from .writer import BagWriter
 _CHUNK_BYTES = 1 << 17  # a killed process loses a chunk: some 17 s of counts at 100 Hz
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
-#: Hidden name of a bag that is being written: its number and the process number.
+#: Hidden name of an unfinished bag: numbers of the bag and of the process that writes it.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
 _SHARE = 0.2  # largest share of the time in which the growing bag is read
 
@@ -96,7 +96,7 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Turn an unfinished bag into a bag with this number, or the next free number, and delete the
+    Turn an unfinished bag into a bag with `number`, or the next free number, and delete the
     unfinished bag; None if it has no message. RecordingError if nothing can be read.
     """
     with open_recording(path, require=()) as reader:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fast path: an MCAP file, read chunk by chunk in bounded memory.
+Owns the reading of an MCAP file chunk by chunk, in bounded memory.
 
 The summary of a complete file lists the spans that hold messages. A file without a usable summary,
 or cut off anywhere, is read record by record, and its messages are counted. Records other than

@@ -23,7 +23,7 @@ from .topics import PLAIN, Topics, shown
 KELVINS = (180.0, 480.0)
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
-_GAP_INTERVALS = 5.0  # pause that counts as a gap, in median intervals
+_GAP_INTERVALS = 5.0  # shortest gap, in median intervals between samples
 _NO_SAMPLES = (
     'no accelerometer samples: record accel/counts or imu/uncompensated, or name yours with '
     '--topic counts=TOPIC or --topic imu=TOPIC'
@@ -32,7 +32,7 @@ _NO_SAMPLES = (
 
 @dataclass(frozen=True)
 class ThermometerSurvey:
-    """A thermometer: range [degC], largest mean rates over two minutes, smallest step."""
+    """A thermometer: range [degC], largest two-minute rates [K/min], smallest step [K]."""
 
     n: int
     rate_hz: float
@@ -63,7 +63,7 @@ class Survey:
 def thermal_findings(
     thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
 ) -> list[str]:
-    """List missing thermometers, span and ramps; `candidates` are unused topics."""
+    """List what the thermometers lack: topic, span, ramps, unit; `candidates`: unused topics."""
     findings = []
     among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')
@@ -223,7 +223,7 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
     stamp_ns, celsius = stamp_ns[use], celsius[use]
     if not len(celsius):
         return None
-    # Rates of two-minute means, so that a quantum does not look like a ramp.
+    # Take rates between two-minute means, so that a quantum does not look like a ramp.
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
     _, place = np.unique(bins, return_inverse=True)

@@ -89,7 +89,7 @@ class Messages:
         return self.take(np.argsort(self.log_ns, kind='stable'))
 
     def packed(self, room: int = 0) -> Messages:
-        """Copy the bytes, with `room` before each message, so that the original can be freed."""
+        """Copy the bytes, with `room` bytes before each message, to free the original."""
         ends = np.cumsum(self.size + room)
         data = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
         for each in np.unique(self.size[self.size > 0]).tolist():

@@ -3,12 +3,12 @@
 """
 Owns still intervals: raw samples -> short cells (count, mean, variance) -> where nothing moved.
 
-Two tests are relative to the quiet level of the bag: the variance inside a cell (vibration,
-handling) and the step between adjacent cells (a turn, a knock). A step starts a new interval,
-because a tilt of one microradian is already one micro-g. Temperature tilts a unit at rest, too: a
-steady change over several cells, slower than the Earth rotates, is a drift and not a step. Two
-tests have absolute limits, because the quietest tenth of a flight is not a rest: a sensor at rest
-scatters by no more than its noise, and does not rotate.
+Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
+(vibration, handling) and the step between adjacent cells (a turn, a knock). A step starts a new
+interval, because a tilt of one microradian is already one micro-g. Temperature tilts a unit at
+rest, too: a steady change over several cells, slower than the Earth rotates, is a drift and not a
+step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest: a
+sensor at rest scatters by no more than its noise, and does not rotate.
 """
 
 from __future__ import annotations
@@ -23,23 +23,24 @@ from ..typing import Bools, Floats, Ints
 from .colour import roughest_at_rest, spread_of_variances
 from .glitches import is_glitch
 
-#: Largest ratio of a cell's variance (n >= 30 samples) at rest to the quiet level: noise exceeds 4
-#: with a probability below 1e-11, and vibration that must be cut out is far above.
+#: Largest ratio of a cell's variance (n >= 30 samples) at rest to the quiet level: noise alone
+#: exceeds 4 with a probability below 1e-11, and vibration that must be cut out is far above 4.
 VARIANCE_RATIO = 4.0
 #: Largest scatter at rest [g]: above the scatter of the noisiest sensors, below the scatter in
 #: most flights.
 STILL_SD = 0.05
-# Largest scatter of a gyroscope within a cell at rest, and largest distance of a cell's mean from
-# its level [rad/s]; the level drifts with temperature and is averaged over this time [s].
+# Largest scatter of a gyroscope within a cell at rest, and largest distance of a cell's mean rate
+# from the level [rad/s]: the median rate over `_LEVEL_S` [s], which drifts with temperature.
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
-# In a rotation the rate is compared with its median over this time [s].
+# `without_rotation` subtracts from the angular rate its median over this time [s].
 _ROTATION_S = 10.0
 # Size of a step that ends a rest, in robust sd of all steps; noise alone does not reach it.
 _STEP_SDS = 8.0
 # Number of steps whose median is the drift, and the largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
-# Samples searched for a quantum, and smallest number of different steps that prove it.
+# Number of samples searched for a quantum, and smallest number of changes that prove a quantum
+# by being whole multiples of it.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
 STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a cell of slow samples may last
 _LONGEST_CELL_NS = 86400e9  # a longer cell is due to wrong stamps [ns]
@@ -90,8 +91,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells of `cell_s`, or of `least` samples if that is longer; a whole
-    number of cells fills `window_s`, or a cell lasts one of `STRETCHES` windows.
+    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer; a
+    whole number of cells fills `window_s`, or a cell lasts one of `STRETCHES` windows.
     """
 
     def __init__(
@@ -253,7 +254,7 @@ def _part_of(window_s: float, least: float) -> float:
 
 
 def _quantum_of(samples: Floats) -> Floats:
-    """Step of each axis, from the changes between samples; 0 if there is none."""
+    """Find the quantum of each axis in the changes between samples; 0 without a quantum."""
     result = np.zeros(3)
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
@@ -273,7 +274,7 @@ def _quantum_of(samples: Floats) -> Floats:
 def still_intervals(
     cells: Cells, min_rest_s: float, still_sd: float = STILL_SD
 ) -> list[tuple[int, int]]:
-    """Find the runs of still cells: half-open ranges of cell numbers, in order."""
+    """Find the runs of still cells: half-open ranges of indices into `cells`, in order."""
     return long_enough(cells, still_runs(cells, still_sd, (VARIANCE_RATIO,))[0], min_rest_s)
 
 
@@ -325,8 +326,8 @@ def still_runs(
 
 def without_rotation(cells: Cells) -> Cells:
     """
-    Subtract from the angular rate of each cell the median rate of the cells before it, so that a
-    unit at a constant angular rate counts as at rest, and a unit whose rate changes does not.
+    Subtract from the angular rate of each cell the median rate of the last 10 s, so that a unit at
+    a constant angular rate counts as at rest, and a unit whose rate changes does not.
     """
     n = max(1, round(_ROTATION_S / cells.cell_s)) if cells.cell_s else 1
     if len(cells.rate) <= n or not cells.rate.any():

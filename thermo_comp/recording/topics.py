@@ -63,7 +63,7 @@ class Part:
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
-        """Return begin and end as stamps; `first_ns`: stamp of the first sample, inf before it."""
+        """Return begin and end as stamps; `first_ns`: stamp of the first sample, or infinity."""
         origin = 0 if self.is_stamped else first_ns
         begin = -inf if self.begin is None else origin + round(self.begin * 1e9)
         return begin, inf if self.end is None else origin + round(self.end * 1e9)
@@ -171,7 +171,7 @@ def shown(name: str) -> str:
 
 
 def choice_note(name: str, key: str, wanted: str, among: str = 'only') -> str:
-    """Note that a topic was chosen for an input by its type; empty if it has the wanted name."""
+    """Note that a topic was chosen for an input by its type; '' if its name is the wanted name."""
     kind = _TYPES[key].rpartition('/')[2]
     is_named = is_called(name, split_field(wanted)[0])
     return '' if is_named else f'{shown(name)}, its {among} {kind}, is taken for {key}'
@@ -298,7 +298,7 @@ def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> st
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find further thermometers: named topics, and topics beside the board's or the case's."""
+    """Find further thermometers: named topics, and those in the namespace of board or case."""
     both = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))

@@ -30,7 +30,7 @@ from .fields import Field, typestore
 from .serialized import Messages, gather, number_at
 from .topics import shown
 
-#: The columns of sensor_msgs/Imu among its numbers, as `ImuColumns` has them.
+#: The columns of sensor_msgs/Imu among its numbers, in the order of `ImuColumns`.
 _IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
 _IMU_ACCELERATION = slice(25, 28)
 
@@ -143,7 +143,7 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
         )
     endian = '<' if representation else '>'
     frame_size = int(number_at(rows, 12, f'{endian}u4')[0])
-    # (12 + length + 7) // 8 * 8, counted from after the encapsulation
+    # (12 + length of frame_id + 7) // 8 * 8 bytes after the end of the encapsulation
     at = (frame_size + (HEAD_BYTES + 3) & -8) + 4
     length = rows.dtype.itemsize
     if not 0 <= length - (at + 8 * n_numbers) <= _MAX_PADDING:

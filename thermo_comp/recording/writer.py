@@ -5,7 +5,7 @@ Owns the writing of columns to a rosbag2 directory or a bare MCAP file, or block
 table: CSV or (extra ``parquet``) Parquet.
 
 The target's name appears only when `BagWriter.close` has succeeded; if writing fails, an older
-output stays.
+file of this name stays.
 """
 
 import csv
@@ -165,7 +165,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise
 
     def abort(self) -> None:
-        """Drop the unfinished output; an older output stays."""
+        """Drop the unfinished output; an older file of the target's name stays."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):

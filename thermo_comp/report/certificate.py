@@ -165,7 +165,7 @@ def results(
 
 
 def own_heat(calibration: Calibration | None) -> str:
-    """State the gradient of a soak, by which the unit heats itself; '' if it is not known."""
+    """State the gradient in a soak, which the unit's own heat causes; '' if not known."""
     if calibration is None or calibration.soak_gradient_k is None:
         return ''
     gradient, sd = (minus(f'{part:.2f}') for part in calibration.soak_gradient_k)

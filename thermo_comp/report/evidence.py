@@ -34,7 +34,7 @@ RAW = 'raw'
 CHOSEN = 'calibration'
 #: For each position of a fit: the calibration fitted to the other positions.
 LEFT_OUT = 'left out'
-# Rate of a set's range below which the set has no ramps in this direction [K/min].
+# Bags whose fastest heating (cooling) is below this have no heating (cooling) ramps [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
 #: Key of a bag's metadata in which the simulator stores the truth.
 _SIMULATED = 'truth'
@@ -194,7 +194,7 @@ class Evidence:
 
 
 def given(value: _T | None) -> _T:
-    """Return a value that is not None, because a figure is drawn only if its data exist."""
+    """Return a value that a figure needs; ValueError if it is None."""
     if value is None:
         raise ValueError('`evidence` lacks the data of this figure')
     return value

@@ -24,7 +24,7 @@ _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
 _RING = 22.0
-# Largest number of rows on a page.
+# Largest number of positions in `draw_every_position`, a row each.
 _MOST = 24
 
 

@@ -94,7 +94,8 @@ def _draw_less_line(
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
     Average the residual in each soak of each position: temperatures (n,), bias [micro-g] and scale
-    [ppm] (n, 6), attributed to bias or to scale alone; scale is NaN below half of gravity.
+    [ppm] (n, 6), attributed to bias or to scale alone; scale is NaN if the axis senses less
+    than half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:

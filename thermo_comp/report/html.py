@@ -93,7 +93,7 @@ def spelt(text: str) -> str:
 
 
 def rounded(value: float, expanded: float) -> tuple[str, str]:
-    """Round an uncertainty to two digits, the value to the same place; unknown is a dash."""
+    """Round an uncertainty to two digits, the value to the same place; '–' if unknown."""
     if not 0.0 < expanded < math.inf:
         return number(value, 6), '–'
     place = 1 - math.floor(math.log10(expanded))

@@ -145,7 +145,7 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _judged_bags(evidence: Evidence) -> list[str]:
-    """Describe the bags of the verdict; add a sentence if their regime was never known."""
+    """Describe the bags of the verdict; add a sentence if the shown bag has no known regime."""
     collected = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board

@@ -13,7 +13,7 @@ from ..unit.gravity import MICRO_G
 from ..unit.prediction import bias_and_scale, in_a_soak, ramp_states, sd_of_states
 
 _N_CURVE = 61
-#: Steps of a table over temperature [K], and the largest number of its temperatures in a state.
+#: Steps of a table over temperature [K], and the largest number of temperatures in a table.
 _STEPS_K = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 _MOST_TEMPERATURES = 8
 
@@ -46,7 +46,7 @@ class Curve(NamedTuple):
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """List a soak and, where they differ from it, ramps at half of the fastest rate calibrated."""
+    """List a soak and, if ramps differ from a soak, ramps at half the fastest calibrated rate."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:

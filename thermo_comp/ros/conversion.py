@@ -18,7 +18,7 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
-#: Compensates a sample: stamp and three components in, force and covariance out; None = dropped.
+#: Compensates a sample: stamp [ns] and three components to force and covariance; None: dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
 #: Corrects the angular rate of a sample: stamp and rate in, rate and variances out.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']

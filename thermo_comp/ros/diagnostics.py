@@ -108,8 +108,8 @@ class Reporter:
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._inputs(), *self._lost_rests()]
         findings += findings_of(loaded, status, new, rate, silence_s)
-        # Without a nonlinearity the warning begins 1 g above the fit, where the unknown square
-        # term has an sd of 0.1 mg, and not at each acceleration of a vehicle.
+        # Without a nonlinearity the warning begins 1 g above the fit's |f|, where the unknown
+        # square term has an sd of 0.1 mg, and not at each acceleration of a vehicle.
         least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > least:
             findings.append((_WARN, f'|f| {over:.3g} m/s^2 {_BEYOND_FORCE}'))

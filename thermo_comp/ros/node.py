@@ -53,7 +53,7 @@ parameters:
 #: Prefix that the launch file gives to a parameter whose argument was not given.
 NOT_GIVEN = 'not_given.'
 
-#: Errors of files, values, the environment and the middleware (which raises RuntimeError, too).
+#: Errors that are no bug of the node: of files, values, environment, middleware (RuntimeError).
 _NOT_OURS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
@@ -81,7 +81,7 @@ class CompensationNode:
         self._requests = parameters.ParameterRequests(self._loop, self._prepare, self._set)
         self._loop.call_every(config.diagnostics_period, self._report)
         topics = [self.node.resolve_topic_name(sample.name) for sample in SAMPLES.values()]
-        # Accept QoS overrides of both inputs: the input that is not in use may be opened later.
+        # Accept QoS overrides of counts and Imu: the input that is not in use may be opened later.
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in overrides(self.node):
             if not (self.node.has_parameter(name) or name.startswith(known)):

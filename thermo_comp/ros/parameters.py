@@ -140,7 +140,7 @@ class ParameterError(ThermoCompError):
 
 
 def declare(node: Node) -> NodeConfig:
-    """Declare every parameter with the user's value; ParameterError if it breaks the rule."""
+    """Declare every parameter with the user's value; ParameterError for an invalid value."""
     values, given = {}, overrides(node)
     names = named_topics(_checked('topics', given.get('topics', '')))
     inputs = [name for name in ('counts', 'imu') if name in names]
@@ -196,7 +196,7 @@ def parameters_help() -> str:
 
 
 def _checked(name: str, value: Any) -> Any:
-    """Return a value in its parameter's type; ParameterError if it breaks the rule."""
+    """Return a value in its parameter's type; ParameterError for an invalid value."""
     metadata, rule, got = _TABLE[name].metadata, '', f'{value!r:.60}'
     if isinstance(_TABLE[name].default, str):
         longest, choices = metadata['longest'], metadata['choices']

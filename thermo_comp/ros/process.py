@@ -33,10 +33,10 @@ def use_profile() -> None:
 
 class SignalWatch:
     """
-    Turns the first signal into a call; the second ends the process. The object must be used in the
-    main thread.
+    Turns the first signal into a call; a second signal ends the process. The object must be used
+    in the main thread.
 
-    If the process has not ended `ending_s` [s] after the call, it is ended.
+    A process that has not ended `ending_s` [s] after the call is ended by `os._exit`.
     """
 
     # Another thread calls the stop function: while the main thread waits in the middleware, the

@@ -4,7 +4,7 @@
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
 Messages do not identify their publisher. A topic with more than one publisher is ignored, as is
-the first batch afterwards, which may be from the publisher that left (`waitloop.Sources`).
+the first batch after one of two publishers has left, which may be its (`waitloop.Sources`).
 """
 
 from bisect import bisect_left, bisect_right
@@ -38,7 +38,7 @@ _Reading = tuple[int, tuple[str, int, float]]
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """Everything that a reload replaces: one reference, exchanged between two samples."""
+    """Everything that a reload replaces, by exchanging one reference between two samples."""
 
     loaded: LoadedCalibration
     config: NodeConfig

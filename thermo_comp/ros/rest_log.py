@@ -39,8 +39,8 @@ _WAITING = 1000
 _EPOCH_NS = 946_684_800 * 10**9
 #: Smallest backward step of the stamps [ns] that begins a new recording.
 _JUMP_NS = 10**9
-# First bytes of a message in plain form (see `conversion`), and offsets from its end of counts,
-# force and angular rate.
+# First bytes of a message in plain form (see `conversion`); offsets of counts, force and angular
+# rate from the end of the message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
 _SHORTEST = {False: 44, True: 316}  # shortest message [bytes]: of counts, and of an Imu (True)
 
@@ -154,7 +154,7 @@ class RestKeeper:
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
         """Sum messages that the compensator has corrected; queue the rests that end in them."""
-        # Sum with the calibration in use now: after a reload, samples of the last second or two
+        # Sum with the present calibration: after a reload, samples of the last second or two
         # may have been corrected by the calibration before.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')

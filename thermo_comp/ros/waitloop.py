@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the loop around a node's wait sets, and everything that leaves rclpy's documented API.
+Owns the loop around a node's wait sets, and all uses of rclpy beyond its documented API.
 
 rclpy's executor costs ten times the compensation itself. In this loop messages stay serialized.
-While samples flow, a wake-up waits only for samples and empties their queue; services and ordinary
-subscriptions are polled. Timers, clients and middleware events are not served by this loop.
+While samples flow, the loop waits only for samples, and each wake-up empties their queue; services
+and ordinary subscriptions are polled. Timers, clients and middleware events are not served by this
+loop.
 
 Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message`, `get_publisher_count`, `service_take_request` and `publish_raw` of handles, and the
@@ -44,20 +45,20 @@ _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 #: Shortest time between two logged failures [ns].
 _LOG_PERIOD_NS = 10 * 10**9
 
-#: Consecutive numbering over this time [ns] and number of messages proves a single publisher.
+#: Consecutive numbers over at least this time [ns] and this many messages prove one publisher.
 ALONE_NS, ALONE_MESSAGES = 10**9, 5
 
 _KINDS = {Subscription: 'subscription', Service: 'service', GuardCondition: 'guard_condition'}
 
 RCLError = rclpy_implementation.RCLError
 
-#: Takes a request and a function that sends the answer, now or later, in the loop's thread.
+#: Serves a request, given the function that sends the answer, now or later, in the loop's thread.
 Serve = Callable[[Any, Callable[[Any], None]], None]
 
 
 class Sources:
     """
-    Decides whether the messages of a topic are from one publisher while several are known.
+    Decides whether a topic's messages are from one publisher while several publishers are known.
 
     The middleware lists a killed publisher for the time of its lease, 20 s. Messages do not
     identify their publisher, but each publisher numbers its messages: consecutive numbers over a
@@ -77,7 +78,7 @@ class Sources:
         """Return the index of the first message that is surely from the only active publisher."""
         was_contested, n_before, self._n_known = self.is_contested, self._n_known, n_known
         if n_known <= 1:
-            # The first messages with one publisher may still be from a publisher that has left.
+            # The first batch after a second publisher has left may hold its last messages.
             self.is_contested, self._number = False, numbers[-1]
             return len(numbers) if was_contested else 0
         if n_known > n_before:
@@ -114,13 +115,13 @@ class RawSubscription:
         self.count_publishers: Callable[[], int] = subscription.handle.get_publisher_count
         self._sequence: int | None = None
         self._newest_ns = 0
-        #: Number of messages sent and not received, by the numbers of a single publisher.
+        #: Number of messages sent and not received, by the sequence numbers of one publisher.
         self.n_lost = 0
         #: Mean interval between the messages of the last drain [ns].
         self.interval_ns = 0
 
     def drain_single_source(self) -> tuple[list[bytes], list[int], int]:
-        """Take the waiting messages that are surely from one publisher, and count the others."""
+        """Take the waiting messages surely from one publisher, and count the other messages."""
         messages, received_ns, numbers = self.drain()
         if not messages:
             return messages, received_ns, 0
@@ -128,7 +129,7 @@ class RawSubscription:
         return messages[first:], received_ns[first:], first
 
     def drain(self) -> tuple[list[bytes], list[int], list[int | None]]:
-        """Take waiting messages, oldest first; return also arrival times [ns] and numbers."""
+        """Take waiting messages, oldest first, with arrival times [ns] and sequence numbers."""
         messages: list[bytes] = []
         received_ns: list[int] = []
         numbers: list[int | None] = []
@@ -202,7 +203,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call a function periodically [s], replacing the previous one; cheaper than a timer."""
+        """Call a function periodically [s] instead of the last function; cheaper than a timer."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback
@@ -333,7 +334,7 @@ def _opened(create: Callable[..., Any], message_type: Any, topic: str, qos: QoSP
     """Open a topic with its QoS overrides; ThermoCompError if name or QoS is invalid."""
     policies = QoSOverridingOptions.with_default_policies()
     try:
-        # rclpy writes the overrides into the profile.
+        # rclpy writes the overrides into the profile: give it a copy.
         return create(message_type, topic, qos_profile=copy(qos), qos_overriding_options=policies)
     except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
         raise ThermoCompError(f'a topic cannot be opened: {error}') from error
@@ -373,5 +374,5 @@ def wait_until(is_done: Callable[[], object], timeout_s: float, nap_s: float = 0
 
 
 def overrides(node: Node) -> dict[str, Any]:
-    """Return the parameters that the user set at the start, known or not, by name."""
+    """Return the parameters that the user set at the start, declared or not, by name."""
     return {name: value.value for name, value in node._parameter_overrides.items()}  # noqa: SLF001
