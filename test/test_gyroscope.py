@@ -31,7 +31,7 @@ from thermo_comp.unit.rate_bias import MILLIDEGREE, RateCurve
 
 OPTIONS = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
 START_NS = 1_767_225_600_000_000_000
-#: White noise of a mean over 60 s of the simulated gyroscope.
+#: White noise of a mean over 60 s of the simulated gyroscope [rad/s].
 RATE_HZ, MINUTE = 1.0, 60
 FLOOR = 5.0 * MILLIDEGREE / np.sqrt(60.0)
 
@@ -61,7 +61,7 @@ def rms(values):
 
 @pytest.fixture(scope='module')
 def unit():
-    # A temperature every 4 s suffices for lags of minutes, and saves 3/4 of the time.
+    # A temperature reading every 4 s suffices for lags of minutes, and saves 3/4 of a fit's time.
     return unit_preset('mems', 2).with_thermometers(rate_hz=0.25)
 
 
@@ -69,7 +69,7 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # The groups of lags and heat flows have half of the columns, and take half of the time.
+    # The groups of lags and heat flows have half of all columns; their fit takes half as long.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -98,12 +98,12 @@ def test_the_residual_of_a_mems_gyroscope_is_its_noise(unit, fitted, held_out):
     assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
     assert rms(changes) < 1.15 * FLOOR
     assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-    # The mean rate is within 3 sd, with the variances of the claim and of the Earth's rate.
+    # The mean rate is within 3 sd: claimed variance plus a third of the Earth's rate squared.
     message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
     claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
     assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
     np.testing.assert_allclose(gyroscope.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
-    # The claimed sd follows from 9 positions with a turn-on of 2 mdeg/s.
+    # The claimed sd is that of the turn-ons, 2 mdeg/s, estimated from 9 positions.
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
@@ -246,7 +246,7 @@ def reduced(unit, records):
 @pytest.mark.slow
 def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, [held_out])
-    # The first third of the bag has enough ramps and soaks to show an error.
+    # The first third of the bag has enough ramps and soaks to show a wrong calibration.
     thirds = [replace(interval, n_whole=interval.n_whole // 3) for interval in bags[0].intervals]
     short = [replace(bags[0], intervals=tuple(thirds))]
     judged = judge_bags(bags, calibration)
@@ -261,7 +261,7 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
         assert section.raw_rms > 50.0 * FLOOR
     assert judged.facts()['angular_rate']['reason'] == rate.reason
     assert 'angular rate: valid: 0.' in str(rate)
-    # A gyroscope of another unit is detected, also if it states no covariance.
+    # A gyroscope calibration of another unit is detected, also if it has no covariance.
     gyro = calibration.gyroscope
     other = replace(gyro, response=(), static=gyro.dynamic, dynamic=gyro.dynamic, posterior=None)
     wrong = judge_bags(short, replace(calibration, gyroscope=other))

@@ -42,7 +42,7 @@ def resting(
     serial='',
     reading_s=1,
 ):
-    """Write a unit at rest, z up, whose z axis drifts with its temperature."""
+    """Write a bag of a unit at rest, z up, whose z axis drifts with its temperature."""
     rng = np.random.default_rng(3)
     begin, end = temperature if isinstance(temperature, tuple) else (temperature, temperature)
     n = round(minutes * 60.0 * rate_hz)
@@ -69,7 +69,7 @@ def resting(
 
 
 def corrected_by(slope, claim=0.0, **changes):
-    """Make a calibration of the z axis' drift per K, with a claimed sd [m/s^2]."""
+    """Make a calibration with a bias slope of z [counts/K] and a claimed sd [m/s^2]."""
     parts = {name: axis_set(residual_sd_m_s2=claim) for name in 'xy'}
     part = regime_set(**parts, z=axis_set((0.0, slope), residual_sd_m_s2=claim))
     return dataclasses.replace(calibration(static=part, dynamic=part), **changes)
@@ -101,7 +101,7 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 class TestWindows:
     @pytest.mark.parametrize('reading_s', [30, 50])
     def test_a_slow_thermometer_leaves_all_windows(self, tmp_path, reading_s):
-        # WHY: at 2 Hz, partial sums of 20 s between slow readings were dropped as leaps of time.
+        # WHY: at 2 Hz, sums of samples over 20 s between readings were dropped as time jumps.
         bag = resting(tmp_path / 'bag', 30.0, minutes=30.0, rate_hz=2.0, reading_s=reading_s)
         windows = judged(bag, corrected_by(SLOPE)).windows
         assert len(windows) >= 28
@@ -145,7 +145,7 @@ class TestWindows:
         assert windows.window_s == window_s
         np.testing.assert_array_equal(windows.count, rate_hz * window_s)
         np.testing.assert_allclose(np.diff(windows.start_ns) * 1e-9, window_s, atol=1e-6)
-        # All of a rest is in windows, except for the time before the first reading.
+        # Windows cover the whole rest, except for the time before the first temperature.
         assert len(windows) >= int(20.5 * 60.0 / window_s) - 1
 
     def test_samples_too_slow_for_a_window_are_refused(self, tmp_path):
@@ -175,7 +175,7 @@ class TestWindows:
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.14)
 
     def test_a_noisy_unit_rests_as_its_calibration_says(self, tmp_path):
-        # WHY: the limit of 50 mg also applied to a unit whose known scatter is 100 mg.
+        # WHY: the limit of 50 mg for noise at rest also applied to a unit with a noise of 100 mg.
         bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
         density = 0.1 * GRAVITY * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
@@ -225,7 +225,7 @@ class TestVerdict:
             (121.0, 1000.0, 60.0, 'recalibrate'),
             (1100.0, 9000.0, 1500.0, 'valid, but it only claims 1.5 mg'),
             (50.0, 100.0, 60.0, 'valid, but it only claims 60 ug'),
-            # A result no better than raw is not valid, whatever its claim.
+            # A residual no smaller than the raw residual is not valid, whatever the claimed sd.
             (1100.0, 1000.0, 1500.0, 'no better than raw'),
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
@@ -265,7 +265,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # A claim refers to the error in sample, a tolerance to the error of left-out positions.
+        # The claimed sd limits the error in sample, a tolerance the error of left-out positions.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -282,7 +282,7 @@ class TestVerdict:
             assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_a_calibration_without_covariance_gets_the_verdict_no_claim(self):
-        # WHY: an import without covariance was compared with the noise alone and called wrong.
+        # WHY: an imported calibration without covariance was judged by noise alone, as wrong.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
         judgement = judge(windows, imported)

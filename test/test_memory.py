@@ -129,7 +129,7 @@ def test_the_lag_of_a_part_between_board_and_sensor(rng):
     # The lag of the case has a negative share in the lag of the part.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # A lag of two inputs starts at the later of their first values.
+    # A lag of two inputs starts when both inputs have had a first value.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
@@ -156,7 +156,7 @@ def test_the_lag_of_a_part_behind_a_thermometer_that_lags_the_board(rng, second_
     reading, _, part = solve_ivp(slope, (0.0, fine[-1]), [board[0]] * 3, t_eval=fine, rtol=1e-9,
                                  atol=1e-9, max_step=1.0).y  # fmt: skip
     behind = memory_on_grid(MemorySpec(lags=(lag,)), 1.0, reading, [reading])[:, 0]
-    # The memory takes the reading as linear between two stamps.
+    # The memory interpolates the readings linearly between their stamps.
     np.testing.assert_allclose(reading - behind, part, atol=1e-3)
     memory = ThermalMemory(MemorySpec(lags=(lag,)))
     for time, celsius in zip(fine, reading, strict=True):
@@ -202,7 +202,8 @@ def plays(*widths):
 
 
 def test_the_hysteresis_loop_of_a_play():
-    # A play of half-width 1 is v - 1 if v rises, v + 1 if v falls, constant for 2 K in between.
+    # The output of a play of half-width 1 K is v - 1 if its input v rises, v + 1 if v falls, and
+    # constant while v turns back by less than 2 K.
     memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []

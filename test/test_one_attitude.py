@@ -25,7 +25,7 @@ from thermo_comp.fitting.rests import poses_of
 @pytest.mark.parametrize('poses', [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_rests_in_a_pose_at_four_temperatures_show_the_drift_of_the_level_axes(unit, poses):
-    # WHY: with a free attitude in each rest, the curve came from the warm-ups of the board, which
+    # WHY: with free attitudes in all rests, the bias curve came from warm-ups of the board, which
     # the sensor follows with a lag: errors of 1 to 4 mg between the rests.
     study = list(returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
@@ -33,13 +33,13 @@ def test_rests_in_a_pose_at_four_temperatures_show_the_drift_of_the_level_axes(u
     force = strangers.corrected(calibration, held).force
     drift = force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
-    # The rests are turned by 0.2 mrad RMS, 0.2 mg along each level axis; a curve through them is
-    # off by about as much. Tolerance: two standard deviations.
+    # The rests are turned by 0.2 mrad RMS, 0.2 mg along each level axis; a bias curve through
+    # the rests is off by about 0.2 mg. Tolerance: two standard deviations.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
 
 
 def test_a_pose_is_an_attitude_to_which_the_unit_was_returned():
-    # WHY: blocks of one long rest counted as returns, and the walk of the bias became a curve.
+    # WHY: blocks of one long rest counted as returns to a pose; a bias walk was fitted as a curve.
     x, y = np.eye(3)[:2]
 
     def poses(*up, start_ns=range(4)):
@@ -75,7 +75,7 @@ def test_rests_on_the_bench_do_not_separate_the_slopes_of_bias_and_scale(draw, u
     # WHY: the thermometer's noise in rests at constant temperature looked like changes without an
     # effect, and the drift of the one ramp went to the scale factors: 470 ppm/K instead of -36.
     # The warm-ups of a cold unit put a lag of an axis into its scale factor alone. Lags whose
-    # initial states fitted the noise of the rests of a warm unit told both slopes apart by chance.
+    # initial states fitted noise in rests of a warm unit separated bias and scale by chance.
     rng = rng_of('bench beside a ramp', unit)
     imu = draw(rng)
     bench = program(22.0, 5.0)
@@ -94,5 +94,5 @@ def test_rests_on_the_bench_do_not_separate_the_slopes_of_bias_and_scale(draw, u
     tests = {'': [strangers.minutes(bag) for bag in held]}
     score = strangers.scored(study, strangers.fitted(study), tests)['']
     # One attitude leaves the slopes of the scale factors at their prior, so the error is that of
-    # three unknown slopes: its RMS in sd exceeds 1.9 in 1 % of all units.
+    # three unknown slopes: its RMS / claimed sd exceeds 1.9 in 1 % of all units.
     assert score.ratio < 1.9

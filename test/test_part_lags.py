@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each axis is a curve of its part: time constants, kinks and bumps of units with known truth."""
+"""The bias of an axis follows its part: fitted lags, kinks and bumps of units with known truth."""
 
 import json
 from dataclasses import replace
@@ -45,7 +45,7 @@ SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
-    """Record a unit in positions, a number or directions, and two other positions to judge it."""
+    """Record a unit in `up` (a number or directions) to fit, and in two held-out positions."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not navigation
@@ -59,7 +59,7 @@ def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
 
 @pytest.fixture(scope='module')
 def parts(tmp_path_factory, cli, equal_fits_once):
-    """Fit files of a unit with a part of another time constant on each axis, by the command."""
+    """Fit, by the command, tables of a unit whose axes follow parts with different lags."""
     unit, study = study_of('parts', part_s=PARTS_S)
     folder, tables = tmp_path_factory.mktemp('parts'), []
     for bag in study.bags:
@@ -99,7 +99,7 @@ def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
     unit, study, calibration, _ = parts
     # An error of 1 % of a time constant is 1 ug (10 ug/K, lag of 10 K).
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
-    # 0.65 ug is the noise of a mean of a minute.
+    # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
 
 
@@ -111,7 +111,7 @@ def test_a_part_between_board_and_case():
     parts = {one.part for one in calibration.response if one.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares, leads = np.array(sorted(parts)).T
-    # Ramps determine a time constant to 1 %, and therefore the share of the case to 0.01.
+    # Ramps determine a time constant to 1 %, and so the case's share in a part's input to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert not leads.any()
@@ -121,27 +121,27 @@ def test_a_part_between_board_and_case():
 @pytest.mark.slow
 @pytest.mark.parametrize('sensors', [('board',), ('board', 'case')])
 def test_thermometers_that_lag_board_and_case(sensors):
-    # WHY: lags of parts alone left 1.2 times the noise, so that a bank of time constants was
-    # chosen, which failed in another program: 57 ug, the claimed sd 2 ug.
+    # WHY: a model without the thermometers' lag left 1.2 times the noise, so the fit chose a bank
+    # of time constants: in another program the error was 57 ug, the claimed sd 2 ug.
     given = {'part_s': PARTS_S, 'thermometer_s': 60.0, 'sensors': sensors}
     unit, study = study_of('slow thermometer', **given)
     calibration = strangers.fitted(study)
-    # 0.65 ug is the noise of a mean of a minute.
+    # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
     parts = {one.part for one in calibration.response if one.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # Parts lag the board plus a share of the gradient; the share is equal for all axes.
+        # Each part lags board + share * (case - board); the share is equal for all axes.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
-        # The fit determines the ratio theta / tau of each axis with an error below 0.01.
+        # Thermometer lag / part lag (60 s / tau) is fitted with an error below 0.01 per axis.
         assert leads / taus == pytest.approx(60.0 / unit.part_s, abs=0.01)
 
 
 @pytest.mark.slow
 def test_bags_that_only_warm_up_predict_a_cool_down():
-    # WHY: lags were valid only in the direction of the bags' ramps, and left 180 ug.
+    # WHY: lags were valid only for the ramp direction of the bags; a cool-down was off by 180 ug.
     warm, cool = program(5, 20, (35, 0.8, 40)), program(33, 20, (10, 0.8, 40))
     given = {'corners': warm, 'held': cool, 'part_s': PARTS_S / 2.0}
     _, study = study_of('only warm', up=10, **given)
@@ -150,7 +150,7 @@ def test_bags_that_only_warm_up_predict_a_cool_down():
 
 @pytest.mark.slow
 def test_a_noisy_sensor_in_one_warm_up():
-    # WHY: with a spline of 60 nodes a time constant was twice the true value, the error 80 ug.
+    # WHY: with a spline of 60 nodes a fitted lag was twice the true lag, and the error 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)
     unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
@@ -163,13 +163,13 @@ def test_a_noisy_sensor_in_one_warm_up():
 
 @pytest.mark.slow
 def test_bags_of_one_warm_up_predict_another():
-    # All bags have the same thaw, so the lags are functions of the board temperature.
+    # All bags have the same warm-up, so each lag is a function of the board temperature.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
     given = {'held': program(-15.0, 10.0, (20.0, 20.0, 90.0)), 'part_s': PARTS_S / 4.0}
     _, study = study_of('thaw', up=10, corners=thaw, **given)
     calibration = strangers.fitted(study)
     assert {one.group for one in calibration.response if any(one.bias)} == {'part'}
-    # 0.65 ug is the noise of a mean of a minute.
+    # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
 
 
@@ -210,8 +210,8 @@ def test_a_unit_without_lags_gets_none():
 
 @pytest.mark.slow
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
-    # WHY: a time constant of 223 s instead of 163 s absorbed an effect of the gradient, which
-    # failed in a soak: the error was 167 ug, the claimed sd 15 ug.
+    # WHY: the fit explained an effect of the gradient by a time constant of 223 s instead of
+    # 163 s: the error in a soak was 167 ug, the claimed sd 15 ug.
     (study,) = gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
@@ -220,12 +220,12 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 
 @pytest.mark.slow
 def test_a_bump_is_no_disturbance_and_no_motion():
-    # At 0.5 Hz a cell of 30 samples takes a minute, and the unit passes the bump within two cells.
+    # At 0.5 Hz a cell of 30 samples takes 60 s; the unit passes the bias bump within two cells.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # A fit of the groups that a fit of all groups chooses takes a third of the time.
+    # A fit of all groups chooses the three groups below, but takes three times as long.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
-    # The fit approximates a bell with an sd of 0.85 K by lines between knees every 0.5 K.
+    # The bias bump, a bell with an sd of 0.85 K, is fitted by lines between knees every 0.5 K.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
@@ -244,7 +244,7 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     for record in (*records, *tests):
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
             setattr(record, name, getattr(record, name)[::10])
-    # A fit of the groups of the unit's physics alone takes half of the time.
+    # A fit of the groups of the unit's physics takes half the time of a fit of all groups.
     groups = ('curve', 'board', 'part', 'product', 'square')
     result = fit_and_correct(records, tests, full_scale=FULL_SCALE['full_scale'], groups=groups)
     least, _ = second_simulator.floor_of(tests)
@@ -261,11 +261,11 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
 @pytest.mark.slow
 @pytest.mark.parametrize('grade', [consumer_grade, navigation])
 def test_soaks_determine_the_curve_by_their_norms(grade):
-    # The board drifts by 0.01 K within a soak; 26 K between the soaks move the norms by milli-g.
+    # The board drifts by 0.01 K within a soak; 26 K between soaks change |f| by some mg.
     _, study, score = soaked(grade)
     means = [minutes(bag) for bag in study.tests['']]
     forces = [strangers.scipy_baselines(study)['constants'](mean) for mean in means]
-    # A part of the error remains, because soaks do not determine the lags in held-out ramps.
+    # Soaks do not determine the lags, so their effect remains as an error in held-out ramps.
     assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
@@ -295,14 +295,14 @@ def test_a_curve_between_two_soaks_is_claimed():
 
 @pytest.mark.slow
 def test_a_curve_that_the_soaks_do_not_show_is_claimed():
-    # WHY: with each axis vertical at a different temperature the error was 15 claimed sd.
+    # WHY: if each axis was vertical at another temperature, the error was 15 times the claimed sd.
     _, study = study_of('confounded soaks', up=np.vstack((FACES, np.eye(3))), corners=SOAKS)
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
 
 @pytest.mark.slow
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
-    # WHY: left-out soaks do not contain lags, so their score rejected the columns of lags.
+    # WHY: the score of left-out soaks, which show no lag, rejected the columns of lags.
     unit, alone, score = soaked(navigation)
     rng = rng_of('soaks and a ramp')
     (ramps,) = positions(unit, HALF, spread(1, rng), rng)
@@ -318,9 +318,9 @@ def lags_of(calibration):
 
 @pytest.mark.slow
 def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
-    # With a part without a thermometer no axis is a curve of the temperature of one part.
+    # A hidden part without a thermometer: no axis' bias is a curve of one part's temperature.
     study = next(third_node(0))
-    # A fit of the groups that a fit of all groups chooses takes two thirds of the time.
+    # A fit of all groups chooses the six groups below, but takes 1.5 times as long.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}
@@ -348,7 +348,7 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     assert {term.tau_s for term in mean.response if term.tau_s} <= {*FINE_TAUS}
     bag = slow(study.tests[''][0])
     off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
-    # Lags of 10 K at 20 ug/K, 200 ug, differ by up to 7 % between the units.
+    # The effect of a lag, 10 K at 20 ug/K = 200 ug, differs by up to 7 % between the units.
     assert np.sqrt(np.mean(off**2)) < 5.0 * UG
 
 

@@ -26,12 +26,12 @@ from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: The groups of the unit's physics have a third of the columns, and take half of the time.
+#: The groups of the unit's physics have a third of all columns; their fit takes half as long.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
 def source(record):
-    # A reading every eight seconds suffices for ramps of 1 K/min, and saves most of the time.
+    # A reading every eight seconds suffices for ramps of 1 K/min, and saves most of a fit's time.
     arrays = arrays_of(record, 8)
     later = [array + 10**18 if array.dtype == np.int64 else array for array in arrays]
     return source_of(*later)
@@ -39,7 +39,7 @@ def source(record):
 
 @cache
 def test_of(number, first, last):
-    """Record some of twelve positions of one sibling."""
+    """Record positions `first` to `last` - 1 (of twelve) of sibling `number`."""
     ups = positions(12, number)[first:last]
     stations = [Position(PROGRAM, up) for up in ups]
     return tuple(arrays(sibling(KIND, number, 0.15), stations, 100 * number + first))
@@ -99,8 +99,8 @@ def test_population_is_the_mean_unit_and_its_scatter():
 
 
 def test_three_units_that_are_alike_by_chance_do_not_determine_an_axis(rng):
-    # WHY: three siblings had nearly equal biases on one axis; nine positions with this prior ended
-    # at 363 ug, where the bags alone left 77 ug.
+    # WHY: three siblings had nearly equal biases on one axis; with the prior of these
+    # siblings a fit of nine positions had an error of 363 ug, without this prior 77 ug.
     layout = parameter_layout(rich_calibration())
     deviations = rng.standard_normal((3, layout.n_parameters))
     level = layout.bias[1].static
@@ -111,12 +111,12 @@ def test_three_units_that_are_alike_by_chance_do_not_determine_an_axis(rng):
 
 
 def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(rng):
-    # WHY: with one position and a prior of twelve units the error was 4.7 mg, the sd 0.9 mg.
+    # WHY: a fit of one position with a prior of twelve units was off by 4.7 mg, claimed sd 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 
     def share_left(units, k):
-        """Return the variance of parameter k given all others / its variance."""
+        """Return the variance of parameter k given all other parameters / its variance."""
         deviations = (units - units.mean(axis=0)) / np.sqrt(len(units) - 1.0)
         scatter = _scatter(deviations, layout, np.ones(3))
         return 1.0 / (np.linalg.inv(scatter)[k, k] * scatter[k, k])
@@ -124,20 +124,20 @@ def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(
     independent = rng.standard_normal((12, n))
     bias, M = layout.bias[1].response - 1, layout.misalignment
     assert share_left(independent, M) == pytest.approx(1.0)
-    # The dynamic level of a bias is correlated with its static level alone.
+    # In the prior the dynamic level of a bias is correlated with its static level alone.
     level = layout.bias[0].dynamic
     pair = np.corrcoef(independent[:, [layout.bias[0].static, level]].T)[0, 1]
     assert share_left(independent, level) == pytest.approx(1.0 - pair**2)
     assert share_left(independent, bias) > 0.5
-    # Curves that have one cause determine each other.
+    # Bias curves of both sets that have one cause determine each other.
     common = rng.standard_normal((12, 1)) + 0.01 * independent
     assert share_left(common, bias) < 0.1
 
 
 @pytest.mark.slow
 def test_units_with_one_curve_for_both_sets_have_it_in_their_population():
-    # WHY: smaller correlations between the equal curves made them independent: with nine positions
-    # and this prior a fit had an error of 3.1 ug, where the bags alone left 0.7 ug.
+    # WHY: a prior with too small correlations made the equal curves of both sets independent: a
+    # fit of nine positions had an error of 3.1 ug with this prior, and 0.7 ug without it.
     prior = population(siblings())
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     for block in (*layout.bias, *layout.scale):
@@ -145,7 +145,7 @@ def test_units_with_one_curve_for_both_sets_have_it_in_their_population():
         for static, dynamic in zip(*curves, strict=True):
             contrast = np.zeros(layout.n_parameters)
             contrast[[static, dynamic]] = 1.0, -1.0
-            # A file has single precision; unused coefficients have a variance of rounding.
+            # The posterior has single precision; unused coefficients have a rounding variance.
             limit = 1e-5 * covariance[static, static] + 1e-24
             assert float(contrast @ covariance @ contrast) <= limit
 

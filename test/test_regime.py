@@ -45,7 +45,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return the switches after each start, and the number of static starts."""
+    """Run n ramps; return the switches after each onset, and how many ramps began static."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -65,7 +65,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
 
 @pytest.fixture(scope='module')
 def headline():
-    """Run the ramp of the requirement: 0.5 K/min behind 15 min, 1 Hz, after a soak."""
+    """Run the ramp of the requirement: 0.5 K/min, thermal lag 15 min, 1 Hz, after a soak."""
     return {
         name: onsets(*sensor, 0.5, LAG_S, 12, end_s=300.0, soak_s=1800.0)
         for name, sensor in SENSORS.items()
@@ -77,7 +77,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # A coarse sensor must cross two edges, 94 mK on average: a median of 146 s, +-6 s.
+        # Readings in steps of 62.5 mK must step twice, 94 mK on average: median 146 s, +-6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -93,15 +93,15 @@ def test_the_onset_of_a_ramp_is_detected_early(headline, sensor, median_s, late_
 
 @pytest.mark.parametrize(('sensor', 'threshold'), [('1 mK', 9.65), ('10 mK', 8.87)])
 def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
-    # The bound: Page's CUSUM with known ramp, baseline and noise; its thresholds (log likelihood
-    # ratios) for one false alarm in 50 h are those of docs/regime.md.
+    # The bound is the delay of Page's CUSUM with known ramp, baseline and noise; its thresholds
+    # (log likelihood ratios) for one false alarm in 50 h are those of docs/regime.md.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # A test with known onset is faster than CUSUM by at most a second.
+        # The likelihood-ratio test with known onset is faster than CUSUM by at most a second.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -142,7 +142,7 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
     ],
 )
 def test_soaks_have_no_false_switches(sensor):
-    # At 0.05 switches an hour, two per opening, more than 2 openings in 15 h have p < 0.01.
+    # At 0.05 switches an hour, two per false ramp, more than 2 false ramps in 15 h have p < 0.01.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -188,8 +188,8 @@ def test_the_rate_of_false_alarms_is_that_of_the_setting():
 
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
-    # Expected: filter gain by the Riccati equation, noise and correlation by the impulse response,
-    # alarms by Rice's formula. Neglected terms of second order in the pace are up to 4 %.
+    # Expected threshold: filter gain by the Riccati equation, noise and correlation by the impulse
+    # response, alarms by Rice's formula. Terms of second order in `pace` of `_tune` are up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -227,7 +227,7 @@ def test_the_regime_is_unknown_until_there_are_enough_readings():
 
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=8000.0, **parts):
-    """Run once; `parts` may change the readings of case or board: functions of (t, reading)."""
+    """Return the switches of a run; `parts`, functions of (t, readings), may change readings."""
     rng = np.random.default_rng(8)
     t = np.arange(begin, end)
     truths = dict(zip(('case', 'board'), case_and_board(t, corners, lag), strict=True))
@@ -263,7 +263,7 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The slower lag decides: the rate halves in the time lag times ln 2.
+    # The longer lag, LAG_S, decides: the rate of the board halves in a time of lag * ln 2.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
@@ -302,14 +302,14 @@ TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 @pytest.mark.parametrize('lost', [None, 'case', 'board'])
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
 def test_a_reversal_is_no_rest(lost, quantum):
-    # Where a ramp reverses, coarse readings are constant for minutes; the state is dynamic.
+    # Where a ramp reverses, coarse readings are constant for minutes; the regime stays dynamic.
     parts = {lost: gone} if lost else {}
     changes = run_once(TRIANGLE, quantum=quantum, end=16000.0, **parts)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
 
 
 def regimes_and_directions(settings, case_readings, board_readings):
-    """Return regime and direction after each pair of readings, of which one comes per second."""
+    """Return regime and direction after each pair of readings, one pair per second."""
     case, board = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
     states = []
@@ -329,14 +329,14 @@ def test_direction_follows_a_reversal():
     directions = {at: direction for at, (_, direction) in zip(t, states, strict=True)}
     assert directions[-100.0] == 0
     assert directions[600.0] == directions[3600.0] == 1
-    # The case turns lag * ln(2 - exp(-ramp / lag)) after the chamber: 616 s.
+    # The case reverses lag * ln(2 - exp(-ramp / lag)) = 616 s after the chamber.
     turn = next(at for at in directions if at > 3600.0 and directions[at] == -1)
     assert turn == pytest.approx(3600.0 + 616.0, abs=60.0)
     assert directions[7199.0] == -1
 
 
 def test_a_held_reading_does_not_turn_the_direction():
-    # WHY: measurements every 30 s, published every second, gave false reversals.
+    # WHY: temperatures measured every 30 s, but published every second, gave false reversals.
     rng = np.random.default_rng(1)
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)

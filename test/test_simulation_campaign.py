@@ -53,7 +53,7 @@ def test_a_perfect_model_leaves_the_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # The walk's mean square over 7.3 h is 9 * 7.3 / 2 per axis; three runs scatter widely.
+        # The bias walk has a mean square of 9 * 7.3 / 2 ug^2 per axis in 7.3 h; 3 runs scatter.
         assert 4.0 < vector < 20.0
     else:
         # The RMS of 1311 means scatters by 2 % (norm) and 1.2 % (vector); the limits are 5 sd.
@@ -84,7 +84,7 @@ def test_plans_are_what_their_names_say():
 
 
 def test_a_slipping_joint_has_a_closed_hysteresis_loop():
-    """Hysteresis is independent of the rate: a bias differs between warming and cooling."""
+    """The hysteresis of a bias between warming and cooling is independent of the rate."""
     there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
     for is_gradual in (False, True):
         effect = SlipEffect('a', 1.0, is_gradual, bias=(2.0, 0.0, 0.0))
@@ -117,7 +117,7 @@ def test_a_saturated_effect_of_heat_flow_is_on_or_off():
 
 
 def test_a_switched_load_heats_its_part():
-    """The warming equals the heat balance of an endless load, and is zero before the load."""
+    """The warming is zero before the load, and at last that of the steady heat balance."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
@@ -222,7 +222,7 @@ def test_sum_of_counts_is_the_integral_within_one_count(rng):
     charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
     start = first_charge(7)
     counts, _ = balanced(charge, start)
-    # Sums of charge and counts agree at every cycle; 1e-6 is the rounding of the float sum.
+    # Sums of charge and counts differ by 0 to 1 count at every cycle; 1e-6 is float rounding.
     short = np.cumsum(charge, axis=0) + start / 2.0**40 - np.cumsum(counts, axis=0)
     assert short.min() > -1e-6
     assert short.max() < 1.0 + 1e-6

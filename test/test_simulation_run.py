@@ -49,7 +49,7 @@ def test_blocks_are_the_whole_bit_for_bit(name, block_size):
         np.testing.assert_array_equal(
             _joined(blocks, column, is_truth=True), getattr(whole.truth, column)
         )
-    # A block has the readings up to the end of its last cycle.
+    # A block has the temperature readings up to the end of its last cycle.
     for block in blocks[:-1]:
         assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
 
@@ -74,7 +74,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
 
 
 def test_a_further_error_source_changes_no_other_numbers(unit):
-    """Thermometer noise changes nothing else; a drifting bias is added to the same noise."""
+    """Thermometer noise changes only the readings; a drifting bias is added to equal noise."""
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)
     assert np.all(noisy.board != plain.board)
@@ -85,7 +85,7 @@ def test_a_further_error_source_changes_no_other_numbers(unit):
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Either converter is within one count of its integral, and both start with the same phase.
+    # Each count sum is within one count of its integral; both runs start with equal remainders.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
@@ -106,7 +106,7 @@ def test_white_noise_has_its_density(unit):
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
-    # The converter carries its remainder, so that its noise rises with f^2: 1 (ug)^2/Hz at 0.4 Hz.
+    # The converter carries its remainder, so its rounding noise rises with f^2: 1 ug^2/Hz at 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
     # The mean of 128 lines, each averaged over 87 half-overlapping segments, scatters by 1 %.
     np.testing.assert_allclose(

@@ -46,7 +46,7 @@ def ramp(given, rate, hours, environment=units.CHAMBER):
 
 
 def test_a_node_lags_a_ramp_by_its_time_constant():
-    # After many time constants x' = (u - x) / tau leaves u - x = rate * tau.
+    # A node with x' = (u - x) / tau lags a ramp u by rate * tau after many time constants.
     lags = np.array([500.0, 900.0, 1500.0])
     given = unit(board_s=700.0, part_s=lags)
     _, states = ramp(given, 0.01, 12)
@@ -56,7 +56,7 @@ def test_a_node_lags_a_ramp_by_its_time_constant():
 
 
 def test_the_integration_is_exact_on_the_way():
-    # One lag behind a ramp from rest: u - x = rate * tau * (1 - exp(-t / tau)).
+    # The lag of x behind a ramp u from rest is u - x = rate * tau * (1 - exp(-t / tau)).
     A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
     at = np.arange(0.0, 1500.0, 5.0)
     states = units.integrate(A, b, h, 0.01 * at, 5.0, np.zeros(1))
@@ -124,7 +124,7 @@ def test_flicker_noise_has_a_flat_allan_deviation():
     for size in (10, 100, 1000):
         means = noise.reshape(-1, size, 3).mean(axis=1)
         deviation = np.sqrt(0.5 * np.mean(np.diff(means, axis=0) ** 2))
-        # Tolerance: 39 differences of three axes determine the longest deviation to 7 %.
+        # Tolerance: 39 differences of three axes determine the Allan deviation to 7 %.
         assert deviation == pytest.approx(3.0, rel=0.2)
 
 
@@ -185,7 +185,7 @@ def test_the_bound_falls_with_noise_and_with_data():
     assert louder == pytest.approx(2.0 * sd, rel=1e-6)
     twice = cases.bias_bound(given, np.concatenate((up, up)), bags + bags)
     assert twice == pytest.approx(sd / np.sqrt(2.0), rel=1e-6)
-    # With nothing else unknown, the sd of the bias is the noise of the mean of all samples.
+    # If only the bias were unknown, its sd would be the noise of the mean of all samples.
     least = UG * given.density / np.sqrt(sum(len(bag.time_s) for bag in bags) * 2.0)
     assert (sd > least).all()
     assert (sd < 100.0 * least).all()
@@ -201,7 +201,7 @@ def of_attitudes(given, board):
 
 
 def curved_unit():
-    """Make a unit that the cubic fitted by hand describes."""
+    """Make a unit whose bias is a cubic, and whose scale is a line, in temperature."""
     rng = rng_of('curved')
     return unit(
         bias=1500.0 * rng.standard_normal(3), gain=0.01 * rng.standard_normal(3),
@@ -349,7 +349,7 @@ def test_each_case_has_a_limit_and_each_limit_a_case():
 
 
 def carried_bag():
-    """Make a day at 1 Hz whose attitude changes after 5 h, with bumps for two minutes at 10 h."""
+    """Make a bag of a day at 1 Hz: attitude changed after 5 h, bumps for two minutes at 10 h."""
     time_s = np.arange(1.0, 86401.0)
     force = np.where((time_s > 18000.0)[:, None], GRAVITY * LEVEL, GRAVITY * ATTITUDES[0])
     force[36000:36120] = 0.5

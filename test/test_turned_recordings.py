@@ -52,8 +52,8 @@ def rms(values):
 
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
-    # WHY: with a lag's products and squares, but without the lag, the fit had the same left-out
-    # errors. At twice the rates the errors of this fit exceeded the effect of the lag, 1.7 mg.
+    # WHY: a fit with products and squares of a lag, but without the lag, had left-out errors as
+    # small as with the lag. At twice the rates that fit erred by more than the lag, 1.7 mg.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
@@ -73,8 +73,8 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
 
 
 def test_a_single_turn_on_is_claimed_as_that_of_separate_recordings():
-    # WHY: the sd of turn-ons in one recording had the prior of mountings within a turn-on, half as
-    # large: a MEMS whose turn-ons differ by 0.6 mg left 5 times its claim after the next turn-on.
+    # WHY: for one recording the sd of turn-ons had the prior of mountings, which is half as large:
+    # a MEMS whose turn-ons differ by 0.6 mg erred by 5 times its claimed sd at the next turn-on.
     rng = np.random.default_rng(3)
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')

@@ -16,7 +16,7 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 def test_a_start_in_a_ramp_is_claimed():
     # WHY: after a restart in a ramp the claimed sd was a third of the error. In a ramp a part lags
-    # the board by the rate times its time constant, 1 K here; after a start at rest the lag has an
+    # the board by the rate times its time constant, 1 K in this test; after a start at rest the lag has an
     # sd of 0.4 K. If the ramp ends soon after the start, the error remains.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
@@ -24,20 +24,20 @@ def test_a_start_in_a_ramp_is_claimed():
         compensator = Compensator(unit, UNCHECKED)
         for second in range(61):
             stamp, risen = 10**12 + second * SECOND_NS, rate * min(second, end)
-            # Constant readings would be those of a faulty thermometer.
+            # Without flicker both thermometers would count as faulty.
             flicker = 1e-5 * (-1) ** second
             compensator.push('board', stamp, 10.0 + risen + flicker)
             compensator.push('case', stamp, 10.0 + risen - flicker)
             row = compensator.process(stamp, 0.0, 0.0, 1.0)
         sd[rate, end] = math.sqrt(row[3] - compensator.thermal.correction.noise[0])
-    # The error of 30 counts, at 300 counts per m/s^2, has decayed for one time constant.
+    # A bias error of 30 counts, at 300 counts per m/s^2, has decayed for one time constant.
     left = 30.0 / 300.0 / math.e
     assert sd.pop((0.0, 60)) == pytest.approx(0.387 * left, rel=0.2)
     assert [*sd.values()] == pytest.approx([math.hypot(1.0, 0.387) * left] * 2, rel=0.2)
 
 
 def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
-    # WHY: a unit heats itself by 1 K above the case; while the case was lost, 0 K was assumed.
+    # WHY: a unit heats itself by 1 K above the case; without the case a gradient of 0 K was assumed.
     unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
     compensator = Compensator(unit, UNCHECKED)
     corrected = []
@@ -83,7 +83,7 @@ def test_beyond_1_g_the_covariance_has_an_unknown_square():
 def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fault):
     # WHY: the bias follows a part that lags the board by 10 min, so a lasting error of the board
     # temperature changes the bias, but a sudden error does not. The claimed sd contained only
-    # sudden errors.
+    # sudden errors of the board temperature.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
@@ -94,7 +94,7 @@ def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fa
     for second in range(3600):
         stamp = 10**12 + second * SECOND_NS
         ramp_s = max(second - 1200.0, 0.0)
-        # The case changes by 1 K/min; the board lags by 1 K.
+        # The case ramps at 1 K/min; the board lags the case by 60 s, which is 1 K.
         case, board = 20.0 + ramp_s / 60.0, 20.0 + max(ramp_s - 60.0, 0.0) / 60.0
         of_part += (board - of_part) / 600.0
         flicker = 2e-3 * (second % 3)
