@@ -139,7 +139,7 @@ def test_a_curve_that_is_not_finite_is_refused(bad):
 
 
 def slope_and_lag(variances):
-    """Make a unit with a slope and a lag of 600 s; `variances` of parameters of its x axis."""
+    """Make a unit with a bias slope and a lag of 600 s; `variances` by index of the parameter."""
     unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
@@ -156,7 +156,7 @@ def test_the_predicted_sd_by_hand():
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     bias, scale = sd_of_states(unit, states)
-    # The variance is 4e-4 + 100 * 1e-6 counts^2, at 300 counts per m/s^2, plus (30 um/s^2)^2.
+    # At 30 degC: variance 4e-4 + 100 * 1e-6 counts^2, at 300 counts per m/s^2, plus (30 um/s^2)^2.
     expected = np.sqrt([4e-4, 5e-4]) / 300.0
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
@@ -216,7 +216,7 @@ def test_ramp_states_equal_those_of_the_stepped_memory(rate):
             # In the memory the gradient rises within the first second, in `ramp_states` at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # A play on the lag would reach its end only after half an hour.
+            # A play on a lag, which is left out, would reach its end only after half an hour.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

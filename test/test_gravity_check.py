@@ -55,7 +55,7 @@ def test_a_jump_of_time_starts_a_new_window(rng):
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
-    """Run a platform at rest whose |f| rises at a given time; return when samples were refused."""
+    """Run a rest whose |f| changes at `at_s`; return the delay of the refusal [s], and the result."""
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     for k in range(round((at_s + 10.0) * rate_hz)):
@@ -80,7 +80,7 @@ def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, of
 
 
 def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
-    # A lift that accelerates over 0.8 s, and a shaking car, are not refused at once.
+    # A calibration is not refused at once in a lift that accelerates for 0.8 s, or a shaking car.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 

@@ -14,7 +14,7 @@ from conftest import ran
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
-# One line per package: a folder, or a module in the root. Each package needs a line.
+# Layer of each package (a folder, or a module in the root), which imports lower layers only.
 LAYERS = {
     '__init__': 0,  # public names, imported for type checkers
     'errors': 0,
@@ -42,7 +42,7 @@ LAYERS = {
     '__main__': 6,
 }
 
-# Packages that may import a library; other libraries may be imported anywhere.
+# Packages that may import a library; libraries not listed may be imported anywhere.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
     **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},
@@ -53,7 +53,7 @@ HOMES = {
     'rich': {'cli', '__main__'},
 }  # fmt: skip
 
-# The mathematics reads no clock.
+# Packages of mathematics, which must not read a clock.
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Raw words with an offset give the same calibration, with the offset in its bias."""
+"""Raw words with an offset give the calibration of signed words, with the offset in its bias."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def test_constants_of_unsigned_words_equal_those_of_signed_words(words, plain, o
 
 
 def test_a_bag_per_position_needs_no_other_bag_for_the_offset(rng):
-    # Bags differ in the signs of their axes: only some show that 16-bit words are unsigned.
+    # Bags differ in the signs of their readings: only some show that 16-bit words are unsigned.
     ups = positions(10, 3)
     ups[0] = -np.full(3, 3.0**-0.5)
     bags = [source(words_of([up], rng) + 32768.0, f'bag{k}') for k, up in enumerate(ups)]

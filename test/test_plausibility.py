@@ -177,7 +177,7 @@ def test_a_working_unit_in_its_chamber_is_never_reported(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# A board that follows within seconds leads by less than a kelvin.
+# With swapped topics a board that follows the case within seconds leads by less than 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [
@@ -197,9 +197,9 @@ def test_swapped_topics_are_reported(preset, sensor):
 
 
 def test_a_unit_that_was_switched_on_heats_itself_and_is_not_swapped():
-    # WHY: every start in the field looks like a ramp in which the board leads. The start was taken
-    # for exchanged topics; the claimed sd of the run was 20 times too large. WHAT: a warm-up
-    # by 4 K, by a third of this in the case, then a ramp with the case in the lead.
+    # WHY: the warm-up after a start, in which the board leads, was taken for exchanged topics; the
+    # claimed sd of the run was 20 times too large. WHAT: the board warms up by 4 K, the case by a
+    # third of this; then a ramp follows, in which the case leads.
     tracker = tracker_of(memory=LAG)
     for second in range(3 * 3600):
         warm = 4.0 * (1.0 - math.exp(-second / 500.0))

@@ -100,7 +100,7 @@ def test_the_order_of_parameters_by_hand():
         response=(term('gradient'), term('board', tau_s=60.0)),
     )
     layout = parameter_layout(value)
-    # Parameters of the bias of x: level, t, t^2; level, three knots; two weights.
+    # Bias parameters of x: static level, t, t^2; dynamic level, three knots; two weights.
     assert layout.bias[0] == Block(0, 3, 7, 9)
     assert layout.scale[0] == Block(9, 10, 11, 13)
     assert layout.bias[1] == Block(13, 14, 15, 17)

@@ -48,7 +48,7 @@ def test_the_residual_of_handheld_units_is_their_noise(unit):
 
 
 def test_handheld_units_agree_with_a_direct_solution(unit):
-    # The second route fits |M (N - b) / K| - g with nine parameters to the positions, by scipy.
+    # The direct solution fits |M (N - b) / K| - g, nine parameters, to the positions by scipy.
     means = means_of(unit)
 
     def residual(parameters):
@@ -140,7 +140,7 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     assert len(raw) >= 17 * len(sets) // n_sets
     # Compare drifts about their mean, because one attitude does not determine the constants.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means of a minute have a noise of 0.19 mg; the first of five parts is extrapolated.
+    # Means of a minute have a noise of 0.19 mg; the fit extrapolates to the first of five parts.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 

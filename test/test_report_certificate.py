@@ -152,7 +152,7 @@ def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
     standards = {one.name: one.standard for one in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
-    # Noise, attitude and model together are the claimed sd; the residual is within it.
+    # Noise, attitude and model add up to the claimed sd; the residual is below the claimed sd.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
     parts = [standards[name] for name in ('noise', 'attitude', 'model')]
@@ -177,7 +177,7 @@ def test_residual_beyond_the_claim_is_repeatability():
 
 
 def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
-    # WHY: 0.00037 was printed for a scale factor although gravity's uncertainty was not stated.
+    # WHY: U = 0.00037 was printed for a scale factor although gravity's uncertainty was not stated.
     rows = {result.quantity: result for result in results(evidence(), CertificateInfo(), ())}
     assert rows['scale factor x'].expanded == '–'
     assert rows['bias x'].expanded != '–'

@@ -112,7 +112,7 @@ def test_rests_are_found_at_any_rate_of_samples(rate, rng):
     samples = (30.0, -20.0, 2941.0) + 300.0 * NOISE * excess * rng.standard_normal((n, 3))
     samples[n // 2 :] = samples[n // 2 :, [2, 1, 0]]
     whole = finder().add(stamps, samples)
-    # At most two windows are lost at the change, and one at the end.
+    # At most two windows are lost at the change of attitude, and one at the end.
     assert sum(one.n for one in whole) >= 0.6 * n
     assert len(whole) >= 6
     for one in whole:
@@ -168,7 +168,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [one for _, one in decode(bytes(changed))[0]]
-    # A changed byte loses one rest; a lost newline loses two rests, a damaged start all.
+    # A changed byte in a file loses one rest, a lost newline two rests, a damaged start all.
     assert all(one in [rest(k) for k in range(9)] for one in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 
@@ -217,7 +217,7 @@ def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     assert len(sizes) == 6
     assert max(sizes) <= 2000
     assert sum(sizes) <= 5000 + 2000
-    # The oldest days have been thinned most, and no day has been removed.
+    # The files of the oldest days were thinned most, and no file was removed.
     assert sizes[0] < sizes[-1] / 2
     assert log.n_rests == len(logged(tmp_path))
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
@@ -241,7 +241,7 @@ def test_the_node_logs_rests_and_a_kill_tears_at_most_one_line(tmp_path, unit, p
     sent = 0
 
     def until(condition, what):
-        """Send second after second: the node may not yet have discovered the driver."""
+        """Send samples, a second at a time: the node may not yet have discovered the driver."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):

@@ -106,7 +106,7 @@ def test_white_noise_has_its_density(unit):
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
-    # The converter carries its remainder, so its rounding noise rises with f^2: 1 ug^2/Hz at 0.4 Hz.
+    # The converter carries its remainder: rounding noise rises with f^2, 1 (ug)^2/Hz at 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
     # The mean of 128 lines, each averaged over 87 half-overlapping segments, scatters by 1 %.
     np.testing.assert_allclose(

@@ -56,7 +56,7 @@ def test_a_flight_is_no_rest(rng, with_gyro):
 
 
 def test_a_smooth_flight_is_told_by_its_gyroscope(rng):
-    # A noisy sensor at rest may show 15 mg of vibration, but none shows 4 deg/s.
+    # A noisy sensor at rest may scatter by 15 mg, but no gyroscope at rest shows 4 deg/s.
     accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
     with pytest.raises(FitError, match='its angular rate is never that of a rest'):
         reduce_bag(source(accel, gyro), OPTIONS)

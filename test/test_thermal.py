@@ -115,7 +115,7 @@ def test_the_rate_of_a_lost_case_is_replaced_by_the_board_s():
     assert tracker.sample(999 * SECOND_NS)[GRADIENT] == pytest.approx(6.0, abs=0.05)
     feed(tracker, 20.0 + 0.01 * np.arange(1000, 1100), start_s=1000)
     state = tracker.sample(1099 * SECOND_NS)
-    # Lag times rate, the closed form of a first-order lag in a ramp.
+    # The closed form of a first-order lag in a ramp is lag times rate.
     assert state[GRADIENT] == pytest.approx(600.0 * 0.01, abs=0.1)
     assert math.sqrt(state[VAR_GRADIENT]) >= LOST_GRADIENT_RELATIVE_SD * 5.9
 

@@ -22,7 +22,7 @@ SENSORS = {
 
 
 def run(thermometer, t, readings):
-    """Temperature, rate and their variances after each reading, shape (n, 4)."""
+    """Return temperature, rate and their variances after each reading, shape (n, 4)."""
     names, rows = ('temperature', 'rate', 'var_temperature', 'var_rate'), []
     stamps = np.round(t * 1e9).astype(np.int64)
     for stamp_ns, reading in zip(stamps.tolist(), readings.tolist(), strict=True):
@@ -48,11 +48,11 @@ def settled(noise=0.001, n=600, **changes):
 
 @pytest.fixture(scope='module')
 def errors():
-    """Return squared errors and variances of all sensors: soak, ramp and soak in some runs."""
+    """Return squared errors and claimed variances per sensor, in runs of soak, ramp and soak."""
     collected = {}
     for name, (noise, quantum, dt) in SENSORS.items():
         runs = []
-        # A run at 10 Hz has as many readings as ten others.
+        # A run at 10 Hz has as many readings as ten runs at 1 Hz.
         for seed in range(1 if dt < 1.0 else 3):
             rng = np.random.default_rng([seed, 1])
             t = np.arange(-SOAK_S, RAMP_S + 3600.0, dt)
@@ -101,7 +101,7 @@ def test_claimed_variances_match_squared_errors(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min):
-    # The limits are 1.5 times measured errors; steps of 1 K give the rate to 10 %.
+    # The limits are 1.5 times measured errors; a sensor with steps of 1 K determines the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -109,7 +109,7 @@ def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min)
 
 
 def test_a_crossed_edge_locates_the_temperature():
-    # A reading of 20.0 becomes 21.0 when the temperature passes 20.5, which is the estimate.
+    # A reading in steps of 1 K changes from 20 to 21 degC at 20.5 degC, which is the estimate.
     thermometer = Thermometer(ThermometerSettings(0.01, 1.0))
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0)
@@ -121,7 +121,7 @@ def test_a_crossed_edge_locates_the_temperature():
 
 
 def test_equal_coarse_readings_keep_the_sd_of_their_quantum():
-    # A thousand equal readings leave the sd of a uniform distribution, 1 / sqrt(12) quantum.
+    # Equal readings leave the sd of a uniform distribution, 1 / sqrt(12) of a quantum.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
         thermometer.update(k * SECOND_NS, 20.0)
@@ -247,7 +247,7 @@ def test_a_gap_widens_and_a_long_gap_starts_anew():
 
 def test_noise_declared_too_small_is_learnt():
     # WHY: real die sensors scatter by 0.1 K; with 5 mK declared every reading was an outlier.
-    # WHAT: the factor is estimated within 20 % (chi-square over about 400 readings: 4 %, and the
+    # WHAT: the noise ratio is estimated within 20 % (chi-square over about 400 readings: 4 %, and the
     # mode of changing rates takes a share), and the variance is right.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
@@ -279,7 +279,7 @@ def test_extrapolation_is_linear_then_held():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # The value is held after 5 s; its sd is the change by 0.01 K/s in the other 55 s.
+    # The extrapolation is held after 5 s; its sd is the change by 0.01 K/s in the other 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 

@@ -16,8 +16,8 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 def test_a_start_in_a_ramp_is_claimed():
     # WHY: after a restart in a ramp the claimed sd was a third of the error. In a ramp a part lags
-    # the board by the rate times its time constant, 1 K in this test; after a start at rest the lag has an
-    # sd of 0.4 K. If the ramp ends soon after the start, the error remains.
+    # the board by rate times time constant, 1 K in this test; after a start at rest the lag has
+    # an sd of 0.4 K. If the ramp ends soon after the start, the error remains.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
@@ -37,7 +37,7 @@ def test_a_start_in_a_ramp_is_claimed():
 
 
 def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
-    # WHY: a unit heats itself by 1 K above the case; without the case a gradient of 0 K was assumed.
+    # WHY: a unit heats itself by 1 K above the case; a lost case was taken as 0 K of gradient.
     unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
     compensator = Compensator(unit, UNCHECKED)
     corrected = []
