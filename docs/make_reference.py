@@ -82,29 +82,29 @@ response:                            # columns of both sets
 
 The parameters of the posterior are, for each axis x, y, z: first the bias in input units (level of
 the static set, free coefficients of its Fs, level of the dynamic set, free coefficients of its Fs,
-weights of the response in the order of the file); then the relative scale in the same order. A
-`nonlinearity` adds, for each axis, the coefficients of its terms, then their changes per kelvin. The
-last three parameters are `M[1][0]`, `M[2][0]` and `M[2][1]`. The covariance is
-`factor @ factor.T + diag(rest)`. The posterior of a `gyroscope` has only the
-parameters of the bias, in rad/s and in the order of the accelerometer's bias. The `gyroscope` uses
-the ranges, the reference temperature and the thermometers of the unit.
+weights of the response in the order of the file); then the parameters of the relative scale in the
+same order. A `nonlinearity` adds, for each axis, the coefficients of its terms, then their changes
+per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
+covariance of all parameters is `factor @ factor.T + diag(rest)`. The posterior of a `gyroscope`
+has only the parameters of the bias, in rad/s and in the order of the accelerometer's bias. The
+`gyroscope` uses the ranges, the reference temperature and the thermometers of the unit.
 """
 
 BOUNDS = """\
 ## Bounds
 
-Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a calibration
-within these bounds gives finite results and a positive definite covariance. Further bounds depend on the full scale of the unit.
-The bias including its curve must stay within twice the full scale over the whole temperature range. The largest
-contribution of a column, and of one standard deviation of a parameter, must stay within a million times twice the full scale. The
-relative scale including the largest contributions of all columns must stay between 0.1 and 10.
+Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a
+calibration within these bounds gives finite results and a positive definite covariance. Further bounds depend on the full
+scale of the unit. The bias including its curve must stay within twice the full scale over the whole temperature range. The
+largest contribution of a column, and of one standard deviation of a parameter, must stay within a million times twice the
+full scale. The relative scale including the largest contributions of all columns must stay between 0.1 and 10.
 """
 
 INTERFACE = """\
 # ROS interface of the node
 
-Node `thermo_comp`, executable `thermo_comp_node`. All names but `/diagnostics` are relative, and can be remapped. Input
-stamps are carried through; the node never stamps with its own clock and needs no `use_sim_time`.
+The node is `thermo_comp`, its executable `thermo_comp_node`. All topic names but `/diagnostics` are relative, and can be
+remapped. An output carries the stamp of its input; the node never stamps with its own clock and needs no `use_sim_time`.
 
 ## Topics
 
@@ -115,41 +115,41 @@ stamps are carried through; the node never stamps with its own clock and needs n
 Each QoS policy can be overridden at start with the usual `qos_overrides./topic.subscription.reliability`
 parameters.
 
-With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has no
-ROS QoS setting. With the default of 0 s each sample for a reliable subscriber wakes a thread of the middleware about four
-times, which takes a quarter of the node's CPU time. A lost sample is sent again up to 20 ms later than with the default. Another
-profile (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces the profile of
-the node; repeat the parameter in the other profile.
+With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has
+no ROS QoS setting. With the default of Fast DDS, 0 s, each sample for a reliable subscriber wakes a thread of the
+middleware about four times, which takes a quarter of the node's CPU time. With 20 ms a lost sample is sent again up to 20
+ms later than with 0 s. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the
+working directory) replaces the profile of the node; repeat `nackSupressionDuration` in the user's profile.
 
-`linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at this thermal
-state. Without angular rate or orientation in the input, the first element of their covariance is -1 (REP 145). If the
-calibration has a `gyroscope`, its bias at this thermal state is subtracted from `angular_velocity`, and
+`linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
+current thermal state. If the input has no angular rate or no orientation, the first element of its covariance is -1 (REP
+145). If the calibration has a `gyroscope`, the bias at the current thermal state is subtracted from `angular_velocity`, and
 `angular_velocity_covariance` is the noise of a message plus the uncertainty of that bias.
 
 ## A driver's own topics
 
-The parameter `topics` names the driver's topics, like `--topic` offline:
-`topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, as in [config/drivers](drivers.md).
-`TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`. The node takes the message type from the
-publisher; only the messages of the driver's package must be installed. A reading without a header gets the stamp of the
-newest sample before it. `output=TOPIC` names the output, for a driver that publishes `imu/data_raw` itself; the node refuses
-an output that is its input.
+The parameter `topics` names the driver's topics, like the option `--topic` of the offline commands:
+`topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, as in
+[config/drivers](drivers.md). `TOPIC:FIELD` is a number inside a message, written as for `ros2 topic echo --field`. The node
+takes the message type from the publisher; only the messages of the driver's package must be installed. A reading without a
+header gets the stamp of the newest sample before it. `output=TOPIC` names the output, for a driver that publishes
+`imu/data_raw` itself; the node refuses an output that is its input.
 
 ## Recording a test
 
-`thermo_comp record` is a separate node, `thermo_comp_record`. This node subscribes to the inputs of the compensating node
-and to every other `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is.
-`thermo_comp_record` publishes nothing. See
-[Recording](recording.md#recording).
+`thermo_comp record` runs a separate node, `thermo_comp_record`, which subscribes to the inputs of the compensating node and
+to every other `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is.
+`thermo_comp_record` publishes nothing. See [Recording](recording.md#recording).
 
 ## Parameters
 
 {parameters}
 
-A change of parameters is checked as a whole before any is applied. A separate process reads and checks a calibration
-while samples flow; the node then exchanges the calibration between two samples. An invalid `calibration_file` is refused
-in the response, with the reason, and the running calibration stays. The coefficients are not parameters, because
-parameters arrive one at a time, and a polynomial with half of its coefficients is wrong.
+A `set_parameters_atomically` request is checked as a whole before any of its parameters is applied. A separate process
+reads and checks a calibration while samples flow; the node then exchanges the calibration between two samples. An
+invalid `calibration_file` is refused in the response, with the reason, and the running calibration stays. The
+coefficients of a calibration are not parameters, because parameters arrive one at a time, and a polynomial with half of
+its coefficients is wrong.
 
 ```console
 $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
@@ -183,7 +183,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a stamp more than 15 s (or ten cycles) ahead, which no reading and no second sample confirms | dropped, counted |
 | a stamp that goes back by more than a second | the estimators restart, reported once |
 
-Every fault with its test: [faults](faults.md).
+[Faults](faults.md) lists every fault with its test.
 """
 
 

@@ -20,7 +20,7 @@ MONDAY = datetime(2026, 1, 5)
 
 
 def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
-    """Draw a fleet: every quantity normal (sizes log-normal), or near that of an earlier test."""
+    """Draw a fleet: every quantity normal (sizes log-normal), or near the quantity in `like`."""
     rows = []
     for i in range(n):
         cells = {}

@@ -55,7 +55,7 @@ def test_a_jump_of_time_starts_a_new_window(rng):
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
-    """Run a rest whose |f| changes at `at_s`; return the delay of the refusal [s], and the result."""
+    """Run a rest whose |f| changes at `at_s`; return the delay of a refusal [s] and a result."""
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     for k in range(round((at_s + 10.0) * rate_hz)):

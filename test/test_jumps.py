@@ -34,7 +34,7 @@ def test_jump_along_gravity(rng, with_gyro):
     # 250 samples with 3 mg on each side: sd of the step 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # 20 readings (noise 20 mK) on each side determine a temperature jump to 2 * 0.02 * sqrt(2 / 20).
+    # 20 readings (noise 20 mK) on each side: sd of the temperature jump 2 * 0.02 * sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 

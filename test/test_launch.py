@@ -16,7 +16,7 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
 OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
 BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
 
-# Nodes of other packages ignore a misspelt parameter: the names are from sources of Jazzy.
+# Parameters of other packages' nodes, from the Jazzy sources: a node ignores a misspelt name.
 OTHERS = {
     ('tf2_ros', 'static_transform_publisher'): set(),
     ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {
@@ -83,7 +83,7 @@ def test_a_driver_is_a_file_of_topics():
 
 
 def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
-    # WHY: the defaults of the arguments replaced the values of the user's file.
+    # WHY: defaults of launch arguments replaced the values of the user's parameter file.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     import rclpy
     import yaml

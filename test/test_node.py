@@ -92,7 +92,7 @@ def test_the_node_takes_imu_input_and_can_switch_to_counts(peer, saved):
         assert heard[0].orientation == sent.orientation
         assert heard[0].orientation_covariance.tolist() == sent.orientation_covariance.tolist()
         assert heard[0].linear_acceleration.z == pytest.approx(0.4, rel=1e-12)
-        # While it runs, the node changes from Imu messages in m/s^2 to vectors of counts.
+        # The running node changes its input from Imu messages in m/s^2 to vectors of counts.
         assert 'unit.input: must be' in peer.set_atomically(input='counts').reason
         file = saved(calibration())[1].removeprefix('calibration_file:=')
         both = peer.set_atomically(input='counts', frame_id='', calibration_file=file)
@@ -178,11 +178,11 @@ def test_diagnostics_name_faults_of_samples(peer, saved):
         assert (values['samples in'], values['samples out']) == ('4', '1')
         assert values['sample stamp [ns]'] == str(stamp_ns)
         assert [m.linear_acceleration.x for m in heard] == [1.0 / 300.0]
-        # After the saturation the report no longer mentions it.
+        # After the end of a saturation the report does not mention the saturation.
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
-        # A stamp older by over 1 s is a jump of time, a less old stamp is out of order.
+        # A stamp that goes back by over 1 s is a jump of time; by less, it is out of order.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
         driver.counts(START_NS - 10 * SECOND_NS, 1.0, 2.0, 3.0)
@@ -217,7 +217,7 @@ def test_diagnostics_have_noise_density_and_bias_sd(peer, saved):
             assert sd >= 0.99 * math.sqrt(covariance[level, level])
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
-            # In an unknown regime the bias sd contains the sets' difference, about 30 urad/s.
+            # In an unknown regime the bias sd contains the difference of the sets, some 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
 
 

@@ -51,7 +51,7 @@ def odd(name, kind):
     return ParameterMessage(name=name, value=ParameterValue(type=kind))
 
 
-#: Values that a request may contain; each request must be answered.
+#: Parameters that a request may contain; the node must answer each request.
 STRANGE = [
     *[odd(name, kind) for name in ('frame_id', '', 'no such') for kind in (0, 77, 255)],
     *[

@@ -95,7 +95,7 @@ def assert_same(live, offline):
     assert expected.imu is not None
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
-    # Each case reading gives a flag, so equal lists of flags mean equal times of the switches.
+    # Each case reading gives a regime flag: equal lists of flags mean equal times of switches.
     assert (len(flags), flags) == (len(expected_flags), expected_flags)
     assert False in flags
     assert True in flags

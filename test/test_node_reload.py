@@ -85,7 +85,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         before = flow.more()
         assert flow.bias(before - 1) == 1.0
 
-        # Another file is applied when the answer comes, between two samples.
+        # A new calibration file is in use when the answer comes; it changes between two samples.
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
 
@@ -100,7 +100,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         (value,) = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert value.string_value == str(second)
 
-        # A file set together with other parameters: all are applied, or none.
+        # Of a request with a file and other parameters all values are applied, or none.
         result = peer.set_atomically(transition_time=5, calibration_file=str(broken))
         assert not result.successful
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
@@ -230,7 +230,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
 
 
 def test_a_calibration_that_cannot_be_applied_changes_nothing(peer, tmp_path):
-    # WHY: a lag of 1e-300 s was refused after the new bias was in use.
+    # WHY: a file with a lag of 1e-300 s was refused only after its new bias was in use.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
     text = dump_calibration(of_bias(77.0))

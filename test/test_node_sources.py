@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Other publishers: two sources are never mixed, and a new driver is accepted soon."""
+"""Samples of two publishers are never mixed, and a restarted driver is accepted soon."""
 
 import contextlib
 import subprocess
@@ -36,7 +36,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 
 
 def contested(peer, heard, topic, send):
-    """Let both publishers send until the node reports two, however slowly."""
+    """Let both publishers send until the node reports two publishers; return its status."""
     text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
     status = status_with(peer, heard, text, send)
     assert status.level == DiagnosticStatus.ERROR
@@ -44,7 +44,7 @@ def contested(peer, heard, topic, send):
 
 
 def test_samples_of_a_second_publisher_are_never_published(peer, unit):
-    # WHY: samples of a second driver in another attitude were published as the unit's.
+    # WHY: samples of a second driver in another attitude were published as the unit's samples.
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
@@ -152,7 +152,7 @@ def numbered(begin, period_s, until_s, start_s=0.0):
 @pytest.mark.parametrize('period_s', [0.01, 0.0101, 0.02, 0.05, 0.9])
 def test_two_publishers_that_send_are_never_mixed(offset, period_s):
     first = [(*message, 'own') for message in numbered(500, 0.01, 12.0)]
-    begins = 500 + 200 + offset  # numbers near those of the first driver
+    begins = 500 + 200 + offset  # sequence numbers near those of the first driver
     other = [(*message, 'other') for message in numbered(begins, period_s, 8.0, start_s=2.003)]
     sources, used = Sources(), []
     for at_s, number, name in sorted(first + other):
@@ -231,7 +231,7 @@ def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path
 
 
 def test_a_reading_far_ahead_is_forgotten(peer, unit):
-    # WHY: a reading one day ahead kept WARN until a sample of that day came.
+    # WHY: a temperature stamped a day ahead kept the status WARN until a sample of that day came.
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)

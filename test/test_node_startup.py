@@ -92,7 +92,7 @@ def test_an_unusable_ros_environment_is_one_line(name, value, text, unit, monkey
 
 
 def test_a_node_with_closed_streams_runs(unit):
-    # WHY: if stderr was closed, the signal pipe got its descriptor, and log text was a signal.
+    # WHY: with stderr closed, the signal pipe got descriptor 2, and log text was read as a signal.
     peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
     words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]
@@ -111,7 +111,7 @@ def test_help_that_cannot_be_written_prints_no_traceback(sink, code):
     assert 'Traceback' not in finished.stderr
 
 
-#: Libraries of the tools that are not on a robot.
+#: Libraries of the offline tools, which are not installed on a robot.
 ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 'matplotlib')
 
 
@@ -182,7 +182,7 @@ def test_misspelt_parameters_are_named(unit, capfd):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_during_start_up_ends_it_cleanly(unit, number):
-    # Send the signal while the node is built: once the middleware has started a thread.
+    # Send the signal while the node starts: once the middleware has started a thread.
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         tasks = Path(f'/proc/{node.process.pid}/task')
         deadline = time.monotonic() + TIMEOUT

@@ -28,7 +28,7 @@ TREE = yaml.safe_load(dump_calibration(rich_calibration()))
 
 
 def leaves(tree, path=()):
-    """List every place of a calibration file, including nested ones."""
+    """List the path of every value of a calibration file, including nested values."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for key, value in items:
         yield (*path, key)
@@ -173,7 +173,7 @@ def whole_range(of):
 
 @settings(deadline=None, max_examples=max(120, settings.default.max_examples))
 @given(edited())
-# Variances of the axes differ by 23 powers of ten; two lags are equal but for rounding.
+# First: variances of the axes differ by 23 powers of ten; second: two lags differ by rounding.
 @example(changed(1, ('axes', 'z', 'scale_factor'), 1.0))
 @example(changed(0, ('response', 3, 'sensor_share'), 1e-12))
 def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree):

@@ -29,7 +29,7 @@ def read(path):
 
 
 def outcome(path):
-    """Read a bag that may be damaged; any other exception than the expected one fails the test."""
+    """Read a damaged bag, or return its `RecordingError`; any other exception fails the test."""
     try:
         return read(path)
     except RecordingError as error:
@@ -90,7 +90,7 @@ def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
 
 
 def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
-    """Content before a cut is decompressed: a block is lost, not the chunk."""
+    """Content before a cut is decompressed: a compressed block is lost, not the whole chunk."""
     n = 60_000
     stamps = np.arange(n) * 2_500_000
     xyz = np.random.default_rng(3).integers(-30_000, 30_000, (n, 3))

@@ -39,7 +39,7 @@ WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
 
 @st.composite
 def bags(draw, accel=ACCEL, lowest=-3):
-    """Messages in order of writing: equal and falling log times, mixed frames and byte orders."""
+    """Draw messages in writing order: equal or falling log times, mixed frames and byte orders."""
     frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
     topics = (accel, BOARD, CASE, OTHER)
     messages = []
@@ -94,8 +94,8 @@ def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
             and options['index_types'] == IndexType.ALL
             and options['repeat']
         ):
-            # Order of rosbags for the same file; versions of rosbags order equal log times
-            # differently.
+            # The expected order is that in which rosbags reads the file; versions of rosbags
+            # order equal log times differently.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]
@@ -206,7 +206,7 @@ def test_overlapping_chunks_of_single_topics_are_merged(tmp_path):
 def test_too_many_overlapping_chunks_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.mcap_file._MAX_HELD_BYTES', 4000)
     messages = regular_messages(200)
-    # Each chunk has every 40th message, so that all of them cover the whole time.
+    # Each chunk has every 40th message, so that each chunk covers the whole time.
     combed = [message for begin in range(40) for message in messages[begin::40]]
     write_mcap(tmp_path / 'bag.mcap', combed, chunk_size=400)
     with pytest.raises(RecordingError, match=r'too many of its chunks overlap in time'):

@@ -23,7 +23,7 @@ def other(content):
 
 
 def one_by_one(data):
-    """Scan in a plain loop: place, size, channel, log time of messages; other records; the end."""
+    """Scan in a loop; return (place, size, channel, log time) of messages, other records, end."""
     at, messages, others = 0, [], []
     while at + 9 <= len(data):
         opcode, length = struct.unpack_from('<BQ', data, at)

@@ -177,7 +177,7 @@ def test_residual_beyond_the_claim_is_repeatability():
 
 
 def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
-    # WHY: U = 0.00037 was printed for a scale factor although gravity's uncertainty was not stated.
+    # WHY: U = 0.00037 was printed for a scale factor without a stated uncertainty of gravity.
     rows = {result.quantity: result for result in results(evidence(), CertificateInfo(), ())}
     assert rows['scale factor x'].expanded == '–'
     assert rows['bias x'].expanded != '–'

@@ -47,7 +47,7 @@ def test_one_line_is_one_harmless_line(text):
 
 
 def test_an_error_is_one_harmless_line():
-    # WHY: paths, keys and topics in the node's messages come from outside.
+    # WHY: paths, keys and topics in messages come from outside, and may hold escape sequences.
     for error in (
         ThermoCompError(FORGED),
         CalibrationError('cannot be read', FORGED, FORGED),

@@ -101,7 +101,7 @@ def test_claimed_variances_match_squared_errors(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min):
-    # The limits are 1.5 times measured errors; a sensor with steps of 1 K determines the rate to 10 %.
+    # The limits are 1.5 times measured errors; steps of 1 K determine the rate to 10 %.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
@@ -247,7 +247,7 @@ def test_a_gap_widens_and_a_long_gap_starts_anew():
 
 def test_noise_declared_too_small_is_learnt():
     # WHY: real die sensors scatter by 0.1 K; with 5 mK declared every reading was an outlier.
-    # WHAT: the noise ratio is estimated within 20 % (chi-square over about 400 readings: 4 %, and the
+    # WHAT: the noise ratio is estimated within 20 % (chi-square of some 400 readings: 4 %, and the
     # mode of changing rates takes a share), and the variance is right.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)

@@ -32,7 +32,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = parse_cyclogram('20 10min, 40@1 25min, 5@1 25min')
 MICRO_G = STANDARD_GRAVITY * 1e-6
-#: Effect of a kelvin of the lid on the axes [ug], and warming of the lid by the load [K].
+#: Effect of the lid's temperature on the axes [ug/K], and warming of the lid by the load [K].
 LID_UG_K = (12.0, -9.0, 15.0)
 LOAD_K = 5.0
 
@@ -109,7 +109,7 @@ def test_a_third_thermometer_explains_what_board_and_case_do_not(runs, tmp_path)
     switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0
     assert errors[False] > 0.3 * switched
     assert errors[True] < 0.05 * switched
-    # With the temperature of the lid only the noise of a minute remains.
+    # With the temperature of the lid only the noise of a mean over 60 s remains.
     noise = float(np.mean(calibration.noise_density_m_s2_sqrt_hz)) / math.sqrt(60.0) / MICRO_G
     assert spreads[False] > 2.0 * noise
     assert spreads[True] < 1.3 * noise

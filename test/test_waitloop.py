@@ -216,7 +216,7 @@ def test_quality_of_service_is_open_to_overrides(node):
     qos = QoSProfile(depth=7)
     loop.subscribe(Vector3Stamped, 'samples', qos)
     loop.subscribe(Vector3Stamped, 'others', qos)
-    # rclpy writes overrides into the profile it gets, so each subscription needs a copy.
+    # rclpy writes QoS overrides into the profile it gets, so each subscription needs a copy.
     assert qos.depth == 7
     depth = node.get_parameter('qos_overrides./samples.subscription.depth')
     assert depth.value == 7
