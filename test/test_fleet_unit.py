@@ -138,7 +138,7 @@ class TestRow:
         assert [row[f'scale_slope_sd_{axis}_ppm_k'] for axis in 'xyz'] == [None] * 3
 
     def test_the_lag_of_a_board_that_leads_is_negative(self, tmp_path):
-        # WHY: without a measured lag the file has the usual 900 s, not the unit's lag.
+        # WHY: a calibration without a measured board lag states 900 s, not the unit's lag.
         write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
         allowed = replace(OPTIONS.fit, allow=('swapped',))
         outcome = processed(tmp_path, fit=allowed)

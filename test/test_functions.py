@@ -46,7 +46,7 @@ def test_sums_do_not_depend_on_the_size_of_the_other_axes(seed, size, before, af
 
 
 def test_polynomial_by_hand():
-    # The paper prints the fourth term of Eq. (10) as a4 t, which should be a4 t^4.
+    # Golovach's paper prints the fourth term of Eq. (10) as a4 t, which should be a4 t^4.
     assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 
@@ -61,7 +61,7 @@ def test_spline_equals_scipy():
     ours = CubicSpline(KNOTS, values)
     reference = ReferenceSpline(KNOTS, values, bc_type='natural')
     t = np.linspace(-15.0, 15.0, 301)
-    # Two solutions of one linear system differ by rounding only.
+    # Both splines solve one linear system, and differ by rounding only.
     np.testing.assert_allclose(ours.value(t), reference(t), atol=1e-13)
     np.testing.assert_allclose(ours.slope(t), reference(t, 1), atol=1e-13)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fuzz targets, without a fuzzer, on their seeds: whole, cut off and changed."""
+"""The fuzz targets run, without a fuzzer, on their seeds: whole, cut off and changed."""
 
 import pytest
 

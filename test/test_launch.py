@@ -137,7 +137,7 @@ def test_executable_parameters_and_topics_of_a_launch_file_exist():
     named = set(parameters_set(dict.fromkeys(declared(parse(OURS)), 'given')))
     assert named == {'calibration_file', 'serial', 'input', 'topics', 'frame_id'}
     assert named <= {field.name for field in fields(NodeConfig)}
-    # A serial such as 0042 would otherwise become a number.
+    # Without the type `str` a serial such as 0042 would become a number.
     assert all(arg.get('type') == 'str' for arg in node.findall('param') if arg.get('name'))
     topics = {topic.name for topic in (*INPUTS.values(), *OUTPUTS)}
     defaults = {arg.get('name'): arg.get('default') for arg in parse(OURS).findall('arg')}

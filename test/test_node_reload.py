@@ -180,7 +180,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
     # WHY: a calibration was refused, and its bias was applied all the same.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # For another detector the node must rebuild all parts of the correction.
+    # For other detector settings the node must rebuild all parts of the correction.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)

@@ -210,7 +210,7 @@ def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path
     from thermo_comp.unit.calibration import Unit
 
     slow = tmp_path / 'slow.yaml'
-    # Samples may be 1.5 s late, which is more than a busy machine delays the driver.
+    # Silence is reported after 5 cycles = 1.5 s; a busy machine delays the driver by less.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
     with node_in_thread(*node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')

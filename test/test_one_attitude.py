@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits of units that were heated in one or two attitudes, with bags of another generator."""
+"""Fits of units of benchmarks/strangers_units.py that were heated in one or two attitudes."""
 
 from types import SimpleNamespace
 

@@ -79,7 +79,7 @@ def test_every_message_arrives_byte_for_byte(peer, tmp_path, rng, rate):
     listener = Listener(peer)
     progress = []
     report = play(bag, rate=rate, progress=progress.append)
-    # The player has ended, so every reliable subscriber has received everything.
+    # The player has ended, so every reliable subscriber has received every message.
     listener.wait_for(4800)
     assert listener.topics == by_topic(bag)
     temperatures = {'/temperature/board': 400, '/temperature/case': 400}

@@ -37,7 +37,7 @@ def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, toleranc
     posterior = posterior_of(covariance, tolerance)
     sd = np.sqrt(np.diag(covariance))
     error = (posterior.covariance() - covariance) / sd / sd[:, np.newaxis]
-    # The factor is stored in single precision.
+    # The factor of the covariance is stored in single precision.
     np.testing.assert_allclose(np.diag(error), 0.0, atol=1e-6)
     np.testing.assert_allclose(error, 0.0, atol=tolerance + 2e-6)
     assert (posterior.variances <= (tolerance + 1e-6) * sd**2).all()

@@ -171,8 +171,8 @@ def helped():
 @pytest.mark.slow
 def test_a_fit_starts_with_the_widest_prior():
     # WHY: begun with the narrow prior of three units, a fit explained 190 ug by mounting offsets
-    # and stayed in this minimum: the held-out error was 271 ug instead of 0.9 ug. WHAT: the prior
-    # of the start is the widest in all directions.
+    # and stayed in this minimum: the held-out error was 271 ug instead of 0.9 ug. WHAT: a fit
+    # starts with the prior that is the widest in all directions.
     *tried, widest = (prior.root.T @ prior.root for prior in helped()[1])
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))
@@ -201,8 +201,8 @@ def test_new_rests_improve_an_old_calibration():
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
-    # Three positions measure three of the six readings of faces: half of the ageing variance is
-    # removed.
+    # Three positions measure three of the six readings of faces, bias +- scale * g of each axis,
+    # so that half of the ageing variance is removed.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [(a.bias - b.bias) / a.scale_factor for a, b in zip(new.axes, old.axes, strict=True)]
@@ -233,7 +233,7 @@ def test_rests_at_one_temperature_correct_ageing_and_keep_the_response():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # In rests of ten minutes a lag of an hour with an unknown start resembles a bias: 10 ug if the
+    # In rests of 10 min a lag of 1 h with an unknown start resembles a bias: an sd of 10 ug if the
     # six norms determine three biases, twice as much if they determine three scale factors, too.
     sd = float(sd_of_levels(new).max())
     assert sd < 20e-6 * STANDARD_GRAVITY
@@ -305,7 +305,7 @@ def test_the_calibration_of_another_unit_is_no_prior():
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
     assert any('allowed: ' in text for text in messages)
     assert any('bags contradict the prior' in text for text in messages)
-    # A prior has a curve for each regime, so there is no residual of one set.
+    # A prior has a set of curves per regime, so the fit has no residual of a single set.
     assert not allowed.residuals[-1].one_set.n
 
 

@@ -83,7 +83,7 @@ def check_positions(result):
 
 def check_fit(result, cli, folder):
     """Run the printed command, and compare the calibration with the truth."""
-    # Fit the paper's model, as only constants are compared: a model with a response takes ten
+    # Fit the model `golovach`, as only constants are compared: a model with a response takes ten
     # times as long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))

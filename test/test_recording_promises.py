@@ -132,7 +132,7 @@ def test_a_compressed_message_expands_within_limits(tmp_path):
 
 @pytest.mark.parametrize('packing', ['BZ2', 'LZ4'])
 def test_a_chunk_of_a_ros1_bag_expands_within_limits(tmp_path, packing, monkeypatch):
-    # WHY: a bag of 10 kB took a gigabyte of memory.
+    # WHY: to read a ROS 1 bag of 10 kB took a gigabyte of memory.
     store, kind = get_typestore(Stores.ROS1_NOETIC), 'sensor_msgs/msg/Temperature'
     header, stamp = (
         store.types[name] for name in ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refusals: other layouts, encodings and topics, and files that are not bags."""
+"""Other layouts, encodings and topics, and files that are not bags, are refused with a reason."""
 
 import os
 import struct

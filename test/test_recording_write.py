@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Other tools read the written bag; it is complete or does not exist."""
+"""Other tools read a written bag, which is complete or does not exist."""
 
 import os
 import tempfile

@@ -246,7 +246,7 @@ RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
 def test_the_dynamic_regime_ends_when_the_lag_has_died_away():
-    # The rate of the board is 0.05 K/min 50 min after the ramp; dwell adds 60 s, noise 10 %.
+    # The board rate falls to 0.05 K/min 50 min after the ramp; dwell adds 60 s, noise 10 %.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)

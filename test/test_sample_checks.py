@@ -148,7 +148,7 @@ def test_the_total_counts_every_reason_once():
 
 @st.composite
 def stretches(draw):
-    """Draw stretches of samples of one kind each, with temperatures between."""
+    """Draw stretches of samples, each of one kind, with temperatures between the samples."""
     events = []
     stamp_ns = 0
     k = 0

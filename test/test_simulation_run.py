@@ -265,7 +265,7 @@ def test_thermostat_holds_its_part_and_spends_what_leaks():
     program = parse_cyclogram('fast')
     response = response_of(network, program.time_s, program.temperature_c)
     grid = np.arange(0.0, program.duration_s, 30.0)
-    # At 30 K outside and 3 K/min an oven for accelerometers keeps the head within 0.2 K.
+    # In air that changes by 30 K, at up to 3 K/min, the oven keeps the head within 0.2 K.
     assert np.ptp(response.temperatures(grid)[:, head]) < 0.2
 
 

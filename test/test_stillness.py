@@ -90,7 +90,7 @@ def test_a_gyroscope_that_drifts_with_temperature_rests(rng):
 
 
 def by_hand(rng, n_rests, rest_s, shaky, misalignment=0.0):
-    """Make hand-held rests with turns between; shaky rests scatter four times as much."""
+    """Make hand-held rests with turns between; shaky rests have four times the noise."""
     ups = positions(n_rests, 4)
     matrix = np.eye(3)
     matrix[1, 0] = matrix[2, 1] = misalignment

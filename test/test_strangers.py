@@ -130,7 +130,7 @@ def test_flicker_noise_has_a_flat_allan_deviation():
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Replace recordings by notes of their programs."""
+    """Replace `record` by a function that notes its arguments; return the notes of a bag."""
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):

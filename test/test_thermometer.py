@@ -81,7 +81,7 @@ PARTS = {
 def test_claimed_variances_match_squared_errors(errors, sensor, part):
     # Ideally, the mean squared error equals the claimed variance. In soaks and ramps the claimed
     # variance is a few times too large, as it allows for the onset or end of a ramp at any time.
-    # The few errors of a coarse sensor scatter by a factor of 2.
+    # The mean over the few independent errors of a coarse sensor scatters by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]

@@ -3,8 +3,8 @@
 """
 A third thermometer is found in the bags, fitted, applied by replay, and improves the result.
 
-The electronics under the lid are switched at random. Board and case temperature do not change, so
-that only the lid's thermometer explains the effect on the axes.
+Electronics under the lid, which heat neither board nor case, are switched at random. Only the
+thermometer of the lid explains the effect of the lid on the axes.
 """
 
 import math

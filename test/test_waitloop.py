@@ -144,7 +144,7 @@ def test_services_and_timers_are_served_while_samples_flow(node, peer):
         finally:
             stop.set()
             flooding.join(TIMEOUT)
-    # Polling every 20 ms leaves time for a reload within 100 ms, including its client.
+    # Polling of services every 20 ms leaves time for a reload within 100 ms, client included.
     assert OTHERS_PERIOD_NS <= 20_000_000
 
 
