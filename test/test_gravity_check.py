@@ -89,7 +89,7 @@ def test_the_message_states_the_present_deviation(rng):
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)
     assert not monitor.is_refuted
-    # The stamps start again at 0: this is a restart, not a step of |f|.
+    # Stamps that start again at 0 are a restart, not a step of |f|.
     result = watch(rng, seconds=8, bias=0.5, monitor=monitor)
     assert monitor.is_refuted
     assert result.residual == pytest.approx(0.5, abs=1e-3)

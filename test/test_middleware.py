@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Fast DDS profile has its effect, and a profile of the user replaces it."""
+"""The node's Fast DDS profile avoids wake-ups, and a profile of the user replaces that profile."""
 
 import json
 import os

@@ -19,7 +19,7 @@ STEP_NS = 10_000_000
 
 
 def blocks_of(path, stamp_ns, reading_ns):
-    """Write samples and readings in this order, and read them on one clock."""
+    """Write samples and temperature readings in the order given, and read them on one clock."""
     n = len(stamp_ns)
     log_ns = START_NS + STEP_NS * np.arange(n)
     with BagWriter(path) as bag:

@@ -112,7 +112,7 @@ def test_rests_are_found_at_any_rate_of_samples(rate, rng):
     samples = (30.0, -20.0, 2941.0) + 300.0 * NOISE * excess * rng.standard_normal((n, 3))
     samples[n // 2 :] = samples[n // 2 :, [2, 1, 0]]
     whole = finder().add(stamps, samples)
-    # At most two windows are lost at the change of attitude, and one at the end.
+    # At most two windows are lost at the change of attitude, and one at the end of the samples.
     assert sum(one.n for one in whole) >= 0.6 * n
     assert len(whole) >= 6
     for one in whole:

@@ -168,7 +168,7 @@ def test_a_periodic_call_goes_on_with_and_without_samples(node, peer):
             publisher.publish(Vector3Stamped())
             running.wait_for(lambda n=n_sent: len(running.messages) == n)
         running.wait_for(lambda: len(called) > n_before and called[-1] == 50)
-        # A second periodic call replaces the first, and is called when it is due, not earlier.
+        # A second periodic function replaces the first, and is called when due, not earlier.
         again = []
         start = time.monotonic()
 
