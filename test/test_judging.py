@@ -314,7 +314,7 @@ class TestVerdict:
         assert found.sections['all'].n == 30
         assert found.sections['outside'].n == 10
         assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
-        # A residual in the bags of the fit (in sample) cannot make a calibration valid.
+        # Residuals inside the ranges decide the verdict; windows outside alone give no verdict.
         bad = windows.force.copy()
         bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
         found = judge(dataclasses.replace(windows, force=bad), CLAIMING)

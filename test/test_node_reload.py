@@ -100,7 +100,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         (value,) = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert value.string_value == str(second)
 
-        # A request with a calibration file and other parameters applies all values, or none.
+        # An atomic request with a file and other parameters applies all values, or none.
         result = peer.set_atomically(transition_time=5, calibration_file=str(broken))
         assert not result.successful
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
