@@ -175,7 +175,7 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples, later than those of a bag, until the node publishes one; reset the counts."""
+        """Send samples with stamps after any bag until the node returns them; reset counts."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):

@@ -109,7 +109,7 @@ class Truth:
 
 
 def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
-    """Compute temperatures: the case lags the air, the board the case, a memory the board."""
+    """Compute temperatures: case lags air, board lags case; memory is board minus its lag [K]."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])

@@ -93,7 +93,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # Merging all rests of a start into one row causes an error below a fifth of the sd.
+        # Summing the rests of each start to a few rows causes an error below a fifth of the sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)

@@ -3,7 +3,7 @@
 """
 Outputs: no input, and no file of another kind, is ever replaced.
 
-WHY: `--force` destroyed the recordings that a command read; of two writers one lost its result
+WHY: `--force` destroyed the recordings that a command read; one of two writers lost its result
 silently; an output was readable by everyone whatever the umask, and replaced a link.
 """
 

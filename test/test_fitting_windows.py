@@ -140,7 +140,7 @@ def test_columns_of_sets_and_start_states_by_hand(bags):
 @pytest.mark.parametrize('name', ['board', 'case'])
 @pytest.mark.parametrize('is_stuck', [False, True])
 def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
-    # The thermometer is silent, or repeats a value, from 900 s (first ramp) to 2200 s (second ramp).
+    # The thermometer is silent, or repeats a value, from 900 s to 2200 s, in both ramps.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]
     age = (readings.stamp_ns - bag.start_ns) * 1e-9
