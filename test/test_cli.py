@@ -148,7 +148,7 @@ class TestSimulate:
             ups.append(truth['up'])
             block = read_recording(path).columns
             measured = block.accel.mean(axis=0) / truth['scale_factor']
-            # Bias and drift of a simulated MEMS unit change |f| by a few per cent of g at most.
+            # Bias and drift of a MEMS unit change a mean sample by a few per cent of g at most.
             np.testing.assert_allclose(measured / 9.80665, truth['up'], atol=0.05)
             # Readings of both thermometers precede the first sample, so every sample is corrected.
             assert [temperature.after[0] for temperature in block.temperatures.values()] == [0, 0]

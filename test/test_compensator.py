@@ -207,7 +207,7 @@ def test_nothing_is_published_before_a_temperature_or_long_after_the_last():
     'run', [lambda *given: stream(*given)[1], lambda *given: batch(*given).index.tolist()]
 )
 def test_a_stamp_that_leaps_ahead_needs_a_second_stamp(run):
-    # WHY: a single stamp 20 s ahead made all later samples late and reset the memory.
+    # WHY: a single stamp 20 s ahead made all later samples count as late and reset the memory.
     leap, step = 20 * SECOND_NS, SECOND_NS // 100
     usual = np.arange(1, 6) * step
     for stamps, kept in (

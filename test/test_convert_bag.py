@@ -172,7 +172,7 @@ def test_the_magnitude_at_rest_tells_the_unit(magnitude, unit):
 def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
-    # Any |a| at rest above 1000 (g in mg) may be counts of a converter with many bits.
+    # Counts are a possible unit of any |a| at rest of 50 and more: converters have many bits.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
     # A sensor that never rests cannot contradict the stated unit.

@@ -423,7 +423,7 @@ def test_unidentified_columns_are_refused(tmp_path, rng):
     for content, reason in (
         ('t,a,b,c\n' + '0,0,0,9.8\n' * 100, 'its headings name no accelerometer'),
         ('a,b,c\n1,2,3\n2,3,4\n', "name no accelerometer: 'a', 'b', 'c'; give a column map"),
-        # WHY: cells were divided at the decimal commas, and the message named no accelerometer.
+        # WHY: decimal commas divided cells; the message was `its headings name no accelerometer`.
         (
             't;ax;ay;az\n' + '0,01;0,0;0,1;9,8\n' * 100,
             'has decimal commas, as in 0,01: use points',

@@ -57,7 +57,7 @@ def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
         for rows in field_watch.forecasts(kind, 3, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The printed interval has a probability of 80 %; 24 forecasts determine its share to 6 %.
+    # The printed interval has a probability of 80 %, which 24 rows estimate with an error of 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
     # The median time of a unit is uncertain by a factor of 1.5, the mean of eight by 1.3.
     assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6

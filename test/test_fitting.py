@@ -43,7 +43,7 @@ def fitted(unit, ups, seed, **options):
 
 
 def constants(calibration):
-    """Bias [counts], K and the elements of M below its diagonal."""
+    """Return bias [counts], K [counts per m/s^2] and the elements of M below its diagonal."""
     axes = calibration.axes
     M = np.array(calibration.misalignment)
     bias, scale = [axis.bias for axis in axes], [axis.scale_factor for axis in axes]
@@ -51,7 +51,7 @@ def constants(calibration):
 
 
 def claimed(calibration):
-    """Sd of bias and of the elements of M, and the relative sd of K."""
+    """Return the sd of bias [counts], the relative sd of K, and the sd of the elements of M."""
     layout, sd = (
         parameter_layout(calibration),
         np.sqrt(np.diag(calibration.posterior.covariance())),
@@ -205,8 +205,8 @@ def test_nine_positions_claim_turn_ons_that_their_norms_cannot_show(rng):
     ]
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set'))
     found = fit(sources_of(switched_on), options)
-    # From the noise of the unit PLAIN the fit expects turn-ons of some 50 ug. Nine errors of 1 sd
-    # each have an RMS above 1.55 by a chance of 1 %.
+    # From the noise of the unit PLAIN the fit expects turn-ons of some 50 ug. The RMS of
+    # nine errors of unit variance exceeds 1.55 by a chance of 1 %.
     assert np.sqrt(np.mean(pulls(found, PLAIN) ** 2)) < 1.55
 
 

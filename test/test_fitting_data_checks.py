@@ -70,7 +70,7 @@ def test_a_complete_thermal_test_has_only_good_findings(good):
     ('name', 'changed', 'message'),
     [
         ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 advised\): run the'),
-        # WHY: the thermometer of a room was taken for the board's.
+        # WHY: the thermometer of a room was taken for the thermometer of the board.
         ('span', lambda w: {'temperature': 0.01 * w.temperature}, 'is the thermometer on'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
          'no thermometer: the calibration holds at the temperature of the test'),
@@ -92,7 +92,8 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
 
 
 def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, rng):
-    # WHY: soaks were refused for interpolated temperatures, whose noise enters rate and gradient.
+    # WHY: bags of soaks were refused: the noise of interpolated temperatures enters rate and
+    # gradient, and was taken for a ramp with exchanged sensors.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)
@@ -119,7 +120,7 @@ def test_rests_on_a_desk_with_a_prior_of_the_unit_need_no_chamber(good):
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
-    # A prior of the type has no information about effects of this unit alone.
+    # A prior of the type of unit has no information about effects of a single unit.
     of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
     assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}
 
