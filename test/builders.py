@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the small calibrations and blocks for the tests of the core."""
+"""Owns the small calibrations and blocks of samples that tests of the core use."""
 
 from dataclasses import dataclass, field, replace
 
@@ -138,7 +138,7 @@ class Columns:
 
 
 def columns_from_events(events):
-    """Columns of (kind, stamp_ns, value) in file order; kind: 'accel', or a thermometer's name."""
+    """Return columns of events (kind, stamp_ns, value); kind: 'accel' or a thermometer's name."""
     accel = [(s, v) for kind, s, v in events if kind == 'accel']
     readings = {}
     n_accel = 0
@@ -157,7 +157,7 @@ def columns_from_events(events):
 
 
 def stream(compensator, events):
-    """Run events one by one, angular rates being 1/1000 of samples; return rows and indices."""
+    """Process events one by one, with 1e-3 of a sample as its rate; return rows and indices."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:
@@ -206,7 +206,7 @@ def arrays_of(run, every=1):
 
 
 def drawn(unit, layout, d):
-    """Change all parameters but the scale levels, which a constant curve does not have."""
+    """Add `d` to all parameters of a unit but the levels of scale curves, which are fixed at 1."""
 
     def moved_by(values, start):
         return tuple(value + d[start + k] for k, value in enumerate(values))

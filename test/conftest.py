@@ -25,8 +25,8 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Use one BLAS thread: several BLAS threads wait for each other on a busy machine. The variable
-# must be set before numpy is imported.
+# Use one BLAS thread: several BLAS threads wait for each other on a busy machine. OpenBLAS
+# reads the variable when numpy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
@@ -38,7 +38,7 @@ os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WO
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_STATIC_PEERS', None)
 
-# Background processes of a shell, and their children, ignore SIGINT: restore it.
+# Background processes of a shell, and their children, ignore SIGINT: restore its handler.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -46,7 +46,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Examples of hypothesis have no deadline, because their duration depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# Profile of `make nightly`; tests with a stated number of examples keep this number.
+# `make nightly` uses this profile; tests that state a number of examples keep the number.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
@@ -80,7 +80,7 @@ def ran(*command, check=False, **keys):
 
 
 def parsed(text):
-    """Parse JSON printed by a command: it must be one object, without NaN, which is not JSON."""
+    """Parse the JSON that a command prints: one object, without NaN, which is not JSON."""
 
     def no_nan(text):
         raise AssertionError(f'{text} is not JSON')
@@ -182,7 +182,7 @@ def _as_a_process(cwd):
 
 @pytest.fixture(scope='session')
 def cli(program):
-    """Return a function that runs a command in this process or, with variables, in another."""
+    """Return a function that runs a command here or, with environment variables, in a process."""
     from thermo_comp.cli.app import run as run_command
 
     def run(*args, code=0, cwd=None, **env):
@@ -253,7 +253,7 @@ def once(tmp_path_factory):
         with (shared / f'.{name}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                # Remove the files of a failed attempt.
+                # Remove the files of a failed attempt to make the folder.
                 shutil.rmtree(partial, ignore_errors=True)
                 partial.mkdir()
                 make(partial)
@@ -271,7 +271,7 @@ def desk(tmp_path_factory, cli, once):
 
 
 class _Pickler(pickle.Pickler):
-    """Leave out the functions that read the bags of a fit; they are not needed after it."""
+    """Pickle a fit without the functions that read its bags, which nothing needs after a fit."""
 
     def persistent_id(self, value):
         is_local = isinstance(value, FunctionType) and '<' in value.__qualname__
@@ -285,7 +285,7 @@ class _Unpickler(pickle.Unpickler):
 
 @pytest.fixture(scope='session')
 def equal_fits_once(once):
-    """Fit equal bags with equal options once, as many pages and examples need the same fit."""
+    """Fit equal bags with equal options once, as many pages and examples need equal fits."""
     from thermo_comp import fitting
 
     fit = fitting.fit
@@ -326,7 +326,7 @@ def equal_tracks_once():
         place = key.digest()
         if place not in known:
             known[place] = track(bag, model, spec)
-            # All fits share these arrays, so that no fit may change them.
+            # All fits share the arrays of a track, so no fit may change an array.
             known[place].states.flags.writeable = known[place].is_known.flags.writeable = False
             if len(known) > 60:
                 del known[next(iter(known))]

@@ -28,7 +28,7 @@ _EXPORTS = {'autopilot.params': 'px4', 'xsens_acc.calib': 'imu_tk',
 
 
 def write_fit_of_the_readme(path, cli):
-    """Write the calibration of the sample bags, and the README command's output beside it."""
+    """Write the calibration of the sample bags, and a text file with the output of its fit."""
     words, _ = shown()['fit']
     bags = ROOT / 'bags' / 'fit'
     assert words[1] == 'bags/fit/*.mcap'
@@ -68,7 +68,7 @@ class Desk:
         elif name == 'unit.yaml':
             shutil.copy(self._make('unit42.yaml'), path)
         elif name == 'unit01.yaml':
-            # The paper's model is small; a prior from three larger models would take ten seconds.
+            # A prior from three units takes 10 s with the default model, less with `golovach`.
             bags = sorted(self._make('bags/unit42').iterdir())
             given = ('--gravity', '9.8154', '--model', 'golovach', '--serial', path.stem)
             self._cli('fit', *bags, *given, '-o', path, '-q')
@@ -142,7 +142,7 @@ class Desk:
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}
         self._n += 1
-        # A second `fleet fit` in the same folder reports the existing results.
+        # All `fleet` commands share a folder: a second `fleet fit` reports the existing results.
         here = self._folder / ('fleet' if words[0] == 'fleet' else f'run{self._n}')
         (here / 'bags').mkdir(parents=True, exist_ok=True)
         for word in words:
@@ -160,14 +160,14 @@ class Desk:
             arguments += sorted(str(path.relative_to(here)) for path in paths) or [word]
         if arguments[0] == 'play':
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-            # No node subscribes in this test, so do not wait for subscribers.
+            # No node subscribes in the tests of examples, so wait only 0.5 s for subscribers.
             arguments[1:1] = ['--wait', '0.5']
         if arguments[:2] == ['record', '--positions']:
             return self._interrupted(arguments, here)
         return (cli or self._cli)(*arguments, cwd=here)
 
     def _interrupted(self, arguments, here):
-        """Start a command that runs until Ctrl-C; send Ctrl-C once it has printed a line."""
+        """Start a command that runs until Ctrl-C; send SIGINT after its first printed line."""
         process = subprocess.Popen(
             [sys.executable, '-m', 'thermo_comp', *arguments], cwd=here,
             env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE,

@@ -33,12 +33,12 @@ from thermo_comp.ros.waitloop import WaitLoop
 #: Longest wait for any event [s]; reached only if the bench is broken.
 TIMEOUT_S = 60.0
 #: Length of bag [s] and largest number of messages in one lot: the shared memory of Fast DDS has
-#: room for 512 messages; Fast DDS sends further messages again seconds later, out of order.
+#: room for 512 messages; Fast DDS sends messages beyond 512 seconds later, out of order.
 LOT_S, LOT_SIZE = 10.0, 400
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 FRAME = b'sensor\0'
 _REST = np.array([20.0])
-#: Counts of the unit at rest at the reference temperature.
+#: Counts of the unit of `fault_rig` at rest at the reference temperature.
 _STANDING = counts_of(force_at(np.array([STANDS_S])), _REST, _REST, 0.0 * _REST)[0]
 _HEAD = '<4siII7s5x'
 _COUNTS, _READING = struct.Struct(_HEAD + '3d'), struct.Struct(_HEAD + '2d')
@@ -64,7 +64,7 @@ class Heard:
     stamp_ns: np.ndarray
     force: np.ndarray
     covariance: np.ndarray
-    #: (level, message) of each report, and all key values of the last report.
+    #: The (level, message) of each diagnostics report, and all key values of the last report.
     reports: list[tuple[int, str]] = field(default_factory=list)
     values: dict[str, str] = field(default_factory=dict)
 
@@ -78,7 +78,7 @@ class Bench:
     def __init__(self, node, context):
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
-        # The wait loop of the package does not serve service clients.
+        # WaitLoop serves no service clients, so a `Peer` calls the services of the node.
         self._operator = Peer()
         self._client = self._operator.node.create_client(
             SetParameters, 'thermo_comp/set_parameters'
@@ -116,7 +116,7 @@ class Bench:
             while not publisher.get_subscription_count():
                 pause.wait(0.01)
                 assert self.process.is_alive, self.process.said
-        # The node's readers need a moment to discover the new publishers completely.
+        # The subscriptions of the node need 0.5 s to discover the new publishers completely.
         pause.wait(0.5)
 
     def close(self):
@@ -175,7 +175,7 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples with later stamps until the node returns the first of them."""
+        """Send samples with stamps after any bag until the node returns them; reset counts."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):
@@ -186,7 +186,7 @@ class Bench:
             pause.wait(0.02)
             if self._frames:
                 break
-        # Messages sent before discovery are lost: start the counts anew.
+        # Messages sent before discovery are lost: take the counts of samples from the node.
         last_ns = stamp_ns + 1_000_000_000
         standing[2] += 1.0
         self.send([('counts', last_ns, tuple(standing))])

@@ -38,19 +38,19 @@ READING_SD = 0.003
 K = 3e5
 FULL_SCALE = 8388607.0
 NOISE_SD = 1e-4
-BIAS = (18000.0, -15000.0, 16500.0)  # 5 mg
-BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K: 100 ug/K
+BIAS = (18000.0, -15000.0, 16500.0)  # counts: 5 to 6 mg
+BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^2
 SCALE_SLOPE = 7e-5
 BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
 
-#: Residual of the static set while a ramp is not detected yet; part of the covariance.
+#: Residual sd of the static set [m/s^2], as in a ramp not detected yet; part of the covariance.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 
 CONFIG = CompensatorConfig(transition_time_s=5.0, temperature_timeout_s=20.0, case_timeout_s=10.0,
                            gravity_tolerance_m_s2=0.02)  # fmt: skip
 
-# A message: topic, stamp, value. A list of messages is in order of arrival.
+# A message is a tuple of topic, stamp [ns] and value. A list of messages is in order of arrival.
 Event = tuple[str, int, Any]
 Inject = Callable[[list[Event]], list[Event]]
 
@@ -87,7 +87,7 @@ def unit(**changes):
 
 
 def force_at(seconds):
-    """Return the true specific force: a slow turn, then rest."""
+    """Return the true specific force [m/s^2], shape (n, 3): a slow turn, then rest."""
     angle = 0.02 * np.minimum(seconds, STANDS_S)
     up = np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
     return GRAVITY * up
@@ -95,7 +95,7 @@ def force_at(seconds):
 
 @dataclass(frozen=True)
 class Truth:
-    """The true temperatures of the unit on a fine grid."""
+    """The true temperatures [degC] of the unit on a fine grid of times [s]."""
 
     time: np.ndarray
     case: np.ndarray
@@ -109,7 +109,7 @@ class Truth:
 
 
 def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
-    """Compute the temperatures of case, board and memory from the air's, each through its lag."""
+    """Compute temperatures: case lags air, board lags case; memory is board minus its lag [K]."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])
@@ -178,7 +178,7 @@ def seconds_of(stamp_ns):
 
 
 def changed(topic, begin_s, end_s, change):
-    """Replace each message of a topic within a span by the events of `change(event)`."""
+    """Replace each message of a topic within a span of stamps by the events of `change(event)`."""
 
     def inject(events):
         result = []
@@ -224,7 +224,7 @@ def late(topic, delay_s, begin_s, end_s):
 
 
 def shuffled(topic, begin_s, end_s):
-    """Exchange each message of a topic with the next one."""
+    """Exchange the messages of a topic within a span in pairs of neighbours."""
 
     def inject(events):
         result = list(events)

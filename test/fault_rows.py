@@ -3,8 +3,8 @@
 """
 Owns the rows of faults: the fault, the required output and the required diagnostics.
 
-Times are seconds of the bag of `fault_rig`: the unit turns until 40, the ramp is from 60 to 120,
-and the lag of the board has decayed by 270. docs/faults.md describes each row.
+Times are seconds of the bag of `fault_rig`: the unit turns until 40 s, the ramp is from 60 to
+120 s, and the lag of the board has decayed by 270 s. docs/faults.md describes each row.
 """
 
 import math
@@ -39,17 +39,17 @@ N_SAMPLES = round(RATE_HZ * DURATION_S)
 class Row:
     fault: str
     inject: Inject
-    #: Required diagnostics: level, and a part of the message.
+    #: Required diagnostics: pairs of a level and a part of the message.
     says: tuple[tuple[int, str], ...]
     #: Smallest number of published samples.
     n_least: int
-    #: Spans in which nothing may be published.
+    #: Spans [s] in which nothing may be published.
     silent: tuple[tuple[float, float], ...] = ()
-    #: Span before the fault can be detected, in which the output may be wrong.
+    #: Span [s] before the fault can be detected, in which the output may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
     #: Time from which the output is within 1 ug of the fault-free output [s]; inf: never.
     recovered: float = 0.0
-    #: Time from which stamps are ahead of the truth, and by how much [s].
+    #: Time from which stamps are ahead of the true times, and the difference [s].
     shift: tuple[float, float] = (math.inf, 0.0)
     #: Messages of the row; None: the bag of `fault_rig`.
     source: list[Event] | None = field(default=None, repr=False)
@@ -81,12 +81,12 @@ def faster(begin_s, end_s, factor):
 
 
 def half_time(begin_s):
-    """Let a bag restart: play its beginning, then the whole bag."""
+    """Let time jump back: play the messages before `begin_s`, then the whole bag."""
     return lambda events: [e for e in events if seconds_of(e[1]) < begin_s] + events
 
 
 def sensor_rows(name):
-    """Return the rows of one thermometer; only faults of the board stop the output."""
+    """Return the rows of one thermometer; only faults of the board thermometer stop output."""
     is_board = name == 'board'
     lost = 'nothing is published' if is_board else 'the board sensor decides the regime'
     level = ERROR if is_board else WARN

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns rests of a unit with any calibration, for tests, as the unit's node logs rests."""
+"""Owns simulated rests of a unit with any calibration, in the form that the node logs."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def in_any_attitude(rng):
 
 
 def known(**keys):
-    """Make a calibration with an sd of 10 ug of its biases and of 10 ppm of its scales."""
+    """Make a calibration with an sd of 10 ug for each bias and of 10 ppm for each scale."""
     value = builders.calibration(noise_density_m_s2_sqrt_hz=(60 * MICRO_G,) * 3, **keys)
     layout = parameter_layout(value)
     sd = np.zeros(layout.n_parameters)

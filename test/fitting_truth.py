@@ -18,7 +18,7 @@ from thermo_comp.typing import Floats
 
 GRAVITY = 9.81
 NOMINAL = np.array([1000.0, 1010.0, 990.0])
-#: Groups of the table's columns: a curve t, t^2; two lags; two columns without effect.
+#: Groups of the columns of a table: curve (t, t^2), board (two lags), idle (two without effect).
 GROUPS = ('curve', 'curve', 'board', 'board', 'idle', 'idle')
 TAUS = np.array([400.0, 2500.0])
 START = np.array([[0.25, 0.1], [0.1, 1.0]])
@@ -27,7 +27,7 @@ MICRO = 1e-6 * GRAVITY
 
 @dataclass(frozen=True)
 class Truth:
-    """True parameters of a unit; biases are counts / nominal scale factor [m/s^2]."""
+    """True parameters of a unit; a bias is in counts / nominal scale factor [m/s^2]."""
 
     kappa: Floats = field(default_factory=lambda: np.array([1.0003, 0.9996, 1.0005]))
     bias: Floats = field(default_factory=lambda: np.array([5e-3, -8e-3, 2e-3]))
@@ -64,7 +64,7 @@ def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
     """Draw a table of windows, one bag per position; also return the true directions."""
     up = positions(n_positions, 3) if up is None else up
     time = step_s * (np.arange(n_windows) + 0.5)
-    # The temperature goes up and down once in each bag, slightly different each time.
+    # In the bag of position p the temperature follows 0.7 + 0.05 p periods of a sine.
     shapes = [_columns(n_windows, step_s, 0.7 + 0.05 * p) for p in range(n_positions)]
     share = np.zeros((n_windows, len(GROUPS)))
     share[:, 2:4] = np.exp(-time[:, None] / TAUS)
@@ -136,7 +136,7 @@ def rows_of(windows, rows):
 
 
 def without_starts(windows):
-    """Remove the unknown start states, as their products with the weights are not linear."""
+    """Remove unknown initial lag states, whose products with weights are not linear."""
     return replace(
         windows, lag=np.full_like(windows.lag, -1), start=np.zeros_like(windows.start),
         start_covariance=np.zeros((0, 0)),
@@ -144,7 +144,7 @@ def without_starts(windows):
 
 
 def column_sd(names, bias_sd, scale_sd):
-    """Prior sd of each column in bias and scale; 0 excludes a column."""
+    """Return the prior sd of each column in bias and scale, shape (2, 6); 0 excludes a column."""
     return np.outer((bias_sd, scale_sd), np.isin(GROUPS, names))
 
 
@@ -159,7 +159,7 @@ def prior_of(truth, names=('curve', 'board'), **changes):
 
 
 def candidates_of(windows, forced=()):
-    """Include all columns, with slopes of some ug/K."""
+    """Make all columns candidates, with typical slopes of 5 ug/K (bias) and 5 ppm/K (scale)."""
     none = np.zeros((2, len(windows.groups)), dtype=bool)
     typical, largest = (
         np.outer(slope, windows.kelvins) * windows.parts

@@ -12,7 +12,7 @@ from thermo_comp.simulation.presets import unit_preset as preset
 from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-#: Half an hour over 36 K, with the fast ramps of a freezer.
+#: Program of about half an hour with the fast ramps of a freezer; the board covers 36 K.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
 #: The paper's model is the fastest fit, for tests of everything around a fit.
 OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
@@ -58,7 +58,7 @@ def write_unit(
 
 
 def damage(path):
-    """Overwrite some bytes in the middle of a bag, as a damaged disk does."""
+    """Overwrite 64 bytes at a third of the length of a bag, as a damaged disk does."""
     content = bytearray(path.read_bytes())
     middle = len(content) // 3
     content[middle : middle + 64] = bytes(64)

@@ -39,7 +39,7 @@ class NodeProcess:
 
     @property
     def said(self):
-        # Read the output without changing the position at which the process writes.
+        # Read the output without moving the file position at which the node process writes.
         return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
 
     def stop(self, number=signal.SIGTERM):

@@ -17,7 +17,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass
 class Imu:
-    """The Imu columns of a recording that are needed to check a jump."""
+    """Those Imu columns of a recording that the check for a jump needs."""
 
     angular_velocity: np.ndarray
 
@@ -33,7 +33,7 @@ class ImuBlock(ArrayBlock):
 
 @dataclass
 class Rest:
-    """A sensor at rest: noise about `level`, a board that cools by `fall` from `warm`."""
+    """A sensor at rest: noise about `level` [m/s^2]; the board cools by `fall` K from `warm`."""
 
     rng: np.random.Generator
     duration_s: float = 600.0

@@ -168,7 +168,7 @@ def assert_columns(block, messages):
             assert found.tolist() == expected[f'{role}_{name}'], (role, name)
         assert after.tolist() == expected[f'{role}_after']
         assert values.dtype == np.float64
-        # Compare bits, so that the payload of a NaN must be kept.
+        # Compare bits, because a reader must keep the payload of a NaN.
         shape = (-1, 3) if role == 'accel' else (-1,)
         wanted = np.array(expected[f'{role}_values'], np.float64).reshape(shape)
         assert np.ascontiguousarray(values).tobytes() == wanted.tobytes(), role

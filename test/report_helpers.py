@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the small simulated thermal tests of the report's tests."""
+"""Owns the small simulated thermal test that the tests of the report use."""
 
 from dataclasses import replace
 from functools import cache
@@ -19,7 +19,7 @@ from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = '15 12min, 30@1.5 14min, 15@1.5 8min'
-#: At 1 Hz the rounding of counts would dominate the noise: 18 ug/sqrt(Hz) instead of 6.
+#: Sample rate. At 1 Hz rounding to counts would give a noise of 18 ug/sqrt(Hz) instead of 6.
 RATE_HZ = 2.0
 N_POSITIONS = 9
 LEFT_OUT_RMS = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(N_POSITIONS - 1)]
@@ -50,7 +50,7 @@ def fitted():
 
 @cache
 def evidence():
-    """Gather the evidence of the fit, with assumed left-out residuals of all positions but one."""
+    """Gather the evidence of the fit; left-out residuals are assumed, NaN in the last position."""
     *others, last = fitted().positions
     left_out = [
         replace(other, left_out_rms=rms) for other, rms in zip(others, LEFT_OUT_RMS, strict=True)

@@ -17,7 +17,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 
 SECOND_NS = 1_000_000_000
-#: Stamp of the first sample of a test, and interval between samples [ns].
+#: Stamp of the first sample of a test [ns], and interval between samples [ns].
 START_NS, CYCLE_NS = 1_767_225_600 * SECOND_NS, 10_000_000
 #: Longest wait for any event on DDS [s]; reached only if a test is broken.
 TIMEOUT = 30.0
@@ -40,7 +40,7 @@ def standing(k):
 
 
 class Peer:
-    """A node with a separate thread; every received message wakes `wait_for`."""
+    """A node with a thread of its own; every received message makes `wait_for` test again."""
 
     def __init__(self):
         self.context = Context()
@@ -80,7 +80,7 @@ class Peer:
             assert self._news.wait_for(condition, TIMEOUT), f'{what} did not come true'
 
     def poll(self, condition, what):
-        """Wait by polling for a condition without a message, such as a discovery."""
+        """Poll a condition that no message announces, such as a discovery."""
         pause = threading.Event()
         for _ in range(int(TIMEOUT / 0.02)):
             if condition():
@@ -168,14 +168,14 @@ def drive(peer, node, kind=Vector3Stamped, topic='accel/counts', qos=DEEP):
 
 
 def node_arguments(unit, *overrides):
-    """Make the arguments of a node with 20 reports a second."""
+    """Make the arguments of a node that publishes 20 diagnostics reports a second."""
     words = [f'calibration_file:={unit}', 'diagnostics_period:=0.05', *overrides]
     return [word for override in words for word in ('-p', override)]
 
 
 @contextmanager
 def bare_node(*overrides):
-    """Make a node of rclpy alone, with overridden parameters."""
+    """Make a plain rclpy node named thermo_comp, with overridden parameters."""
     context = Context()
     words = [word for override in overrides for word in ('-p', override)]
     rclpy.init(args=['--ros-args', *words], context=context)
@@ -208,7 +208,7 @@ class Samples:
 
 
 def status_with(peer, heard, text, send=lambda: None):
-    """Send until a report contains the text; return the status of the report."""
+    """Call `send` until the message of a report contains the text; return the status."""
     del heard[:]
     collected = []
 

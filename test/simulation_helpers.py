@@ -14,7 +14,7 @@ def of_part(truth, node):
 
 
 def ideal_regime(run, threshold_k_min=0.02):
-    """Return, for each time of the thermal grid, whether the board's temperature changes."""
+    """Return for each time of the thermal grid whether the board changes by `threshold_k_min`."""
     truth = run.truth
     rate = np.gradient(of_part(truth, truth.unit.board.node), truth.grid_s)
     return np.asarray(np.abs(rate) * 60.0 > threshold_k_min)
@@ -26,7 +26,7 @@ def noiseless(unit):
 
 def rippled(program, seed=1, amplitude=0.1, period=300.0):
     """Return a program with the ripple of a chamber's control: a sine with a random-walk phase."""
-    # A period has twelve points, and changes the phase by an sd of half a radian.
+    # The sine has twelve points per period; its phase changes by an sd of 0.5 rad per period.
     time = np.arange(0.0, program.duration_s, period / 12.0)
     rng = np.random.default_rng(seed)
     phase = rng.uniform(0.0, 2.0 * np.pi) + np.cumsum(

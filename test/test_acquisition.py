@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The progress of a test during recording: simulated positions are found in any blocks."""
+"""The progress of a test during recording: positions are found in blocks of any length."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
         stream.turn()
     test = Acquisition(6, 50.0)
     starts = [begin for block in stream.blocks(seconds) for begin in test.add(block)]
-    # A position begins within two cells of half a second after the turn.
+    # A position begins within two cells (0.5 s each) after the end of a turn.
     assert np.array(starts) * 1e-9 - START_NS * 1e-9 == pytest.approx(
         np.array(begins[1:]) + 0.5, abs=0.6
     )
@@ -115,7 +115,7 @@ def test_faults_of_a_position_are_reported(stream):
     stream.turn()
     stream.rest((0, -1, 0), 30.0)
     stream.turn()
-    # The unit is turned and put back in the same position.
+    # The unit is turned and put back in its previous position.
     stream.rest((0, -1, 0), 30.0)
     test = Acquisition(5, 50.0)
     for block in stream.blocks(0.5):

@@ -14,7 +14,7 @@ from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.options import REFUSALS
 from thermo_comp.simulation.campaign import positions
 
-# Refusals do not depend on the model; golovach is the fastest to fit.
+# Refusals do not depend on the model; the model golovach is the fastest to fit.
 COUNTS = FitOptions(gravity=GRAVITY, model='golovach')
 FORCE = replace(COUNTS, input='m/s^2')
 
@@ -55,7 +55,7 @@ def swapped(source, rest):
         ('units', as_it_is, COUNTS, 1),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # Bags of ten minutes do not determine which thermometer leads.
+        # The test replaces the thermometers of the bags by `swapped`, so that the board leads.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],
@@ -130,7 +130,7 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
     ('spoil', 'name', 'text'),
     [
         (late_by(120.0), 'unmeasured', '^2[0-9] % .* has no temperatures .* use the same clock'),
-        # WHY: the message asked about the same clock, although readings overlapped the samples.
+        # WHY: if readings dropped out in the middle, the message asked about the same clock.
         (
             dropping_out,
             'unmeasured',
@@ -151,8 +151,8 @@ def test_likely_mistakes_are_refused_by_name(rng, spoil, name, text):
 
 
 def test_an_axis_that_is_dead_in_one_position_is_named(rng):
-    # WHY: the y axis read exactly 3000 for hours, and its drift was attributed to all other
-    # positions.
+    # WHY: in one position the y axis read exactly 3000 for hours, and the missing drift of y was
+    # attributed to all other positions.
     rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads \S+ to the bit for 0\.\d+ h: the axis is'):

@@ -37,7 +37,7 @@ def arrays(rng):
 
 
 def test_importing_the_package_is_light_and_unknown_names_fail():
-    # The first import of a script must not load the libraries of a fit.
+    # `import thermo_comp` must load neither numpy nor the libraries of a fit.
     heavy = ('numpy', 'scipy', 'yaml', 'rosbags', 'mcap', 'matplotlib')
     assert loaded_after('import thermo_comp', *heavy) == []
     assert all(getattr(tc, name) is not None for name in tc.__all__)
@@ -66,7 +66,7 @@ def test_arrays_have_the_bits_of_a_replayed_bag(root, tmp_path, fitted):
 
 
 def test_no_reading_of_a_large_number_is_lost(rng):
-    # WHY: `correct` queued all readings at once, and the limited queue dropped some of them.
+    # WHY: `correct` queued all readings at once, and the limited queue dropped some readings.
     time_s = np.arange(5000) * 0.1
     readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
     counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (5000, 3)).round()
@@ -121,7 +121,7 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
     out = thermal_calibration().correct(arrays['time_s'], counts, board=board, case=arrays['case'])
-    # The first board reading left is at the sample of 1 s: 10 samples have no temperature.
+    # The first board reading that is no NaN is at 1 s, so 10 samples have no temperature.
     assert np.isnan(out.specific_force[:10]).all()
     assert np.isnan(out.covariance[:10]).all()
     assert np.isfinite(out.specific_force[10:]).all()
@@ -129,7 +129,7 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # Without a case thermometer the board decides the regime, not earlier than the case would.
+    # If the board alone decides the regime, `dynamic` begins no earlier than with a case.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 

@@ -32,7 +32,7 @@ def test_the_files_that_a_page_names_exist(page):
     text = (DOCS / page).read_text()
     for name in re.findall(r'[\w*/]+\.py\b', text):
         places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
-        # Match a path, or a file in the folder that was named before in the sentence.
+        # A page names a file by its path, or by its name if the sentence has named the folder.
         is_path = any(list(place.glob(name)) for place in places)
         assert is_path or any(path.name == name for path in SOURCES), name
 

@@ -123,7 +123,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
             assert len(results) == len(given)
             for (key, value), result in zip(given.items(), results, strict=True):
                 is_good = value not in (str(tmp_path / 'none'), 'x' * 300, -1.0, 'imu')
-                # With too many requests at once some may be refused, with a reason.
+                # The node may refuse some of too many requests at once, with a reason.
                 assert result.successful == is_good or 'too many' in result.reason, (key, value)
         config = node._config
         for key in ('calibration_file', 'frame_id', 'transition_time', 'diagnostics_period'):
@@ -208,7 +208,7 @@ def test_a_write_killed_at_any_line_leaves_the_old_or_the_new_calibration(tmp_pa
     lines = [line.split() for line in done.stdout.splitlines()]
     *killed, last = lines
     assert last == ['0', 'new']
-    # The writing was killed at every line, before and after the rename.
+    # The writing process was killed at every line, before and after the rename of its file.
     assert len(killed) > 30
     assert {code for code, _ in killed} == {str(signal.SIGKILL.value)}
     assert [name for name, _ in itertools.groupby(name for _, name in killed)] == ['old', 'new']

@@ -24,7 +24,7 @@ def test_sample_bags_are_small():
 @pytest.mark.parametrize('command', COMMANDS, ids=['fit', 'held_out'])
 def test_the_readme_s_commands_make_the_sample_bags(command, tmp_path, cli):
     arguments = shlex.split(command)[1:]
-    # Simulate the same content with a faster compression.
+    # Simulate the content of the sample bags with the fastest compression, level 1.
     arguments[arguments.index('--level') + 1] = '1'
     cli(*arguments, cwd=tmp_path)
     made = sorted((tmp_path / 'bags').rglob('*.mcap'))
@@ -49,7 +49,7 @@ def test_the_readme_s_commands_make_the_sample_bags(command, tmp_path, cli):
 
 
 def test_every_sample_of_the_sample_bags_can_be_corrected():
-    # Both temperatures come before the first sample, so that every sample is corrected.
+    # Readings of both thermometers precede the first sample, so every sample is corrected.
     for path in SHIPPED:
         block = read_recording(path).columns
         assert [temperature.after[0] for temperature in block.temperatures.values()] == [0, 0]

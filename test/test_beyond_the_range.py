@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections beyond the calibrated ranges: tangents, and a claimed sd that grows."""
+"""Corrections beyond calibrated ranges follow tangents, with a claimed sd that grows."""
 
 import math
 
@@ -60,10 +60,12 @@ def test_beyond_the_range_lagging_parts_do_not_lower_the_claimed_sd():
 
 
 def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
-    # The slope of the bias is 0.8 counts/K at the upper edge; a force of 10 m/s^2 cancels it.
+    # At the upper edge the bias slope is 0.8 counts/K, which the scale slope cancels at a force of
+    # 10 m/s^2.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # The RMS change of the slope over 30 K is 0.02 * 30 / sqrt(12), larger on a coarse grid.
+    # The bias slope over the range of 30 K has an sd of 0.02 * 30 / sqrt(12) counts/K, larger on a
+    # coarse grid.
     bends = 0.6 / math.sqrt(12.0)
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
@@ -96,14 +98,14 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span(
 
 
 def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
-    # Ranges: static 5 to 35 degC, dynamic 0 to 30 degC.
+    # The static set has a range of 5 to 35 degC, the dynamic set of 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
         dynamic=regime_set(axis_set(WAVY, delta=2.0), temperature_range_c=(0.0, 30.0)),
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside both ranges the sets differ as at the last common temperature.
+    # Outside the common range the sets differ by as much as at its nearest edge, 5 or 30 degC.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -113,8 +115,8 @@ def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
 
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # The correction must change by the regressors times the change of the parameters. The dynamic
-    # range ends before the static range when warming, after it when cooling.
+    # Bias and scale must change by the regressors times the change of the parameters. The dynamic
+    # range, 0 to 30 degC, ends before the static range at the top and after it at the bottom.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     one = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -174,13 +176,13 @@ def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # Without a lag the sd grows with the 19 half ranges by which the ramp is too fast.
+    # Without a lag the sd grows with the 19 half ranges by which the ramp exceeds its range.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 
 def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
     # WHY: a temperature difference of 10 K, after bags with 0.1 K, exceeds the range 100 times,
-    # and its square 10000 times. The claimed sd was that of 10000 half ranges: 0.1 g.
+    # and its square 10000 times. The claimed sd was 0.1 g, that of 10000 half ranges.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(Layout(correction.memory).width)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration value and its file: round trip to the bit, and every refusal with its key."""
+"""The calibration and its file: round trip to the bit, and every refusal with its key."""
 
 import contextlib
 import os
@@ -27,7 +27,7 @@ from thermo_comp.unit.functions import CubicSpline, Exponential
 from thermo_comp.unit.provenance import GroupEvidence
 
 REPOSITORY = Path(__file__).parents[1]
-# A bias must be within twice the full scale of 32767.
+# A bias must be within twice the full scale of 32767 counts.
 number = st.floats(-6.5e4, 6.5e4)
 # A scale function with coefficients up to 1e-6 stays far from 0 over 15 K.
 small = st.floats(-1e-6, 1e-6)
@@ -261,7 +261,7 @@ def test_paths_that_are_no_regular_file_are_refused(tmp_path):
             'static.x.bias_function',
             'must be finite over its range',
         ),
-        # 1 - 0.05 t is 0.15 at 37 degC, and negative along its tangent.
+        # The scale 1 - 0.05 t is 0.15 at 37 degC, and negative along its tangent beyond 37 degC.
         ('[1.0, 7.7e-05]', '[1.0, -0.05]', 'static.x.scale_function', 'must stay above 0.1'),
     ],
 )

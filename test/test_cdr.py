@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serialized messages in and out: always the bytes that rclpy would give."""
+"""Conversion of serialized messages: the bytes that rclpy would give."""
 
 import struct
 
@@ -26,7 +26,7 @@ def process(stamp_ns, x, y, z):
 
 
 def cdr(order, stamp, frame, values):
-    """Serialize a stamped message of float64 values after the CDR standard, as a second route."""
+    """Serialize a stamped message of float64 values by the CDR standard, without rclpy."""
     name = frame.encode() + b'\0'
     head = struct.pack(f'{order}iII', *stamp, len(name)) + name
     head += bytes(-len(head) % 8)
@@ -38,7 +38,7 @@ def pack(order, values):
 
 
 def doubles(data):
-    """Return the 37 values of a serialized Imu as bytes, as a NaN is not equal to itself."""
+    """Return each of the 37 values of a serialized Imu as bytes: a NaN does not equal itself."""
     body = data[-37 * 8 :]
     return [body[i : i + 8] for i in range(0, len(body), 8)]
 
@@ -69,7 +69,8 @@ def test_counts_become_an_imu(order, sec, nanosec, frame, values):
     fields = doubles(written[0])
     assert fields[25:28] == [z, x, y]
     assert b''.join(fields[28:]) == pack('<', covariance)
-    # Fields without a measurement are marked by -1 (REP 145), and the quaternion stays valid.
+    # A covariance that starts with -1 marks a field as not measured (REP 145); the quaternion is
+    # valid.
     assert b''.join(fields[:4]) == pack('<', [0.0, 0.0, 0.0, 1.0])
     assert fields[4] == fields[16] == pack('<', [-1.0])
     assert not any(b''.join(fields[5:16] + fields[17:25]))
@@ -103,7 +104,7 @@ def test_signalling_nan_survives_the_byte_swap():
 
 
 def test_frame_ids_of_several_lengths_in_one_stream():
-    # WHY: another length of frame_id, by a second driver, shifts all later bytes of a message.
+    # WHY: a second driver with a frame_id of another length shifts all later bytes of a message.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))
@@ -119,7 +120,8 @@ def test_messages_of_another_form_go_through_rclpy(kind, override):
     values = [float(k) for k in range(37 if kind is Imu else 3)]
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
-    # rclpy accepts bytes after the end of a message; the plain form has no such bytes.
+    # rclpy accepts bytes after the end of a message; the fast conversion leaves such a message to
+    # rclpy.
     (expected,), (written,) = convert(fast, good), convert(slow, good + bytes(8))
     assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
     assert deserialize_message(written, Imu) == deserialize_message(expected, Imu)
@@ -184,5 +186,5 @@ def test_a_temperature_is_read_as_rclpy_reads_it(data):
     else:
         stamp = message.header.stamp
         expected = (stamp.sec * 10**9 + stamp.nanosec, message.temperature)
-    # The values are compared as text, as NaN is among them.
+    # Temperatures are compared as text, because a NaN does not equal itself.
     assert repr(read_temperature(data)) == repr(expected)

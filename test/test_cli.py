@@ -148,9 +148,9 @@ class TestSimulate:
             ups.append(truth['up'])
             block = read_recording(path).columns
             measured = block.accel.mean(axis=0) / truth['scale_factor']
-            # Bias and drift of a MEMS unit are a few per cent of g at most.
+            # Bias and drift of a MEMS unit change a mean sample by a few per cent of g at most.
             np.testing.assert_allclose(measured / 9.80665, truth['up'], atol=0.05)
-            # Both temperatures come before the first sample, so that every sample is corrected.
+            # Readings of both thermometers precede the first sample, so every sample is corrected.
             assert [temperature.after[0] for temperature in block.temperatures.values()] == [0, 0]
         assert len({tuple(up) for up in ups}) == 3
 

@@ -21,7 +21,7 @@ def needs_ros():
 
 @pytest.mark.slow
 def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
-    # The fits of the sample bags are shared with the README's test, so the demo runs here.
+    # The demo runs in this process, so that its fits of the sample bags serve other tests, too.
     import demo
 
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
@@ -30,7 +30,7 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv('COLUMNS', '80')
     assert demo.main() == 0
     printed = capsys.readouterr().out
-    # Run as a program, the demo finds its imports.
+    # The demo finds its imports if it runs as a program.
     script = ROOT / 'benchmarks' / 'demo.py'
     assert '--bags' in ran(sys.executable, script, '--help', check=True).stdout
     assert 'messages in 15407, messages out 15407' in printed
@@ -51,7 +51,8 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # One set lacks the difference of the regimes, two sets lack lags; noise is below 10 ug.
+        # A correction by one set lacks the difference of regimes, a correction by two sets lacks
+        # lags; noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

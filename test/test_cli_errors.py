@@ -37,7 +37,7 @@ def unit(tmp_path):
 
 
 def refused(cli, code, message, *arguments):
-    """Run a command that must fail with exactly one line that contains this text."""
+    """Run a command that must fail with exactly one line that contains `message`."""
     finished = cli(*arguments, code=code)
     lines = finished.stderr.splitlines()
     assert len(lines) == 1, finished.stderr
@@ -162,14 +162,14 @@ class TestFits:
 
 class TestEvaluations:
     def test_a_calibration_that_is_not_valid_gives_exit_code_1(self, cli, tmp_path):
-        # The unit reads exactly g at 20 degC; the calibration wrongly adds 50 mg by a function.
+        # The unit reads exactly g at 20 degC; the calibration wrongly subtracts 50 mg by a delta.
         wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
         sets = regime_set(wrong, wrong, wrong)
         save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
         path = tmp_path / 'bag'
         stamps = START_NS + np.arange(3000) * 100_000_000
         level = np.tile([0.0, 0.0, 300.0 * 9.80665], (3000, 1))
-        # The output of a working sensor is never constant.
+        # Add noise to x and y, because the compensator drops constant samples as stuck.
         level[:, :2] += np.random.default_rng(2).integers(-1, 2, (3000, 2))
         with BagWriter(path) as writer:
             writer.write_temperature(TOPICS.board, stamps[::10], np.full(300, 20.0))

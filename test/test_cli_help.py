@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 
 def leaves(group, prefix=''):
-    """Return every command by the words that call it, including those of groups."""
+    """Return every command by the words that call the command, including commands of groups."""
     collected = {}
     for name, command in group.commands.items():
         inner = hasattr(command, 'commands')
@@ -31,7 +31,7 @@ EXAMPLES = [
 ]
 # Example that runs in a separate process; all other examples run in the process of the tests.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
-# One example of each command that prints figures and ends; others are tested elsewhere.
+# One example of each command that prints figures and ends; other files test other commands.
 WITH_JSON = {
     example.split()[1]: example
     for example in EXAMPLES
@@ -90,7 +90,7 @@ def test_help_cuts_no_name(name, cli, monkeypatch):
     text = cli(*name.split(), '--help').stdout
     assert '…' not in text
     assert max(map(len, text.splitlines())) <= 80
-    # The help printer takes square brackets as mark-up and drops their content.
+    # The help printer takes square brackets as mark-up and drops their content, which leaves ' .'.
     assert not re.search(r' \.\s', text)
     assert text == cli(*name.split(), '-h').stdout
     for parameter in COMMANDS[name].params:

@@ -65,7 +65,7 @@ def test_gradient_even_about_rest_is_even_about_rest():
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
-    # Gradients: the value at rest, -0.5 K, and values 1.5 K above and below.
+    # The three states have a gradient of -0.5 K, as at rest, and 1.5 K above and below -0.5 K.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -121,7 +121,7 @@ def test_each_value_of_a_column_by_hand():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert values == pytest.approx(expected)
-    # In a product t is limited to the calibrated temperatures; the lag itself is not limited.
+    # A column `product` limits t to the calibrated temperatures; a column `board` has no limit.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The compensator against hand calculations and Monte Carlo; samples equal blocks of any cut."""
+"""The compensator against hand calculations; samples one by one give the bits of blocks."""
 
 import math
 import random
@@ -29,12 +29,12 @@ from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.correction import Correction
 
 UNIQUE = [0, 1, 2, 4, 5, 8]
-#: Variance of one message: density^2 / cycle, plus the rounding with a carried remainder.
+#: Variance of a sample [(m/s^2)^2]: density^2 / cycle, plus rounding with a carried remainder.
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Feed steady readings; a `flicker` [K] keeps them from counting as a stuck thermometer."""
+    """Feed steady readings; a `flicker` [K] keeps the thermometer from counting as stuck."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)
@@ -63,7 +63,8 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # Counts of +g and -g: offset = sum / 2, scale = difference / 2, which Eq. (3), (4) exchange.
+    # Counts at +g and -g: offset = sum / 2, scale = difference / 2. Eq. (3) and (4) exchange sum
+    # and difference.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -91,7 +92,7 @@ def test_every_term_of_the_correction_by_hand():
     assert (x, y, z) == pytest.approx((a, 1e-3 * a + b, 2e-3 * a - 3e-3 * b + c), abs=1e-12)
 
 
-#: One calibration for all examples, as it does not change.
+#: All examples use one calibration, which no example changes.
 RICH = rich_calibration()
 
 #: Values that a converter never gives, its limits, and zero; most samples are between the limits.
@@ -122,7 +123,7 @@ def event_list(seed):
     return events
 
 
-#: Messages are drawn by seed: drawing each with hypothesis takes as long as the test.
+#: Hypothesis draws only the seed of a list: drawing each message takes as long as the test.
 event_lists = st.integers(0, 2**64 - 1).map(event_list)
 
 
@@ -135,7 +136,8 @@ def at_seconds(*events):
     ]
 
 
-# An applied reading, or a reading a day later, shows that waiting readings are of another clock.
+# In the examples an applied reading, or a reading a day later, shows that waiting readings are of
+# another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -179,7 +181,7 @@ def test_an_unknown_regime_widens_the_covariance():
     early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 1.0)
     warm(compensator, until_s=1500, start_s=1)
     late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0)
-    # The sets differ by 3 counts = 0.01 m/s^2 on x, and not on y.
+    # The static and the dynamic set differ by 3 counts = 0.01 m/s^2 on x, and are equal on y.
     assert early[3] == pytest.approx(NOISE + 0.01**2, rel=1e-6)
     assert early[6] == pytest.approx(NOISE, rel=1e-6)
     assert late[3] == pytest.approx(NOISE, rel=1e-6)
@@ -205,13 +207,13 @@ def test_nothing_is_published_before_a_temperature_or_long_after_the_last():
     'run', [lambda *given: stream(*given)[1], lambda *given: batch(*given).index.tolist()]
 )
 def test_a_stamp_that_leaps_ahead_needs_a_second_stamp(run):
-    # WHY: a single stamp 20 s ahead made all later samples late and reset the memory.
+    # WHY: a single stamp 20 s ahead made all later samples count as late and reset the memory.
     leap, step = 20 * SECOND_NS, SECOND_NS // 100
     usual = np.arange(1, 6) * step
     for stamps, kept in (
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),  # a gap, confirmed twice
-        # Cases: two separate damaged stamps, and two damaged stamps in falling order.
+        # The next cases are two separate damaged stamps, and two damaged stamps in falling order.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -250,7 +252,7 @@ def test_readings_from_a_long_time_without_samples_are_all_applied(n_before, ahe
         for k in range(4, 20 * 120)
         for name in ('board', 'case')
     ]
-    # Some readings have later stamps than the sample after them.
+    # With `ahead_s` = 2 some readings have later stamps than the first sample after the readings.
     after_ns = (120 - ahead_s) * SECOND_NS
     last = [('accel', after_ns + k * SECOND_NS // 100, (1.0, 2.0 + k, 2930.0)) for k in range(5)]
     block, live = (Compensator(replace(rich_calibration(), gyroscope=None)) for _ in range(2))
@@ -276,7 +278,7 @@ def test_flush_lets_the_regime_go_on_without_samples():
 
 
 def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
-    # The sets differ by 0.025 counts = 8.5 ug, at any temperature.
+    # The static and the dynamic set differ by 0.025 counts = 8.5 ug at any temperature.
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
     config = CompensatorConfig(
         transition_time_s=100.0, stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0

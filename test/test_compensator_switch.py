@@ -12,7 +12,7 @@ from thermo_comp.unit.calibration import Axes, AxisReference
 
 
 def test_a_switch_of_sets_makes_no_step():
-    # Sets that differ by 5 counts = 1.7 mg are blended over 300 s: 0.28 ug per sample at 20 Hz.
+    # Sets that differ by 5 counts = 1.7 mg blend over 300 s: 0.28 ug per sample at 20 Hz.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
     compensator = Compensator(
         unit, CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
@@ -33,7 +33,7 @@ def test_a_switch_of_sets_makes_no_step():
 
 @pytest.mark.parametrize(
     ('delta', 'given_s', 'expected_s'),
-    # A difference of 0.3 counts is 1e-3 m/s^2 = 102 ug, which takes 102 s at 1 ug per second.
+    # Sets that differ by 0.3 counts = 1e-3 m/s^2 = 102 ug take 102 s to blend at 1 ug/s.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
 def test_a_switch_of_sets_that_differ_much_takes_longer(delta, given_s, expected_s):

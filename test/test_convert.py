@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A converted table accounts for every row, and converts back unchanged."""
+"""A converted table accounts for every row, and its bag gives the values of the table."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def table(path, n=400, scale=1.0):
-    """Write a log at rest with slow temperatures that are held between their readings."""
+    """Write a log of a unit at rest; temperature cells repeat a reading until the next."""
     rng = np.random.default_rng(1)
     columns = {
         'ms': 1000 + 10 * np.arange(n),
@@ -77,7 +77,7 @@ def test_a_table_is_unchanged_by_a_round_trip_through_a_bag(tmp_path):
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
     assert len(board.celsius) == report.messages['board'] == 10
-    # A reading precedes the sample of the same stamp, so that the node applies it.
+    # A reading precedes the sample with its stamp, so that the node applies the reading to it.
     assert case.after.tolist() == [0, 100, 200, 300]
     assert (report.rows, report.messages['accel']) == (400, 400)
     assert report.rate_hz == pytest.approx(100.0)
@@ -93,7 +93,7 @@ def test_counts_become_an_imu_with_a_sensitivity(tmp_path):
     )
     block = read_recording(tmp_path / 'bag').columns
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
-    # A stated sensitivity is compared with |a| at rest, like a stated unit.
+    # A stated sensitivity is compared with |a| at rest, as a stated unit is.
     wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
     with pytest.raises(RecordingError, match=r'16384 per g are stated$'):
         write_log(wrong, tmp_path / 'other')
@@ -123,7 +123,8 @@ def test_an_offset_of_raw_words_is_subtracted(tmp_path):
 
 @pytest.mark.parametrize('unit', ['ms', 'us'])
 def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
-    # WHY: Arduino's micros() begins again after 71.6 min; a fit read only a part of such a log.
+    # WHY: Arduino's micros() begins again at 0 after 71.6 min, and a fit read only a part of a
+    # longer log.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     ticks = [(2**32 - 2000 + 10 * k) % 2**32 for k in range(400)]
@@ -143,7 +144,7 @@ def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
 
 
 def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
-    # WHY: all readings after the restart stood before all samples after it.
+    # WHY: in the bag all readings after a restart of the clock stood before all samples after it.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in range(201, 401):
@@ -152,7 +153,7 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
     path.write_text('\n'.join(lines))
     write_log(table_log(path, column_map()), tmp_path / 'bag')
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']
-    # The temperature changes once in 40 rows. A reading precedes the sample of its row.
+    # The board temperature changes once in 40 rows. A reading precedes the sample of its row.
     assert board.after.tolist() == list(range(0, 400, 40))
 
 
@@ -189,10 +190,10 @@ def test_every_odd_row_is_accounted_for(tmp_path):
     assert (report.findings['backwards'].count, report.findings['backwards'].lines) == (1, (43,))
     assert (report.findings['repeated'].count, report.findings['repeated'].lines) == (1, (52,))
     assert len(block) == report.messages['accel'] == 397
-    # A clipped row and rows in wrong order stay in the bag, because the node rejects them.
+    # Clipped rows and rows in wrong order stay in the bag, because the node rejects such samples.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
-    # Log times keep the order of the file, in which some stamps fall.
+    # Log times of a bag rise in the order of the rows, even where stamps fall.
     assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 
@@ -201,7 +202,7 @@ def test_stamps_of_a_fixed_rate_do_not_accumulate_rounding(tmp_path):
     write_log(table_log(path, column_map(stamp={'rate_hz': 3.0})), tmp_path / 'bag')
     stamps = read_recording(tmp_path / 'bag').columns.accel_stamp_ns
     assert stamps[0] == 10**9
-    # Each stamp is the integer nearest to a multiple of 1/3 s, not of 0.333333333 s.
+    # Each stamp is the nanosecond nearest to a multiple of 1/3 s, not of 0.333333333 s.
     assert stamps[-1] == 10**9 + round(299 * 1e9 / 3.0)
 
 
@@ -228,7 +229,7 @@ def test_temperatures_of_any_unit_become_degc(tmp_path, unit, celsius):
     board = {'column': 'board', 'unit': unit, **raw}
     write_log(table_log(path, column_map(board=board)), tmp_path / 'bag')
     first = float(read_recording(tmp_path / 'bag').columns.temperatures['board'].celsius[0])
-    # Expected: 300 K, 212 degF (boiling water), and 160 steps of 1/16 K above 20 degC.
+    # Expected in degC: 300 K, 212 degF (boiling water), and 160 counts of 1/16 K above 20 degC.
     assert first == pytest.approx({'K': 26.85, 'degF': 100.0, 'raw': 30.0, 'degC': 30.0}[unit])
 
 
@@ -366,7 +367,7 @@ class TestFreezer:
         report = write_log(table_log(path, columns), tmp_path / 'bag')
         assert report.rows == report.messages['accel'] == 24514
         assert report.findings['clipped'].count == 7
-        # The unit was moved before 49 s and after 1945 s of a log that starts at 1.5 s.
+        # The log starts at 1.5 s; the unit was moved before 49 s and after 1945 s.
         first, last = report.stillness.moving_ns[0], report.stillness.moving_ns[-1]
         assert first[0] == report.log.stamp_ns[0]
         assert first[1] * 1e-9 == pytest.approx(49.0, abs=3.0)

@@ -24,7 +24,7 @@ NAMES = {'/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE}
 
 
 def messages(ros, rng, scale, names):
-    """Yield (topic, type, log_ns, message) of a driver at rest that publishes `scale` per g."""
+    """Yield (topic, type, log_ns, message) of a sensor at rest that reads `scale` at 1 g."""
     types = typestore(ros).types
     vector = types['geometry_msgs/msg/Vector3']
 
@@ -68,7 +68,7 @@ def test_topics_of_any_name_become_the_usual_topics(tmp_path, rng, ros):
     )
     np.testing.assert_allclose(recording.columns.accel.mean(axis=0), (0.0, 0.1 * G, G), atol=0.02)
     np.testing.assert_array_equal(recording.columns.imu.angular_velocity[0], (0.01, 0.0, 0.5))
-    # The thermometer in the namespace of the Imu is the board's.
+    # The thermometer in the namespace of the Imu is the board thermometer.
     np.testing.assert_array_equal(
         recording.columns.temperatures['board'].celsius, len('/mpu/die') + np.arange(8)
     )
@@ -101,7 +101,7 @@ def present(imu, temperature=(), pressure=()):
         ((), (), None, None),
         (('/t',), (), '/t', None),
         (('/imu/t', '/air'), (), '/imu/t', '/air'),
-        # The thermometer beside the barometer is the case's, even without a board thermometer.
+        # A thermometer beside a barometer is the case thermometer, even if there is no other.
         (('/baro/t',), ('/baro/p',), None, '/baro/t'),
         (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
         (('/robot/imu/t', '/robot/baro/t'), ('/robot/baro/p',), '/robot/imu/t', '/robot/baro/t'),
@@ -172,7 +172,7 @@ def test_the_magnitude_at_rest_tells_the_unit(magnitude, unit):
 def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
-    # Any magnitude at rest above that of mg may be counts of a precise converter.
+    # Counts are a possible unit of any |a| at rest of 50 and more: converters have many bits.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
     # A sensor that never rests cannot contradict the stated unit.
@@ -195,14 +195,14 @@ def test_movement_is_found_in_any_unit(rng, scale):
     assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in stillness.moving_ns] == [
         (pytest.approx(20.01), pytest.approx(30.01))
     ]
-    # The mean over 2 s of noise of 0.1 % has an sd of 0.1 % / sqrt(200).
+    # Noise of 0.1 % at 100 Hz has an sd of 0.1 % / sqrt(200) in a mean over 2 s.
     assert stillness.magnitude == pytest.approx(scale, rel=3e-4)
     assert stillness.noise == pytest.approx(1e-3 * scale, rel=0.1)
     assert stillness.still_s == pytest.approx(40.0, abs=0.5)
 
 
 def test_a_sensor_that_shows_no_noise_is_not_moving(rng):
-    # A value rounded to steps larger than the noise changes by a step from time to time.
+    # A value rounded to steps larger than the noise changes by a step from time to time, at rest.
     accel = np.tile([0.0, 0.0, 1.0], (1000, 1))
     accel[::97, 0] = 0.1
     stillness = find_stillness(np.arange(1000) * 10_000_000, accel)

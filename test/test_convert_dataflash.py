@@ -86,11 +86,11 @@ def test_logs_of_the_new_format_give_each_instance(tmp_path, rng, imu, baro):
     np.testing.assert_array_equal(bag.accel, force[imu])
     # The log stores the rate 0.3 as float32, which rounds it by up to 1e-7.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
-    # The chip's temperature is constant for ten samples; only its changes are messages.
+    # The chip temperature is constant for ten samples; only changes of a temperature are messages.
     np.testing.assert_array_equal(
         bag.temperatures['board'].celsius, 30.0 + imu + 0.25 * np.arange(N // 10)
     )
-    # The barometer's temperature is stored in hundredths of a degree.
+    # A log has the temperature of the barometer in hundredths of a degree.
     hundredths = (2000 + np.arange(0, N, 10)) if baro == 0 else (1500 - np.arange(0, N, 10))
     np.testing.assert_allclose(bag.temperatures['case'].celsius, hundredths / 100, rtol=1e-15)
 
@@ -208,7 +208,7 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
     log.write('IMU', 1000, 0, *np.zeros(6), 0, 0, 30.0, 1, 1, 1000, 1000)
     body = bytearray(log.body)
     if 'longer' in message:
-        # Position of the length in the second FMT message; the first FMT message has 89 bytes.
+        # Reduce the length (byte 4) in the second FMT message; the first FMT message has 89 bytes.
         body[89 + 4] -= 10
     path = tmp_path / 'damaged.BIN'
     path.write_bytes(body)
@@ -220,7 +220,7 @@ def test_absurd_stamps_are_no_stamps(tmp_path, rng):
     path = tmp_path / 'jump.BIN'
     write_new(path, rng)
     body = bytearray(path.read_bytes())
-    # The time of the first IMU message gets all bits set, which is half a million years.
+    # All bits of the time of the first IMU message are set, which is half a million years.
     at = body.index(b'\xa3\x95\x81') + 3
     body[at : at + 8] = b'\xff' * 8
     path.write_bytes(body)

@@ -189,9 +189,9 @@ def slow_table(path, heading, times, first=20.0, last=45.0):
         # WHY: a test of two hours at 1 Hz was read as 8 s at 1 kHz, even with stamps since 1970.
         *(('s', [since + step * k for k in range(4000)], 45.0)
           for since in (0, 1_774_747_800) for step in (1, 5)),
-        # WHY: a table in which one row in seven was written twice was refused as not rising.
+        # WHY: a table with one row in seven written twice was refused for times that do not rise.
         ('s', [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)], 45.0),
-        # Without a temperature, in one attitude, the size of the stamps alone shows their unit.
+        # At constant temperature in one attitude, only the size of the stamps shows their unit.
         *((unit, [START_NS // size + step * k for k in range(900)], 20.0)
           for unit, size, step in (('s', 10**9, 2), ('ms', 10**6, 5000), ('us', 10**9, 10_000))),
     ],
@@ -208,7 +208,7 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
         ('time', [k // 10 for k in range(900)], "'time' has the time of the row before in 90%"),
         ('date', [46110 + k / 864000 for k in range(900)], 'no plausible interval of samples'),
         ('time', list(range(900, 0, -1)), "'time' is not a rising time"),
-        # WHY: for other dates the message was that no row holds numbers in the stamp column.
+        # WHY: dates not of ISO 8601 gave the message that no row has numbers in the stamp column.
         *(('date', [cell] * 900, f"column 'date' is a date of ISO 8601.*'{cell}'")
           for cell in ('29/03/2026 01:30:00', '01:30:00.5')),
         # WHY: the message `column 'temp' is given twice` suggested a wrong command line.
@@ -216,14 +216,14 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
     ],
 )  # fmt: skip
 def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
-    # WHY: minutes were taken for seconds, and other times were refused with a wrong reason.
+    # WHY: times in minutes were read as seconds; times that do not rise got a wrong message.
     path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
         table_log(path, guess_columns(path))
 
 
 def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
-    # WHY: with blank last cells in most rows the headings had a cell too many.
+    # WHY: if the last cell of most rows was blank, the headings counted as a cell too many.
     path = slow_table(tmp_path / 'log.csv', 'time', [k / 100 for k in range(N)], last=31.99)
     head, *rows = path.read_text().splitlines()
     rows = [row if k % 100 == 0 else f'{row.rpartition(",")[0]},' for k, row in enumerate(rows)]
@@ -264,7 +264,7 @@ def test_a_temperature_and_a_force_of_other_units_are_refused(tmp_path):
 
 
 def test_headings_without_a_time_take_a_rate(tmp_path, rng):
-    # WHY: --rate-hz only worked for tables without headings, and was ignored with them.
+    # WHY: --rate-hz worked only for tables without headings, and tables with headings ignored it.
     path, rows = tmp_path / 'log.csv', UP + 0.002 * rng.standard_normal(UP.shape)
     path.write_text('\n'.join(['ax,ay,az', *(f'{x:.5f},{y:.5f},{z:.5f}' for x, y, z in rows)]))
     with pytest.raises(RecordingError, match="name no time: 'ax', 'ay', 'az'; give --rate-hz, or"):
@@ -308,7 +308,7 @@ def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermom
 
 @pytest.mark.parametrize(('last', 'unit'), [(3, None), (1200, None), (40, 'degC')])
 def test_whole_numbers_of_a_board_may_be_its_temperature(tmp_path, last, unit):
-    # Values of `board`: the number of a board, a count of rows, whole degrees.
+    # The column `board` holds the number of a board, a count of rows, or whole degrees.
     rows = [f'{k / 10},0,6,8,{3 + k * (last - 3) // 1199}' for k in range(1200)]
     (tmp_path / 'log.csv').write_text('\n'.join(['time,ax,ay,az,board', *rows]))
     board = guess_columns(tmp_path / 'log.csv').board
@@ -337,7 +337,7 @@ def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
 
 
 def write(path, rng, unit, **columns):
-    """Write a table of rests with forces in `unit` per g, and times and rates if given."""
+    """Write a table of rests with `unit` per g, and with times and angular rates if given."""
     accel = unit * (UP + 0.002 * rng.standard_normal(UP.shape))
     parts = [columns['time'][:, None]] if 'time' in columns else []
     parts += [accel, columns['rate']] if 'rate' in columns else [accel]
@@ -372,7 +372,8 @@ def test_the_unit_of_times_gives_a_plausible_sample_rate(tmp_path, rng, step, un
 
 
 def test_seconds_and_milliseconds_differ_in_how_fast_a_hand_turns(tmp_path, rng):
-    # WHY: samples at 1 Hz were taken for 1 kHz. A turn by 180 deg takes 1 s, then 0.8 s.
+    # WHY: samples at 1 Hz were taken for 1 kHz. A turn by 180 deg takes one sample, 1 s, or 800
+    # samples, 0.8 s.
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):
@@ -385,7 +386,7 @@ def test_seconds_and_milliseconds_differ_in_how_fast_a_hand_turns(tmp_path, rng)
 
 @pytest.mark.parametrize(('rest_s', 'gap_s'), [(30, 0), (30, 670), (60, 1), (45, 3)])
 def test_times_of_short_rests_at_1_hz_are_seconds(tmp_path, rng, rest_s, gap_s):
-    # WHY: cells of 30 and more samples contained two rests, whose mean is shorter than gravity.
+    # WHY: cells of 30 and more samples contained two rests, and |f| of their mean is below g.
     ups = positions(18, 1)
     accel = np.repeat(ups, rest_s, axis=0) + 2e-5 * rng.standard_normal((18 * rest_s, 3))
     times = (np.arange(18)[:, None] * (rest_s + gap_s) + np.arange(rest_s)).ravel()
@@ -422,7 +423,7 @@ def test_unidentified_columns_are_refused(tmp_path, rng):
     for content, reason in (
         ('t,a,b,c\n' + '0,0,0,9.8\n' * 100, 'its headings name no accelerometer'),
         ('a,b,c\n1,2,3\n2,3,4\n', "name no accelerometer: 'a', 'b', 'c'; give a column map"),
-        # WHY: cells were divided at the decimal commas, and the message named no accelerometer.
+        # WHY: decimal commas divided cells; the message was `its headings name no accelerometer`.
         (
             't;ax;ay;az\n' + '0,01;0,0;0,1;9,8\n' * 100,
             'has decimal commas, as in 0,01: use points',

@@ -47,14 +47,14 @@ def test_every_layout_of_a_table_gives_equal_values(tmp_path, delimiter, newline
 def test_headings_of_a_table_are_optional(tmp_path):
     path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
     assert read_text(path, [2], ROWS_ALONE).values[2].tolist() == [3.0, 6.0]
-    # A first line of words is the heading, unless the user says otherwise.
+    # The words 'nan' and 'inf' are numbers, unless the user says that the first line is a heading.
     path = write(tmp_path / 'words.txt', 'nan inf\n1 2\n')
     assert read_text(path, [0], ROWS_ALONE, Format(header=True)).values[0].tolist() == [1.0]
 
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
 def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
-    # A row of units counts as a row without numbers; the last row is incomplete.
+    # A row of units counts as a row of NaN; the incomplete last row is counted and left out.
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
     text = '\n'.join([*head, *(row.replace('|', separator) for row in rows)])
@@ -85,7 +85,7 @@ def test_line_numbers_are_those_of_an_editor(tmp_path):
 
 
 def test_stamps_of_a_table_are_exact():
-    # A float64 of nanoseconds since 1970 has steps of 256 ns.
+    # Stamps are not read as float64, which has steps of 256 ns for nanoseconds since 1970.
     cells = ['1767225600.123456789', '1767225600123456789e-9', ' +2 ', '1.5e-9']
     exact = [1767225600123456789, 1767225600123456789, 2 * 10**9, 2]
     assert [exact_ns(cell, 's') for cell in cells] == exact
@@ -112,7 +112,7 @@ def test_layout_prefers_the_delimiter_that_splits_all_lines_alike():
         ('1,2\n3,4\n', 'a', "no column 'a': the table has no headings"),
         ('1,2\n3,4\n', 2, 'no column 2: the table has 2, 0 to 1'),
         ('1,2\n3,4\n', -1, 'no column -1: the table has 2, 0 to 1'),
-        # WHY: only rows with whole numbers were once kept of a table with decimal commas.
+        # WHY: rows without whole numbers were left out of a table with decimal commas.
         ('a;b\n1,5;2\n3;4\n5;6\n', 'a', "column 'a' has decimal commas, as in 1,5"),
         ('a,b\n\0\0\n', 'a', 'it holds zero bytes'),
     ],

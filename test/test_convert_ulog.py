@@ -90,7 +90,7 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # The board temperature is the chip's at every sample, the case temperature the barometer's.
+    # The chip gives the board temperature at every sample, the barometer the case temperature.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -100,7 +100,7 @@ def test_the_gyroscope_of_an_instance_is_in_its_bag(flight, tmp_path):
     path, _ = flight
     write_log(read_autopilot(path, imu=0), tmp_path / 'bag.mcap')
     rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
-    # Gyroscope and accelerometer have the same stamps here; the log rounds values to float32.
+    # In this log gyroscope and accelerometer have equal stamps; values are rounded to float32.
     np.testing.assert_allclose(rate[:, 0], 0.001 * np.arange(N), atol=1e-6)
     assert read_autopilot(path, imu=1).gyro is None
 
@@ -180,7 +180,7 @@ def write_combined(path, rng, later=None, **parameters):
         now = 7_000_000 + k * STEP_US
         rows = [(-200, vector)]
         if k == 3:
-            # One message has no accelerometer sample, the other an earlier sample.
+            # The first further message has no accelerometer sample, the second an old sample.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
         for j, (relative, (x, y, z)) in enumerate(rows):
             at = now + (50 if j == 2 else 0)
@@ -209,7 +209,7 @@ def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
-    # The only thermometer in the log, the barometer's, must become the board's.
+    # The only thermometer in the log, in the barometer, must become the board thermometer.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
@@ -231,7 +231,8 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # The change of a parameter has the stamp of the previous message: one sample may be wrong.
+    # A change of a parameter gets the stamp of the previous message, so the sample at a change may
+    # be left out or kept wrongly.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])

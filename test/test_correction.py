@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections with all columns: blocks give the same bits, and errors scatter as claimed."""
+"""Corrections with all columns: blocks have the bits of a stream; errors scatter as claimed."""
 
 import math
 from dataclasses import replace
@@ -99,7 +99,7 @@ def assert_same(blocks, rows):
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    # The run leaves 5 .. 35 degC, and -2.5 .. 42.5 degC, where the tangents end.
+    # The run leaves the range 5 .. 35 degC, and leaves -2.5 .. 42.5 degC, where tangents end.
     events = run_of(rng, seconds=50, swing_k=90.0)
     rows = stream(Compensator(unit, UNCHECKED), events)[0]
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
@@ -133,7 +133,7 @@ def states_of(unit, rng, n=5):
 
 @pytest.mark.slow
 def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_posterior(rng):
-    # The corrections of random, correlated calibrations scatter as SlowUncertainty states.
+    # Corrections with randomly drawn parameters must scatter as `SlowUncertainty` claims.
     unit = replace(full_bank(rng), noise_density_m_s2_sqrt_hz=(1e-4,) * 3)
     layout = parameter_layout(unit)
     n = layout.n_parameters
@@ -183,7 +183,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
             # A covariance from n draws has an sd of sqrt(2 / n) times both sds; tolerance: 4 sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
-            # The variances agree along all directions, so the axes have the right correlations.
+            # Claimed and drawn variances agree in all directions: the correlations are right.
             root = np.linalg.inv(np.linalg.cholesky(expected))
             assert np.abs(root @ claimed @ root.T - np.eye(3)).max() < 0.5
 
@@ -205,7 +205,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     wide = replace(
         unit, response=tuple(replace(term, range=(-4000.0, 4000.0)) for term in unit.response)
     )
-    # Squares of lags are nonlinear: the spread is tested for small changes.
+    # Squares of lags are nonlinear, so initial lag states are drawn with 0.05 of their sd.
     small = 0.05
     moved[places] += small * (draws * np.array(shares)).T
     values = Correction(wide).bias_scale(moved)
@@ -218,7 +218,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
 
 
 def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
-    # Only the start of a lag of 60 s is uncertain: the sd falls as exp(-t/60).
+    # Only the initial state of a lag of 60 s is uncertain: its sd falls as exp(-t / 60 s).
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     compensator = Compensator(unit, UNCHECKED)
     noise = compensator.thermal.correction.noise[0]
@@ -237,7 +237,7 @@ def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within 10 s only the variance by the thermometer changes: 30 counts/K times some mK.
+        # Within 10 s only the thermometer changes the variance: 30 counts/K times 5 mK.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0

@@ -60,7 +60,7 @@ def test_without_positions_the_covariance_is_that_of_the_prior():
 
 def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
-    # Bias and scale of x are half the difference and half the sum of two readings.
+    # Bias and scale error of x are half the difference and half the sum of two readings of |f|.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
     np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
 
@@ -71,7 +71,7 @@ def test_the_covariance_is_the_scatter_of_estimates(rng):
     truth = rng.standard_normal((n, 9)) * PRIOR_SD
     columns = norm_columns(up)
     seen = truth @ columns.T + SD * rng.standard_normal((n, 12))
-    # The estimate is the conditional mean of a Gaussian, from its joint covariance.
+    # The estimate is the mean of the constants given the norms, from their joint covariance.
     joint = columns * PRIOR_SD**2 @ columns.T + SD**2 * np.eye(12)
     estimate = seen @ np.linalg.solve(joint, columns * PRIOR_SD**2)
     # 4000 trials determine a standard deviation to 1.1 %.
@@ -98,7 +98,7 @@ def test_the_proposed_directions_make_a_good_test():
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
         up = np.vstack([up, next_direction(covariance, SD, up)])
-    # Faces are proposed first, +z before all others, then directions for the misalignment.
+    # Faces are proposed first, +z before all other faces, then directions for the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))
@@ -108,7 +108,7 @@ def test_the_proposed_directions_make_a_good_test():
 
 
 def test_the_largest_angle_to_the_nearest_direction():
-    # The corners of a cube are equally far from its faces.
+    # The directions farthest from all six faces are the corners of a cube.
     up, angle = farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))
     assert angle == pytest.approx(np.degrees(np.arccos(1.0 / np.sqrt(3.0))))

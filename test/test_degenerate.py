@@ -44,5 +44,5 @@ def test_the_cause_of_a_refusal_is_named_in_the_users_words(name, text, tmp_path
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
     (line,) = [text for text in failed.stderr.splitlines() if ': error: ' in text]
     assert text in line
-    # If the input's topic was chosen by its type, the message names the topic.
+    # If the command chose a topic by its message type, the message names the topic.
     assert 'bag.mcap (/imu/data)' in line or name in {'stamps all zero', 'axes that lean'}

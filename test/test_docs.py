@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# Commands that other files test: a bag that plays for minutes, a recording of 18 positions.
+# Commands that other test files run: a bag that plays for minutes, a record of 18 positions.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',
     'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',
@@ -122,6 +122,6 @@ def test_messages_on_the_pages_are_those_of_the_source():
     # Join adjacent string literals, which form one message.
     plain = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
-        # Numbers and the text after them are only known at run time.
+        # Numbers and '...' stand for values at run time: compare the longest text between.
         words = max(re.split(r'\d+(?:\.\d+)?|\.\.\.', sentence), key=len).strip(' ,;')
         assert words in plain, sentence

@@ -21,7 +21,7 @@ from thermo_comp.unit.gravity import MICRO_G
 
 
 def walked(rate, bound, axes=1, mean=0.0):
-    """Forecast a random walk from a known point; the variance grows by `rate` on each axis."""
+    """Forecast a random walk from `mean`; the variance grows by `rate` per day on each axis."""
     start = np.full(axes, mean)
     return passage(start, np.zeros((axes, axes)), np.sqrt(rate) * np.eye(axes), bound)
 
@@ -51,13 +51,13 @@ def test_the_first_passage_follows_the_reflection_principle():
 @pytest.mark.slow
 def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
     # WHY: signed errors of opposite attitudes had cancelled: forecasts were 3 to 5 times too long.
-    # WHAT: the times at which walks of known sd leave the tolerance lie in the printed interval.
+    # WHAT: the days when random walks leave the tolerance lie in the printed interval.
     shares, ratios = [], []
     for kind in ('fixed', 'up and down', 'faces', 'carried'):
         for rows in field_watch.forecasts(kind, 3, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The printed interval is 80 %; the estimate from 24 rows has an error of 6 %.
+    # The printed interval has a probability of 80 %, which 24 rows estimate with an error of 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
     # The median time of a unit is uncertain by a factor of 1.5, the mean of eight by 1.3.
     assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6
@@ -75,7 +75,7 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
 
     def error(day):
         size = 1.5 if 20.0 <= day < 34.0 else 0.6
-        # Each component has the size of the RMS error along any direction.
+        # Equal components of size s give an RMS error of s over all directions of gravity.
         return np.full(3, limit * (20.0 if 12.0 <= day < 13.0 else size))
 
     series = series_of(rests(unit, attitudes, error, 40, turn_on=5.0 * MICRO_G), unit)
@@ -87,7 +87,7 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
             (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
         )
         assert ('outside its claim since' in str(result)) == (since is not None)
-        # A day in an attitude along the error has 1.04 times the limit.
+        # A day in an attitude along the error has 0.6 * sqrt(3) = 1.04 times the limit.
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.back in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.back is not None)

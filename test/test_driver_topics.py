@@ -79,7 +79,7 @@ def test_the_node_finds_the_type_while_it_runs(peer, unit, is_file):
         peer.wait_for(values(unpublished=0), 'a report')
         samples.publish(sample(START_NS))
         peer.wait_for(values(**{'board temperature [degC]': 25.0}), 'the board')
-        # Without a stamp a reading applies from the previous sample on.
+        # A reading without a stamp applies from the previous sample on.
         case.publish(Float64(data=23.0))
         samples.publish(sample(START_NS + SECOND_NS))
         samples.publish(sample(START_NS + 2 * SECOND_NS))
@@ -151,7 +151,7 @@ def test_record_writes_fields_of_messages_as_temperatures(peer):
             for role, own in news[0].raw.items() if news else ():
                 outputs.setdefault(role, []).extend(own)
     case, board = (deserialize_message(outputs[one][0], Temperature) for one in ('case', 'board'))
-    # A reading without a stamp gets that of the previous sample.
+    # A reading without a stamp gets the stamp of the previous sample.
     assert (case.temperature, case.header.stamp.sec) == (23.0, START_NS // SECOND_NS)
     assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)
 

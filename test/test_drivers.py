@@ -33,7 +33,7 @@ OWN = {
     'float32 mean_temp\n',
     'microstrain_inertial_msgs/msg/MipHeader': 'std_msgs/Header header\nuint8 event_source\n',
 }
-#: Topics of each driver as in docs/drivers.md, and further topics of a bag of the driver.
+#: Topics of each driver and their types, as in docs/drivers.md, with further topics of a bag.
 LAYOUTS = {
     'microstrain': {'/imu/data': IMU, '/mip/sensor/temperature_statistics': MIP},
     'xsens': {
@@ -52,7 +52,7 @@ LAYOUTS = {
     'bno055': {'/bno055/imu_raw': IMU, '/bno055/imu': IMU, '/bno055/temp': TEMPERATURE},
     'witmotion': {'/imu': IMU, '/temperature': TEMPERATURE, '/magnetometer': MAGNETIC},
     'phidgets': {'/imu/data_raw': IMU, '/temperature': FLOAT, '/imu/mag': MAGNETIC},
-    # The Imu is published by a node of the user.
+    # A node of the user publishes the Imu messages of PX4.
     'px4': {'/imu/uncompensated': IMU, '/fmu/out/sensor_accel': PX4},
     'mavros': {
         '/mavros/imu/data': IMU,
@@ -65,16 +65,16 @@ LAYOUTS = {
     'realsense': {'/camera/camera/accel/sample': IMU, '/camera/camera/gyro/sample': IMU},
     'mpu6050': {'/imu': IMU},
 }
-#: Drivers without a temperature.
+#: Drivers that publish no temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
-#: Drivers whose bags are fitted: one driver for each kind of thermometer's message, one without.
+#: Drivers whose bags are fitted: one per type of temperature message, and one without.
 FITTED = {'xsens', 'mavros', 'px4', 'phidgets', 'ardupilot'}
 #: Six faces and the first face again, for REST_S each, while the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
 RATE, REST_S, WARMING = 5, 75, 0.05
 SECONDS = len(UPS) * REST_S
 GRAVITY, MICRO_G = 9.80665, 9.80665e-6
-#: Biases of the unit [m/s^2], constant and per K, and noise: 4 ug in the mean of a minute.
+#: Bias [m/s^2], its slope [m/s^2/K], noise of a sample [m/s^2]: 6 ug in means over 60 s.
 BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]), 1e-3
 
 
@@ -110,7 +110,7 @@ def message(store, kind, stamp_ns, celsius, force):
 
 @pytest.fixture
 def bag(request, tmp_path, store):
-    """Write a tumble with a driver's topics: samples at 10 Hz, other messages at 1 Hz."""
+    """Write a tumble with the topics of a driver: samples at 5 Hz, other messages at 1 Hz."""
     path, noise = tmp_path / 'bag', np.random.default_rng(40)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         links = {
@@ -148,7 +148,7 @@ def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
     printed = cli('info', bag, *topics).stdout
     assert f'{SECONDS * RATE} samples of imu, {RATE} Hz' in printed
     assert f'{len(UPS)} still intervals' in printed
-    # Only the thermometers of the file are used, no other numbers of the same messages.
+    # `info` uses only the thermometers of the topics file, no other numbers of the messages.
     assert re.findall(r'^(board|case) +1\.000 +(\S+) +(\S+)', printed, re.MULTILINE) == [
         (name, f'{20.0 - lag:.2f}', f'{46.2 - lag:.2f}')
         for name, lag in (('board', 0.0), ('case', 2.0))
@@ -163,7 +163,7 @@ def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
     if path.stem in FITTED:
         finished = cli('fit', bag, *topics, '-o', fitted, '--gravity', str(GRAVITY))
         assert ('the bags have no thermometer' in finished.stdout) == (not has_board)
-        # Means of a minute have a noise of 4 ug; the raw drift is 23 K times 1 mm/s^2 per K.
+        # Means over 60 s have a noise of 6 ug; the raw drift is 26 K times 1 to 3 mm/s^2 per K.
         judged = parsed(cli('evaluate', bag, '-c', fitted, *topics, '--json', code=None).stdout)
         left = judged['sections_m_s2']['all']['rms'] / MICRO_G
         assert left < 10.0 if has_board else 500.0 < left < 2500.0
@@ -183,7 +183,7 @@ def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
 
 
 def warming_unit():
-    """Make a unit whose z grows by 1 mm/s^2 per K: the correction shows which reading was used."""
+    """Make a unit whose z bias grows by 1 mm/s^2 per K: the output shows the reading in use."""
     return calibration(
         unit=Unit('T-1', 'm/s^2', 160.0, 1.0 / RATE),
         axes=Axes(*[AxisReference(1.0, 0.0)] * 3),
@@ -210,7 +210,7 @@ def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
         topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
         board, _, field = names['board'].partition(':')
         if field:
-            # The package is not installed; an installed type is looked up when the driver sends.
+            # The message package of the driver is not installed, so `LiveField` must refuse it.
             assert topics - {board} <= heard_topics
             with pytest.raises(ThermoCompError, match=f'{board}: its type .* is not installed'):
                 LiveField(board, layout[board], field)

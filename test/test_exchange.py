@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Exchange with other tools: their formulas written again, round trips, losses and refusals."""
+"""Exchange with other tools: formulas of the tools, round trips, losses and refusals."""
 
 import re
 from dataclasses import replace
@@ -89,7 +89,7 @@ def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):
         for celsius in (5.0, 20.0, 33.0, 45.0):
             d = celsius - p['TC_A2_TREF']
             offset = sum(p[f'TC_A2_X{power}_{axis}'] * d**power for power in range(4))
-            # PX4's file has nine digits, which determine a float32.
+            # A parameter file of PX4 has nine digits, which determine a float32.
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
 
 
@@ -150,7 +150,7 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
 
     ardupilot = export_calibration(unit, 'ardupilot', number=2).text
     assert 'INS_TCAL2_GYR1_X' in ardupilot
-    # ArduPilot keeps the constant offset itself: the cubic is 0 at the calibration temperature.
+    # ArduPilot stores constant offsets elsewhere: a cubic is 0 at the calibration temperature.
     found = again(f'{ardupilot}INS_GYR2_CALTEMP,{celsius[3]}\n')
     np.testing.assert_allclose(found, true - true[3], atol=1e-9)
     zeros = re.sub(r'(GYR\d_.),.*', r'\1,0', ardupilot)
@@ -309,7 +309,7 @@ RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 
 
 
 def test_the_formula_of_imu_tk_gives_the_same_correction(tumbled):
-    # X' = T K (X - B) as in imu_tk's header; its reader takes 9 + 9 + 3 numbers in rows.
+    # The header of imu_tk has X' = T K (X - B); a file of imu_tk has 9 + 9 + 3 numbers in rows.
     file = export_calibration(tumbled, 'imu_tk')
     numbers = [float(cell) for cell in file.text.split()]
     T, K = np.reshape(numbers[:9], (3, 3)), np.reshape(numbers[9:18], (3, 3))
@@ -317,7 +317,7 @@ def test_the_formula_of_imu_tk_gives_the_same_correction(tumbled):
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # The printed angles have six digits: errors of 1e-6 times 90 m/s^2.
+    # Angles printed with six digits cause errors of 1e-6 times 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
@@ -341,14 +341,14 @@ def test_constants_are_unchanged_by_export_and_import(tumbled, to):
     file = export_calibration(tumbled, to)
     back = import_calibration(file.text, serial='7')
     assert back.unit.input == 'counts'
-    # Export to imu_tk rotates the frame, import rotates it back.
+    # An export to imu_tk rotates the frame of the axes, an import rotates the frame back.
     np.testing.assert_allclose(ours(back, RAW), ours(tumbled, RAW), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(back.misalignment, tumbled.misalignment, atol=1e-12)
     assert any('holds at 20 degC' in note for note in file.notes)
 
 
 def test_a_file_that_imu_tk_saved_is_read():
-    # imu_tk's stream writes columns of six digits; `theirs` is imu_tk's formula by hand.
+    # A file of imu_tk has columns of six digits; `theirs` is the formula of imu_tk by hand.
     text = (
         '          1 -0.00354989 -0.00890444\n          0           1 -0.0213032\n'
         '          0           0           1\n\n'
@@ -381,7 +381,7 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
     back = import_calibration(f'imu0:\n{imu}  update_rate: 200.0\n', serial='7')
     assert back.unit.input == 'm/s^2'
     assert 'no bias' in back.provenance.notes[0]
-    # The reading was computed by hand as M a, with a = (1, 2, 3).
+    # The reading (1.01, 1.99, 3.06) was computed by hand as M a, with a = (1, 2, 3) m/s^2.
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(CalibrationError, match='choose one of the IMUs: there are imu0, imu1'):
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')

@@ -23,7 +23,7 @@ from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
-#: Arguments of a command before and after the output.
+#: Arguments of the command for each output, before and after the path of the output.
 COMMANDS = {
     'unit.yaml': (('fit', *FIT, *GRAVITY, '-f', '-o'), ()),
     'page.html': (('report', '-c', 'unit.yaml', '-f', '-o'), ()),
@@ -108,7 +108,7 @@ def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
 
-#: A process that runs a command and kills itself as its temporary file is open or complete.
+#: A script that runs a command and kills itself while the temporary output is open, or complete.
 KILLED = """
 import os, signal, sys
 point, target = sys.argv[1:3]
@@ -156,7 +156,7 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
     # The file that a killed command leaves has a hidden name, which no tool takes for an output.
     assert rest.name.startswith('.')
     if point == 'before':
-        # Killed just before the rename, the hidden file is complete.
+        # If the command is killed just before the rename, the hidden file is complete.
         if name == 'unit.yaml':
             assert load_calibration(rest).unit.serial
         elif name == 'bag.mcap':
@@ -168,7 +168,7 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
 def test_a_terminated_command_leaves_no_file(folder, name):
-    # WHY: a hidden file as large as the bag remained after each time-out and each shutdown.
+    # WHY: a hidden file as large as the bag remained whenever SIGTERM ended a command.
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
     script = KILLED.replace('SIGKILL', 'SIGTERM')

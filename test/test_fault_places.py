@@ -3,8 +3,8 @@
 """
 Faults at the worst times of a ramp, through the compensator without DDS.
 
-WHY: the covariance was large enough for a fault in the middle of a ramp, but not for the same
-fault at the start of the ramp, nor after a sensor came back with another value. PROMISE: every
+WHY: the covariance was large enough for a fault in the middle of a ramp, but not for an equal
+fault at the start of a ramp, nor after a sensor came back with another value. PROMISE: every
 published sample has an error below five claimed standard deviations.
 """
 
@@ -66,7 +66,7 @@ def settling_s():
 
 
 def ended_s(row):
-    """Return the time from which the messages equal the undisturbed bag again."""
+    """Return the time [s] from which the messages of a row equal the undisturbed bag again."""
     at, _ = row.shift
     if math.isfinite(at):
         return at

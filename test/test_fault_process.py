@@ -67,7 +67,7 @@ def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
         assert first.values['memory settled'] == 'False'
         rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
     n = len(first.force)
-    # The covariance includes the unknown temperatures before the new process.
+    # The covariance includes the effect of unknown temperatures before the start of the process.
     at = round(90.0 * RATE_HZ)
     assert (first.covariance[:, 0, 0] > 4.0 * undisturbed[at : at + n, 3].max()).all()
     assert max(sigmas(first), sigmas(rest)) < SIGMAS
@@ -89,7 +89,7 @@ def unreadable(path):
     if os.geteuid():
         path.chmod(0)
     else:
-        # Root may open any file, but no process can read /proc/self/mem from its beginning.
+        # Root may open any file, but no process can read the first byte of /proc/self/mem.
         path.unlink()
         path.symlink_to('/proc/self/mem')
 
@@ -153,7 +153,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
-    # 60 s of samples suffice on any machine; the loop below ends with the last answer.
+    # 60 s of samples suffice on any machine; the loop of sending ends with the last answer.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100
     with bench(path) as node:
@@ -187,7 +187,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     assert len(heard.force) == n_samples
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
-    # One sample in a million is beyond five standard deviations of noise.
+    # By noise one sample in a million has an error above 5 sd, so the limit is 6 sd.
     assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
 
 

@@ -3,7 +3,7 @@
 """
 The fault table: each row goes through the compensator and the node's diagnostics, and every number
 is compared with the truth. Rows about the order of arrival are also sent over DDS to the node
-process, whose output must be the same.
+process, whose output must equal that without DDS.
 """
 
 from copy import deepcopy
@@ -25,11 +25,11 @@ from thermo_comp.ros.diagnostics import findings_of
 from thermo_comp.ros.reader import LoadedCalibration
 from thermo_comp.unit.calibration_file import save_calibration
 
-#: Largest error of a published number that is not wrong, in its published standard deviations.
+#: Largest error of a published force that does not count as wrong, in its published sd.
 SIGMAS = 5.0
-#: Largest difference [m/s^2] of a recovered output to the undisturbed run: 1 ug.
+#: Largest difference of a recovered output to the undisturbed output [m/s^2]: 1 ug.
 RECOVERED = 9.80665e-6
-#: Rows that also run over DDS, because the order of arrival matters in them.
+#: Rows that also run over DDS, because the order of arrival of messages matters.
 OVER_DDS = (
     *('board late by 5 s', 'counts out of order'),
     *('time jumps back', 'temperatures of another clock'),
@@ -37,7 +37,7 @@ OVER_DDS = (
 
 
 class Direct:
-    """A compensator with the node's findings, without DDS, which takes one lot after another."""
+    """A compensator that takes lots of messages without DDS, with the findings of the node."""
 
     def __init__(self):
         self.compensator = Compensator(unit(), CONFIG)
@@ -68,7 +68,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return each lot of the undisturbed bag with a copy of the run before it, then the end."""
+    """Return each lot of the undisturbed bag, and the end, with a copy of `Direct` before it."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))
@@ -78,7 +78,7 @@ def undisturbed():
 
 
 def direct(events):
-    """Run events; the run before the first lot with a fault is that of the undisturbed bag."""
+    """Run events, from a copy of the undisturbed run up to the first lot with a fault."""
     given, known = list(lots(events)), undisturbed()
     n = next((k for k, lot in enumerate(given) if lot != known[k][0]), len(given))
     run = deepcopy(known[n][1])
@@ -134,7 +134,7 @@ def test_fault_row_over_dds_gives_the_same_samples(tmp_path):
     assert len(rows) == len(OVER_DDS)
     with bench(tmp_path / 'unit.yaml') as node:
         for row in rows:
-            # The faults of these rows have been reported after 200 s.
+            # All faults of the rows in OVER_DDS are reported within 200 s.
             events = row.inject(list(bag(duration_s=200.0)))
             heard, expected = node.play(events), direct(events)
             for name in ('stamp_ns', 'force', 'covariance'):

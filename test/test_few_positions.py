@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Few positions: parameters that they determine are right, other parameters stay at the prior."""
+"""Fits to few positions: determined parameters are right, the others stay at their prior."""
 
 from dataclasses import replace
 from functools import cache
@@ -25,7 +25,7 @@ MICRO_G = 9.80665e-6
 
 
 def minutes(values):
-    """Means of a minute at 1/4 Hz [ug], without the first minutes, which have no temperature."""
+    """Return means over 60 s [ug] of values at 1/4 Hz; rows without a temperature are NaN."""
     values = values[~np.isnan(values).any(axis=1)]
     n = len(values) // 15
     return values[: 15 * n].reshape(n, 15, 3).mean(axis=1) / MICRO_G
@@ -36,12 +36,13 @@ def left_by(pair, **options):
     bags = [BAGS / f'fit/0{number}.mcap' for number in pair]
     calibration = tc.fit(bags, gravity=9.80665, **options)
     held_out = tc.read(BAGS / 'held_out.mcap')
-    # Samples and times are averaged over 4 s, which keeps the means of a minute and saves time.
+    # Averaging samples and times over 4 s keeps the means over 60 s and saves computing time.
     n = len(held_out.time_s) // 8
     time_s = held_out.time_s[: 8 * n].reshape(n, 8).mean(axis=1)
     counts = held_out.counts[: 8 * n].reshape(n, 8, 3).mean(axis=1)
     corrected = calibration.correct(time_s, counts, **held_out.temperatures)
-    # In a new attitude the constants are uncertain, and the covariance includes this uncertainty.
+    # A fit to two positions leaves bias, K and M uncertain: in a third position the claimed sd of
+    # an axis exceeds 1 mg.
     sd = np.sqrt(np.nanmedian(np.einsum('nii->ni', corrected.covariance), axis=0))
     assert (sd > 1000.0 * MICRO_G).any()
     return np.asarray(minutes(corrected.specific_force).std(axis=0))
@@ -49,8 +50,8 @@ def left_by(pair, **options):
 
 @pytest.mark.slow
 def test_two_positions_tell_the_thermal_response():
-    # 9 ug/sqrt(Hz) are 1.2 ug in a minute; 128 minutes determine the sd to 6 %, and superfluous
-    # columns may add 10 %. All 36 pairs of positions have a median of 1.3 ug (docs/accuracy.md).
+    # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine the sd to 6 %, and
+    # superfluous columns may add 10 %. The median of all 36 pairs is 1.3 ug (docs/accuracy.md).
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 
@@ -150,7 +151,7 @@ def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
 
 @pytest.mark.slow
 def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_each_rest(rng):
-    # WHY: the warm-up of the board, which the sensor does not follow, gave a slope of 0, and the
+    # WHY: the warm-up of the board, which the sensor does not follow, gave a bias slope of 0, and
     # differences between the norms of 36 rests were taken for mountings that do not repeat.
     bags = []
     for celsius in (5.0, 20.0, 35.0):
@@ -162,11 +163,12 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
     calibration, at = result.calibration, np.array([6.0, 36.0])
     curves = [axis.bias_function for axis in calibration.static.axes()]
     slopes = np.array([np.diff(curve.value(at))[0] / 30.0 for curve in curves])
-    # 24 norms with a noise of 1 ug: the warm-up, 1 K in 600 s, limits the temperature to 0.1 K.
+    # Each norm has a noise of 1 ug; with a warm-up of 1 K in 600 s its temperature is uncertain
+    # by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in names_of(result)
-    # Soaks do not show the lag of the sensor, whose effect is at most that of the slope: twice the
-    # claimed sd covers this effect, and the claimed sd is at most this effect.
+    # Soaks do not determine the weight of the sensor's lag, which is at most the bias slope: the
+    # claimed sd of the weight is between half of the slope and the slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
@@ -174,8 +176,8 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
 
 @pytest.mark.slow
 def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
-    # WHY: a curve from the drifts in the warm-ups was wrong by 7 claimed sd between the rests.
-    # With this seed the error exceeds the claim of the drifts alone.
+    # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd between rests at
+    # different temperatures. With seed 2 the error exceeds the sd claimed from the drifts alone.
     rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
@@ -190,8 +192,8 @@ def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
 
 
 def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
-    # WHY: without tilts in the model, a tilt of 4 urad/K with an axis at 0.03 g gave a slope of
-    # its scale factor of 137 ppm/K.
+    # WHY: without tilts in the model, a support tilt of 4 urad/K gave the scale factor of an axis
+    # at 0.03 g a slope of 137 ppm/K.
     bags = []
     for up, tilt in (((1.0, 0.0, 0.03), 4e-6), ((0.0, 1.0, -0.03), -4e-6)):
         rest = Rest(rng, level=tuple(GRAVITY * np.array(up)), sd=0.1 * MG)
@@ -200,14 +202,14 @@ def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
         bags.append(rest.source(name=str(up)))
     z = fit(bags, OPTIONS).calibration.static.z
     at = np.array([0.0, 10.0])
-    # 15000 samples (noise 0.1 mg) determine the mean slope of the two rests to 1 ug/K.
+    # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
     # At 0.03 g a slope of 1 ug/K is 33 ppm/K of the scale factor, for two rests 47 ppm/K.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
 def test_one_tilted_support_is_not_the_scale_of_an_axis_across_gravity():
-    # WHY: with a prior sd of up to 200 ppm/K a tilt of 17 urad/K gave a slope of 817 +- 23 ppm/K.
+    # WHY: a tilt of 17 urad/K gave a scale slope of 817 +- 23 ppm/K, at a prior sd to 200 ppm/K.
     rng = rng_of('linear tilts', 1)
     unit = replace(consumer_grade(rng), counts=0.0)
     ups = (1.0, 0.0, 0.03), (0.0, 1.0, 0.0)
@@ -220,7 +222,7 @@ def test_one_tilted_support_is_not_the_scale_of_an_axis_across_gravity():
     slope = parameter_layout(calibration).scale[2].static + 1
     sd = np.sqrt(calibration.posterior.covariance()[slope, slope])
     found = np.diff(calibration.static.z.scale_function.value(np.array([0.0, 1.0])))[0]
-    # The prior of the slope has an sd of 100 ppm/K or less, and no position shows the slope.
+    # No position determines the slope of the scale factor, whose prior sd is at most 100 ppm/K.
     assert sd < 100e-6
     assert abs(found - 1e-6 * unit.scale_curve[0, 2]) < 3.0 * sd
 
@@ -244,7 +246,7 @@ def test_positions_without_temperature():
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.001)
     assert calibration.response == ()
     assert 'temperature' in names_of(result)
-    # Temperature effects stay at their prior: no slope, sd 5 mm/s^2 and 200 ppm per K.
+    # Temperature slopes stay at their prior: 0, with sd 5 mm/s^2/K (bias) and 200 ppm/K (scale).
     assert not calibration.needs_temperature
     sd = np.sqrt(np.diag(calibration.posterior.covariance()))
     layout = parameter_layout(calibration)
@@ -262,11 +264,11 @@ def test_positions_without_temperature():
 
 
 def test_the_assumed_repeatability_of_the_bias_is_said(rng):
-    # Nine constants explain nine norms, for any offsets of the mountings.
+    # The nine constants of a triad explain nine norms, whatever the offsets of the mountings.
     assert 'mountings' in names_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
     assert 'mountings' not in names_of(stated)
-    # Twelve positions show how well mountings repeat, but one recording has one turn-on.
+    # Twelve positions show how well mountings repeat, but one recording has one turn-on offset.
     assert 'mountings' in names_of(tumbled(12))
     twelve = fit([turned(rng, [up]) for up in positions(12, 3)], OPTIONS)
     assert 'mountings' not in names_of(twelve)
@@ -283,7 +285,7 @@ def test_counts_of_32_bits_are_fitted(rng):
 
 
 def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
-    # WHY: positions of one recording have the same turn-on: the claimed sd was 1/6 of the error.
+    # WHY: positions of one recording share a turn-on; the claimed bias sd was 1/6 of the error.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
     # `least`: sd of turn-ons by the prior for a noise of 0.02 m/s^2 at 100 Hz, or the stated sd.
@@ -301,9 +303,9 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
 
 @pytest.mark.slow
 def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
-    # WHY: each of three recordings has a temperature of its own. The turn-ons were claimed as an
-    # error of their mean alone, and the offsets of mountings as independent: the claimed variance
-    # of the axes was 1.6, 1.8 and 1.9 times that of a turn-on.
+    # WHY: with three recordings at three temperatures, turn-ons were claimed as an error of the
+    # mean of the turn-ons alone, and mounting offsets as independent: the claimed variances of
+    # the axes were 1.6, 1.8 and 1.9 times the variance of a turn-on.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -316,8 +318,8 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # The leverage of the curve at the ends is 5/6 if it is a line through three equidistant
-        # points, 1 if it is a parabola; the next turn-on adds its variance. The stated sd may also
+        # The leverage of the curve at the ends is 5/6 for a line through three equidistant
+        # points, 1 for a parabola; the next turn-on adds its variance. The stated sd may also
         # be that of mountings: bias and scale keep a third each of the variance of nine
         # independent offsets.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
@@ -326,13 +328,13 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
 
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: with positions cut into several rests, the sd of the offset was 1/20 of the true sd.
+    # WHY: with positions cut into several rests, the fitted mounting sd was 1/20 of the true sd.
     whole, cut = tumbled(9), fit([turned(rng, np.repeat(positions(9, 3), 5, axis=0))], OPTIONS)
     sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, cut))
-    # Nine norms do not determine the sd, which stays at its prior in both fits.
+    # Nine norms do not determine the mounting sd, which stays at its prior in both fits.
     assert sd_cut == pytest.approx(sd, rel=0.1)
     assert 'mountings' in names_of(cut)
-    # The rests of a mounting are left out together.
+    # All rests of a mounting are left out together, so nine mountings have nine left-out norms.
     assert len(cut.fit.selected.score.norms.square) == 9
 
 
@@ -364,7 +366,7 @@ def test_a_calibration_has_the_date_of_its_test(rng):
     provenance = tumbled(9).calibration.provenance
     assert provenance.date == provenance.tested == '2023-11-14T22:16:28Z'
     assert provenance.created > provenance.tested
-    # Seconds since the start of a computer are not a date.
+    # Stamps in seconds since the start of a computer contain no date.
     blocks = [replace(b, accel_stamp_ns=b.accel_stamp_ns - START_NS) for b in source.blocks()]
     undated = fit([replace(source, blocks=lambda: blocks)], OPTIONS).calibration.provenance
     assert (undated.tested, undated.date) == ('', undated.created)
@@ -394,13 +396,14 @@ def test_three_positions_do_not_show_which_constants_have_aged(rng):
         ups = positions(3, 10 + seed) * scale + bias / GRAVITY
         few = replace(OPTIONS, serial='1', prior=known, allow=('prior',))
         aged = fit([turned(rng, ups)], few).calibration
-        # A unit without thermometer must not need one after the fit.
+        # A calibration fitted without a thermometer must not need a temperature.
         assert not aged.needs_temperature
         reading = GRAVITY * corners * scale + bias + (0.1, -0.2, 0.3)
         out = aged.correct(np.arange(1.0, len(reading) + 1.0), reading)
         variance = np.diagonal(out.covariance, axis1=1, axis2=2) - 0.02**2
         ratios.append((out.specific_force - GRAVITY * corners) ** 2 / variance)
-    # All fits share six random changes, whose mean square has a relative sd of 60 %.
+    # Both fits share six random changes of scales and biases; their mean square has a relative
+    # sd of 60 %.
     assert np.mean(ratios) < 3.0
 
 
@@ -436,7 +439,7 @@ def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):
 
 
 def test_six_attitudes_that_hardly_determine_the_scale_factors_leave_them_near_each_other(rng):
-    # The squares of these attitudes are almost linearly dependent.
+    # The squared components of the attitudes in `up` are almost linearly dependent.
     up = [
         [-7, 88, 48],
         [14, -89, -44],
@@ -470,7 +473,7 @@ def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
 def test_short_rests_have_windows_enough_to_learn_the_noise_from(rng):
     # WHY: an attitude fits a rest of one window exactly, so the estimated noise was 0.
     calibration = fit([turned(rng, positions(12, 3), rest_s=5.0)], OPTIONS).calibration
-    # The noise is 0.02 m/s^2 per sample at 100 Hz.
+    # A noise of 0.02 m/s^2 per sample at 100 Hz is a density of 0.002 m/s^2/sqrt(Hz).
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Updates in the field against the truth, the best filter and closed forms."""
+"""Updates from rests in the field against the truth, a Kalman filter and closed forms."""
 
 import sys
 from dataclasses import replace
@@ -30,7 +30,7 @@ from thermo_comp.unit.provenance import Provenance
 
 
 def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
-    # A ramp excites every column and both sets; the expected derivatives are finite differences.
+    # A ramp excites all columns and both sets; expected derivatives of |f| are finite differences.
     unit = rich_calibration()
     logged = rests(unit, in_any_attitude, no_error, days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
@@ -39,12 +39,12 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Testing every second parameter tests each kind on some axis, as blocks have odd lengths.
+    # Every second parameter is tested: blocks of an axis have odd lengths, so each kind occurs.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # a change of K, which moves both levels, is tested below
+            continue  # the scale levels of both sets are tested below, by a change of K
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
@@ -93,7 +93,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # Merging the rests of a start causes an error below a fifth of the sd.
+        # Summing the rests of each start to a few rows causes an error below a fifth of the sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -102,7 +102,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
 
 
 def test_updates_of_ageing_units_are_near_the_best_and_claim_their_errors():
-    # The units age for 30 days by walks, turn-on and one shock, on a level and a carried platform.
+    # Level and carried units age for 30 days by random walks, turn-on offsets and one shock.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
         process = field_units.Process(shock_day=11.5)
@@ -129,7 +129,8 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_their_errors():
         if kind == 'level':
             assert abs(updated.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
     before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
-    # A Kalman filter with the true variances leaves 12 to 14 ug RMS (benchmarks/field.py).
+    # A Kalman filter with the true variances leaves residuals of 12 to 14 ug RMS
+    # (benchmarks/field.py).
     assert before > 100.0
     assert left < 30.0
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -143,7 +144,7 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
-    # In one attitude a shock and another gravity cause the same residuals.
+    # In one attitude a shock and a change of gravity cause equal residuals.
     assert [change.may_be_gravity for change in updated.changes] == [True]
     assert 'or another gravity' in ' '.join(change_texts(updated))
     # Upright rests determine the sum of bias and scale of z, 300 ug, to 15 ug (turn-ons of 20 ug).
@@ -180,7 +181,8 @@ def test_the_present_sd_of_the_old_calibration_contains_its_ageing(rng):
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
-    # One attitude does not separate bias from scale, so up to half the variance goes to the scale.
+    # Rests in one attitude do not separate bias from scale: up to half of the variance goes to the
+    # scale.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
     # The rests determine the bias of z to two sd of a turn-on offset (sd 20 ug).
@@ -197,7 +199,7 @@ def stepped(history, size, day):
 
 @pytest.mark.parametrize('day', [15, 0])
 def test_another_gravity_is_not_taken_for_three_scales(day):
-    # Walks are 15 ug and 10 ppm; gravity differs by 300 ug from day 15, or from the first rest on.
+    # Random walks are 15 ug and 10 ppm per root day; gravity differs by 300 ug from `day` on.
     unit, size = field_units.calibration(), 300.0 * MICRO_G
     history = field_units.live('carried', 2, 30, field_units.Process())
     aged = update(series_of(history.rests, unit), unit)
@@ -211,7 +213,7 @@ def test_another_gravity_is_not_taken_for_three_scales(day):
     assert result.judged.after < 40.0 * MICRO_G
     (text,) = (line for line in change_texts(result) if 'another gravity' in line)
     assert 'than the stated 9.80665 m/s^2 from 2026-' in text
-    # With a gravity that is certain, the scales of all axes have changed.
+    # If gravity is stated as certain, the step is attributed to the scales of all axes.
     certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
     assert certain.solution.gravity == ()
     assert all(axis.scale > 150e-6 for axis in certain.moved)
@@ -232,7 +234,7 @@ def test_ageing_is_not_taken_for_another_gravity_or_unit(kind):
 
 @pytest.mark.parametrize('first', [0, 10])
 def test_samples_of_another_unit_are_refused(first):
-    # All rests, or half of them, are of a unit with other scale (percents) and bias (milli-g).
+    # All or half of the rests are from a unit with other scales (by percents) and biases (by mg).
     unit = field_units.calibration()
     history = field_units.live('carried', 3, 20, field_units.Process())
     mixed = [
@@ -264,7 +266,8 @@ def test_a_changed_curve_is_detected_and_corrected():
 
 
 def test_the_slopes_over_temperature_age_by_a_fixed_walk():
-    # Level rests do not determine x, so the sd of its curve grows by 1 ug/K per root year.
+    # Level rests do not determine the x axis: the sd of its bias slope grows by 1 ug/K per root
+    # year.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
@@ -291,7 +294,7 @@ def test_a_start_that_contradicts_all_others_is_left_out():
 
 def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
     # A computer without a battery clock starts at the date of its image, and the stamps of the
-    # samples are right. First all starts have the date of an image, then only the last start.
+    # samples are right. First all starts have a date of the image, then the last start alone.
     unit = known()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {one.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for one, _ in logged}
@@ -346,10 +349,10 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
-    # The date of the new file is that of its last rest, not that of the command.
+    # The date of the new file is the date of its last rest, not the date of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # The new file has no residual, the old file has one; the history shows both.
+    # Only the old calibration has a residual on the log; the history shows both calibrations.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'
@@ -409,7 +412,8 @@ def with_shares(logged, share):
 
 
 def test_a_rest_differentiates_by_the_unknown_lags_of_its_start():
-    # The unknowns are initial states of lags; the expected derivatives are differences of |f|.
+    # The unknowns of a start are the initial states of lags; expected derivatives are differences
+    # of |f|.
     unit, share, step = rich_calibration(), 0.6, 1e-4
     logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
     series, layout = series_of(logged, unit), Layout(Correction(unit).memory)
@@ -429,7 +433,8 @@ def test_a_rest_differentiates_by_the_unknown_lags_of_its_start():
 
 
 def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
-    # The residual sd of the file is the scatter of starts, which the ageing model estimates.
+    # The residual sd of a calibration is the scatter of starts, which the ageing model estimates:
+    # the noise of a rest leaves it out.
     unit = field_units.calibration()
     logged = field_units.live('level', 1, 3, field_units.Process()).rests
     unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]
@@ -440,8 +445,9 @@ def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
 
 @pytest.mark.parametrize('lags', [0.0, 1.0])
 def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
-    # Three rests per start, the first at once. Walks are 15 and 10 ug per root day, turn-ons 20
-    # ug, the scatter 3 ug; lags have none or all of the assumed sd, 40 to 100 ug.
+    # Each start has three rests, the first at once. Walks of bias and scale are 15 and 10 ug per
+    # root day, turn-ons 20 ug, the scatter of rests 3 ug; the initial lag states have `lags` times
+    # the assumed sd, 40 to 100 ug.
     unit = rich_calibration()
     each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
     n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]
@@ -457,7 +463,8 @@ def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
     residual += np.sqrt(series.noise + (3.0 * MICRO_G) ** 2) * rng.standard_normal(3 * n)
     ageing, _, used = learn(replace(series, residual=residual), unit, float(series.time[0]))
     assert len(used) == 3 * n
-    # Six simulated units vary by 20 % in the bias, 30 % in the scale, 15 % at a start.
+    # Over six simulated units the estimates vary by 20 % (bias walk), 30 % (scale walk) and 15 %
+    # (turn-on).
     assert ageing.bias == pytest.approx(15.0 * MICRO_G, rel=0.5)
     assert ageing.scale == pytest.approx(10.0 * MICRO_G, rel=0.7)
     assert ageing.turn_on == pytest.approx(20.0 * MICRO_G, rel=0.35)

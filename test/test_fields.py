@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A temperature in a message of any type: values of many messages equal those of rosbags."""
+"""A temperature in a message of any type: fields of many messages equal those by rosbags."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.serialized import Messages
 from thermo_comp.recording.topics import Topics
 
-# PX4's messages have no header, and the temperature beside the samples.
+# A SensorAccel message of PX4 has no header, and holds the temperature beside the sample.
 PX4 = {
     'px4_msgs/msg/SensorAccel': (
         'uint64 timestamp\nuint64 timestamp_sample\nuint32 device_id\nfloat32 x\nfloat32 y\n'
@@ -138,7 +138,7 @@ def test_definitions_come_from_the_bag_or_are_known_or_refused():
 
 
 def driver_bag(path, store, storage=StoragePlugin.MCAP):
-    """Write 50 Imu messages, with PX4's and Float64's between; return the readings of PX4."""
+    """Write 50 Imu messages with PX4 and Float64 messages between; return the PX4 readings."""
     celsius = []
     with Writer(path, version=9, storage_plugin=storage) as bag:
         kinds = {'/imu/data': 'sensor_msgs/msg/Imu', '/case': 'std_msgs/msg/Float64',
@@ -155,7 +155,7 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
         level = store.types['geometry_msgs/msg/Quaternion'](0, 0, 0, 1)
         for row in range(50):
             stamp_ns = START_NS + row * 10**7
-            # The recorder's clock differs from the driver's.
+            # The clock of the recorder is 1000 s ahead of the clock of the driver.
             log_ns = stamp_ns + 10**12
             if row % 5 == 0:
                 accel = store.types['px4_msgs/msg/SensorAccel']
@@ -179,7 +179,8 @@ def test_a_bag_with_a_message_type_of_the_driver_is_read(tmp_path, store, storag
     recording = read_recording(tmp_path / 'bag', Topics.named(names))
     assert 'board, case without a stamp' in str(recording.info.chosen)
     board, case = (recording.columns.temperatures[name] for name in ('board', 'case'))
-    # The first reading is before any sample; later readings get the stamp of the sample before.
+    # The first board reading precedes all samples and is lost; each later reading has the stamp of
+    # the sample before the reading.
     assert board.celsius.tolist() == celsius[1:]
     assert board.stamp_ns.tolist() == [START_NS + (row - 1) * 10**7 for row in range(5, 50, 5)]
     assert case.celsius.tolist() == [celsiu - 1.0 for celsiu in celsius]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Outputs: no input, and no file of another kind, is ever replaced.
+Outputs of commands: no output replaces an input or a file of another kind.
 
-WHY: `--force` destroyed the recordings that a command read; of two writers one lost its result
+WHY: `--force` destroyed the recordings that a command read; one of two writers lost its result
 silently; an output was readable by everyone whatever the umask, and replaced a link.
 """
 

@@ -20,7 +20,7 @@ UPS = np.array(
 
 
 def recording(up, rng, slope=None):
-    """Simulate times, m/s^2 and board temperatures of two hours, 10 to 32 degC and back."""
+    """Simulate times [s], samples [m/s^2] and board [degC] for two hours: 10, 32, 12 degC."""
     time_s = np.arange(0.0, 7200.0, 2.0)
     board = np.interp(time_s, (0.0, 600.0, 3600.0, 7200.0), (10.0, 10.0, 32.0, 12.0))
     bias = (SLOPE if slope is None else slope) * MICRO_G * np.maximum(board - KNEE_C, 0.0)
@@ -29,7 +29,7 @@ def recording(up, rng, slope=None):
 
 
 def left_by(groups):
-    """Fit some groups, and correct another recording: RMS error of minutes [ug]."""
+    """Fit some groups, correct another recording; return the RMS error of means over 60 s [ug]."""
     rng = np.random.default_rng(8)
     bags = [
         tc.Columns(time_s, force, {'board': (time_s[::5], board[::5])}, name=f'rest{k}')
@@ -49,8 +49,8 @@ def test_a_knee_of_the_bias_is_found():
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # Trial knees are 1 K apart: the fit uses the two trial knees around the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # A mean slope between two knees instead of the kink gives an error of at most 20 ug/K times
-    # 0.25 K, within 1 K of the 22 K.
+    # A mean slope between two trial knees instead of the true knee gives an error of at most
+    # 20 ug/K times 0.25 K, within 1 K of the range of 22 K.
     assert left < 1.5
 
 
@@ -88,7 +88,7 @@ def columns_of(slopes):
 
 
 def sd_of_a_correction(unit):
-    """Claimed sd of the axes at the end of a recording [ug]."""
+    """Return the claimed sd of the axes at the end of a recording [ug]."""
     time_s, force, board = recording(UPS[0], np.random.default_rng(11))
     last = unit.correct(time_s[3::4], force[3::4], board=(time_s[::5], board[::5])).covariance[-1]
     return np.sqrt(np.diag(last)) / MICRO_G
@@ -107,9 +107,10 @@ def test_a_bag_of_another_environment_is_excluded_and_widens_the_claimed_sd():
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'took no part' in note
-        # In bag r4 the slope is 100 ug/K over 11 K above the knee, and half of this on z.
+        # The slope of bag r4 exceeds that of the other bags by 100 ug/K over 11 K above the knee,
+        # by half of 100 ug/K on z.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
-    # One more bag of the same environment contradicts no other bag.
+    # A further bag with the slope of the first four bags contradicts no other bag.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]

@@ -43,7 +43,7 @@ def fitted(unit, ups, seed, **options):
 
 
 def constants(calibration):
-    """Bias [counts], K and the elements of M below its diagonal."""
+    """Return bias [counts], K [counts per m/s^2] and the elements of M below its diagonal."""
     axes = calibration.axes
     M = np.array(calibration.misalignment)
     bias, scale = [axis.bias for axis in axes], [axis.scale_factor for axis in axes]
@@ -51,7 +51,7 @@ def constants(calibration):
 
 
 def claimed(calibration):
-    """Sd of bias and of the elements of M, and the relative sd of K."""
+    """Return the sd of bias [counts], the relative sd of K, and the sd of the elements of M."""
     layout, sd = (
         parameter_layout(calibration),
         np.sqrt(np.diag(calibration.posterior.covariance())),
@@ -91,7 +91,7 @@ def test_the_constants_of_a_fit_are_within_their_claimed_sd(response):
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
-    # The claimed sd is some ug and ppm, for a drift of hundreds of ug.
+    # The claimed sd of bias, scale and M is some ug and ppm, although the drift is 100s of ug.
     bias_sd, scale_sd, M_sd = claimed(response.calibration)
     assert (bias_sd / np.array(OWN_LAGS.counts_per_micro_g)).max() < 5.0
     assert scale_sd.max() < 10e-6
@@ -110,7 +110,7 @@ def test_the_fitted_response_leaves_only_noise(response):
 def test_fitted_attitudes_have_unit_norm(response):
     up = np.array([position.up for position in response.positions])
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0, rtol=1e-14)
-    # The directions are unknown to the fit and estimated within some urad.
+    # The fit does not know the directions, and estimates each within some urad.
     np.testing.assert_allclose(up, positions(12, 1), atol=3e-5)
 
 
@@ -120,13 +120,13 @@ def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # The paper's model has a separate curve for each regime, so no residual of one set exists.
+        # The paper's model has a separate curve for each regime, so `one_set` has no residual.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
     # The paper's model has a linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The estimated biases are wrong by up to the error of the paper's model in ramps.
+    # The biases are wrong by at most the peak residual of the paper's model, which is in ramps.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)
@@ -146,9 +146,9 @@ def test_the_evidence_is_complete(response):
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     assert 'refusal' not in {finding.level for finding in response.findings}
     judged = {(group.part, group.group) for group in calibration.evidence}
-    # In this unit the bias of each axis is a curve over the temperature of the axis' part.
+    # In the unit OWN_LAGS the bias of each axis is a curve over the temperature of a lagging part.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
-    # A term with zero weight is only needed for the covariance.
+    # A response term with zero weight serves the covariance only, and needs no evidence.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
 
@@ -160,7 +160,7 @@ def test_the_calibration_file_holds_the_fit(response, tmp_path):
 
 
 def test_the_compensator_does_what_the_fit_promised(response):
-    # In a new attitude the error is that of left-out positions, and within the published sd.
+    # The error in a new attitude is below twice the left-out error, and near its claimed sd.
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)
     compensator = Compensator(response.calibration)
@@ -168,7 +168,7 @@ def test_the_compensator_does_what_the_fit_promised(response):
     per_window = round(60.0 * RATE_HZ)
     n = len(after.index) // per_window
     force = after.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
-    # Leave out the first 45 min, in which the unknown initial lag states dominate.
+    # Leave out the first 45 min, in which errors of the unknown initial lag states dominate.
     late = force[45:]
     rms = residual_statistics(norm_residual(late, STANDARD_GRAVITY)).rms
     assert rms < 2.0 * response.residuals[-1].left_out.rms
@@ -190,7 +190,7 @@ def test_six_faces_leave_misalignment_at_its_prior():
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     finding = next(finding for finding in result.findings if finding.name == 'misalignment')
     assert (finding.level, finding.message.startswith('6 positions')) == ('advice', True)
-    # Bias and scale are determined, except for half the square of M (1 mrad) on the faces.
+    # Six faces determine bias and scale but for an error of half the square of M (1 mrad).
     assert scale_sd.max() < 2e-5
     assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
@@ -205,8 +205,8 @@ def test_nine_positions_claim_turn_ons_that_their_norms_cannot_show(rng):
     ]
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set'))
     found = fit(sources_of(switched_on), options)
-    # By the noise of this sensor the fit expects turn-ons of some 50 ug. Nine pulls of unit
-    # variance have an RMS above 1.55 by a chance of 1 %.
+    # From the noise of the unit PLAIN the fit expects turn-ons of some 50 ug. The RMS of
+    # nine errors of unit variance exceeds 1.55 by a chance of 1 %.
     assert np.sqrt(np.mean(pulls(found, PLAIN) ** 2)) < 1.55
 
 
@@ -223,7 +223,7 @@ def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng)
         return fit(sources, FitOptions(**options))
 
     def force(counts):
-        # As in a compensator's output, noise in m/s^2 hides the steps of the counts.
+        # Noise of 5e-4 m/s^2 hides the steps of the counts, as in the output of a compensator.
         return ((counts - bias) / scale) @ M.T + 5e-4 * rng.standard_normal(counts.shape)
 
     raw = fit_of(lambda counts: counts)
@@ -253,7 +253,7 @@ def test_a_switch_of_sets_changes_the_output_by_1_ug_per_second(golovach):
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return corrected.specific_force
 
-    # The equal noise of the three outputs cancels, which gives the weight of the dynamic set.
+    # The three outputs have equal noise, so their differences give the weight of the dynamic set.
     output, static, dynamic = forces(None), forces(0.0), forces(1.0)
     gap = dynamic - static
     size = np.linalg.norm(gap, axis=1)
@@ -262,7 +262,7 @@ def test_a_switch_of_sets_changes_the_output_by_1_ug_per_second(golovach):
     moved = np.abs(weight[per_second:] - weight[:-per_second]) * size[per_second:]
     assert weight[0] == pytest.approx(0.0, abs=1e-6)
     assert weight.max() == pytest.approx(1.0, abs=1e-6)
-    # The difference of the sets itself changes by less than 1 % during the transition.
+    # The difference of the two sets changes by less than 1 % during a transition.
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 
@@ -332,7 +332,7 @@ def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mounting
     # Misalignments of some mrad or mounting offsets of 5 mg explain the norms of nine positions.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
-    # A fit of the groups of the unit's physics alone takes half of the time.
+    # A fit with only those groups that the simulated unit has takes half of the time.
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))
     calibration = fit(sources_of(records), options).calibration
     M = np.array(calibration.misalignment)

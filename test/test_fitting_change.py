@@ -16,7 +16,7 @@ from thermo_comp.simulation.campaign import positions
 
 GRAVITY, MICRO = 9.80665, 9.80665e-6
 STEP_S, OWN_HEAT_K = 2.0, 0.6
-#: Noise of a sample [m/s^2]; a mean of a minute has 30 samples.
+#: Noise of a sample [m/s^2]; a window of 60 s has 30 samples.
 NOISE = 4.0 * MICRO
 
 
@@ -26,7 +26,7 @@ def lagged(values, tau):
 
 
 def recorded(rng, up, name, targets):
-    """Record a unit of two thermal nodes whose bias is even in the heating of its board."""
+    """Record a unit whose bias is even in case minus board about the rest gradient."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
@@ -46,7 +46,7 @@ def recorded(rng, up, name, targets):
         np.round(celsius + 0.003 * rng.standard_normal(len(time)), 4) for celsius in (board, case)
     )
     accel = force + bias * MICRO + NOISE * rng.standard_normal((len(time), 3))
-    # A reading every ten seconds suffices for ramps of 1 K/min.
+    # Every fifth reading (one in 10 s) suffices for ramps of 1 K/min.
     readings = (stamps[::5], board[::5], stamps[::5] + 1, case[::5])
     return source_of(stamps, accel, *readings, name=name)
 
@@ -56,7 +56,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # 5000 readings (noise 3 mK) give the gradient to 0.1 mK; means of rates add an error.
+    # 5000 readings (noise 3 mK) give the rest gradient to 0.1 mK; averaged rates add an error.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (
@@ -66,7 +66,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # In means of a minute, columns that are even about 0 leave a part of the effect.
+    # Columns even about a gradient of 0 leave a part of an effect even about the rest gradient.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor

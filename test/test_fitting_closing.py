@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of series, and the end of the dynamic regime, are estimated, not assumed."""
+"""A fit estimates the noise of series, and the condition that ends the dynamic regime."""
 
 from dataclasses import replace
 
@@ -19,14 +19,14 @@ from thermo_comp.thermal.state import WEIGHT
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
-#: Soaks long enough for the board to settle.
+#: Temperatures of a bag: soaks long enough for the board to settle.
 PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
-#: Difference of the dynamic set in each axis, far above the 2 ug of a window.
+#: Difference of dynamic and static set in each axis [m/s^2], far above the 2 ug of a window.
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
 def weight(record, closes):
-    """Weight of the dynamic set at each sample, by a detector with the true sensor settings."""
+    """Return the weight of the dynamic set at each sample, with the true sensor settings."""
     tracker = ThermalTracker(replace(DetectorSettings(), closes=closes))
     readings = sorted(
         (stamp, name, value)
@@ -37,7 +37,7 @@ def weight(record, closes):
         for stamp, value in zip(stamps.tolist(), values.tolist(), strict=True)
     )
     at, result = 0, []
-    # The weight changes in 300 s, so that every fourth sample, of 2 Hz, suffices.
+    # The weight changes over 300 s, so every fourth sample (2 Hz) suffices.
     for stamp in record.accel_stamp_ns[::4].tolist():
         while at < len(readings) and readings[at][0] <= stamp:
             tracker.read(readings[at][1], readings[at][0], readings[at][2])
@@ -101,7 +101,7 @@ def test_products_and_determinant_are_those_of_the_dense_matrix(rng, noise):
     white = whitener.filter(series, weight, noise)
     covariance = dense(position, time, weight, noise)
     expected = series.T @ np.linalg.solve(covariance, series)
-    # The tolerance allows for rounding with a covariance of condition number below 1e6.
+    # The tolerance allows for rounding if the condition number of the covariance is below 1e6.
     np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9, atol=1e-10)
     determinant = np.linalg.slogdet(covariance)[1]
     assert whitener.log_determinant(weight, noise) == pytest.approx(determinant, abs=1e-9)
@@ -121,7 +121,8 @@ def drawn(rng, n, steps, noise):
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
 def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
-    # 240 correlation times determine the variance to sqrt(2 / 240) = 9 %, the time to 15 %.
+    # 240 correlation times determine the variance to sqrt(2 / 240) = 9 %, the correlation time to
+    # 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     fitted = whitener.estimate(5.0 * series, weight)
     assert 0.5 < fitted.ratio / noise.ratio < 2.0
@@ -129,7 +130,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # Slow noise is found in 1 % of white series by chance; in none of the ten series here.
+    # By chance slow noise is found in 1 % of white series, but in none of the ten drawn series.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refusals and advice of a fit, with the numbers in their texts, on tables made for each."""
+"""Refusals and advice of a fit, with the numbers in the texts, on simulated tables."""
 
 import re
 from dataclasses import replace
@@ -36,7 +36,7 @@ def findings_of(windows, up, *, has_case=True, prior=None):
 
 @pytest.fixture
 def good(rng):
-    """Spend an hour and a half in each of 18 positions: up, down, and a soak at the end."""
+    """Make windows of 18 positions of 80 min: a ramp up, a ramp down and a soak in each."""
     data, up = table_of(Truth(), 18, rng)
     case = np.interp(data.time, [0.0, 1800.0, 3000.0, 3600.0], [5.0, 45.0, 5.0, 5.0])
     rate = np.interp(
@@ -50,7 +50,7 @@ def good(rng):
         data=data,
         temperature=case - gradient,
         rate=rate,
-        # Half of the time is static, at all temperatures.
+        # The ramp down and the soak count as static: 62 % of the time, at all temperatures.
         weight=(rate > 0.0).astype(float),
         gradient=gradient,
         raw=np.zeros((len(case), 0)),
@@ -70,7 +70,7 @@ def test_a_complete_thermal_test_has_only_good_findings(good):
     ('name', 'changed', 'message'),
     [
         ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 advised\): run the'),
-        # WHY: the thermometer of a room was taken for the board's.
+        # WHY: the thermometer of a room was taken for the thermometer of the board.
         ('span', lambda w: {'temperature': 0.01 * w.temperature}, 'is the thermometer on'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
          'no thermometer: the calibration holds at the temperature of the test'),
@@ -92,7 +92,8 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
 
 
 def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, rng):
-    # WHY: soaks were refused for interpolated temperatures, whose noise enters rate and gradient.
+    # WHY: bags of soaks were refused: the noise of interpolated temperatures enters rate and
+    # gradient, and was taken for a ramp with exchanged sensors.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)
@@ -101,7 +102,7 @@ def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, r
     assert 'swapped' not in findings
     assert 'no ramp' in findings['ramps'].message
     assert 'soaks at 3 temperatures' in findings['soaks'].message
-    # A slow drift through the whole range is not a soak.
+    # A slow drift through the whole temperature range is not a soak.
     drift = replace(windows, rate=0.0 * windows.rate)
     assert 'soaks' not in findings_of(drift, up)
 
@@ -119,7 +120,7 @@ def test_rests_on_a_desk_with_a_prior_of_the_unit_need_no_chamber(good):
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
-    # A prior of the type has no information about effects of this unit alone.
+    # A prior of the type of unit has no information about effects of a single unit.
     of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
     assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}
 
@@ -130,7 +131,7 @@ def test_six_faces_do_not_determine_the_misalignment(good):
     assert not determines_misalignment(faces)
     message = findings_of(windows, faces)['misalignment'].message
     assert 'the misalignment keeps its prior' in message
-    # The same face again, two degrees off, is not a new position.
+    # A second rest on a face, two degrees off, is not a new position.
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
@@ -144,13 +145,13 @@ def test_six_faces_do_not_determine_the_misalignment(good):
 
 
 def test_geometry_is_the_scatter_of_the_parameters(rng):
-    # Expected by Monte Carlo: least-squares fits of the nine parameters to noise of the norm.
+    # The expected scatter is that of least-squares fits of nine parameters to noise of the norm.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))
     noise = rng.standard_normal((4000, 12))
     scatter = (noise @ np.linalg.pinv(jacobian).T).std(axis=0).max()
-    # 4000 draws determine a standard deviation to 1.1 %.
+    # 4000 draws determine the sd of a parameter to 1.1 %.
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
 
 
@@ -179,7 +180,7 @@ def test_the_residual_of_the_fit_is_reported():
     good = judged(100.0, 1.0, 0.2, 1.5)
     assert set(good) == {'residual'}
     assert '100.0 ug RMS raw, 1.5 ug on data left out, 1.0 ug' in good['residual'].message
-    # If no position can be left out, there is no residual on positions left out.
+    # If no position can be left out, the message has no residual of left-out positions.
     assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
 
 
@@ -187,7 +188,7 @@ def test_the_residual_of_the_fit_is_reported():
     ('given', 'name', 'message'),
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
-        # The temperatures are stamped an hour late, by another clock.
+        # The numbers of the next case are of temperatures stamped an hour late, by another clock.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
         # WHY: noise, a span of 0.3 K, and different turn-ons each gave false advice.
@@ -217,8 +218,8 @@ def test_options_out_of_range_are_refused(change, message):
 
 
 def test_the_gradient_of_a_soak_is_that_without_the_ramps(good, rng):
-    # The unit heats itself by 3 K; the board lags the case by 600 s in ramps, by 1500 s
-    # while a soak settles.
+    # The unit heats itself by 3 K; the board lags the case by 600 s in ramps, and by 1500 s while
+    # a soak settles.
     windows, _ = good
     t = windows.data.time
     rate = np.where(t < 3000.0, 1.0 / 60.0, 0.02 / 60.0 * np.exp(-(t - 3000.0) / 600.0))
@@ -227,7 +228,7 @@ def test_the_gradient_of_a_soak_is_that_without_the_ramps(good, rng):
     middle, sd = soak_gradient(replace(windows, rate=rate, gradient=gradient), None)
     assert middle == pytest.approx(-3.0, abs=0.01)
     assert sd == pytest.approx(0.01, rel=0.2)
-    # Without a soak, and without the case, the gradient is not known.
+    # Without a soak or without a case thermometer, the gradient of a soak is unknown.
     assert (
         soak_gradient(replace(windows, rate=np.full_like(t, 0.5), gradient=gradient), None) is None
     )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Claimed sd: effects that the model lacks; scatter of real units from position to position."""
+"""The claimed sd contains effects that the model lacks, and agrees with a jackknife."""
 
 from dataclasses import replace
 
@@ -68,8 +68,8 @@ def ratio(path):
     options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
     short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
     whole = reduce_source(source_of(stamps, accel, name=path.stem), full_scale=None, **short)
-    # The jackknife over the positions of one recording does not show how well turn-ons repeat:
-    # here each position counts as a recording.
+    # A jackknife over positions of one recording does not show how well turn-ons repeat, so each
+    # position is fitted as a recording.
     result = fit_bags([replace(whole, intervals=[each]) for each in whole.intervals], options)
     posterior = result.fit.posterior
     calibration, data = result.calibration, result.fit.windows.data

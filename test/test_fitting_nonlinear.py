@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits beyond 1 g: derivatives, choice of terms, radius, statements of |f|, whole runs."""
+"""Fits of nonlinear terms beyond 1 g: derivatives, choice of terms, radius, stated |f|, runs."""
 
 import math
 from dataclasses import replace
@@ -49,7 +49,7 @@ SIZES = np.tile([GRAVITY, 30.0, 60.0, 95.0], 6)
 
 
 def table(rng, k2=0.0, kq=0.0, k3=0.0, *, share=0.01, radius_sd=0.0, radius_error=0.0):
-    """Draw windows of 24 positions on a centrifuge; terms change by `share` per kelvin."""
+    """Draw windows of 24 positions on a centrifuge; terms of force change by `share` per K."""
     truth = Truth(on_bias=np.zeros((3, 6)), on_scale=np.zeros((3, 6)), offset_sd=MICRO)
     windows, up = table_of(truth, 24, rng, n_windows=10)
     t = windows.columns[:, 0]
@@ -216,7 +216,7 @@ def test_a_constant_rotation_is_a_rest_a_changing_rotation_is_not(rng):
     summed = cells.finish()
     still = still_intervals(without_rotation(summed), 3.0)
     edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
-    # After a change of rate the median needs 5 s to follow; cells beside a motion are not still.
+    # The median of the rate follows a change after 5 s, and cells beside a motion are not still.
     assert len(edges) == 3
     for (a, b), (begun, ended) in zip(edges, ((0, 80), (100, 180), (190, 240)), strict=True):
         assert begun <= a < begun + 8.0
@@ -240,7 +240,7 @@ def source(run, spin, name):
 
 @pytest.mark.slow
 def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
-    # For speed the test has one temperature, and nine mountings at 1, 3 and 8 g.
+    # For speed the runs have one temperature, and nine mountings at about 1, 3 and 8 g.
     unit = replace(triad('plain', 3), bend=Bend((10.0, -10.0, 10.0), (1.0, 1.0, -1.0)))
     time, rate = steps((150.0,), tuple(np.sqrt([3.0 * G, 8.0 * G])), 150.0, 20.0)
     program = Cyclogram((0.0, 560.0), (20.0, 20.0))
@@ -262,14 +262,15 @@ def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
     judged = judge_bags(result.bags, result.calibration)
     assert [round(size / G, 1) for size in judged.by_force] == [1.0, 3.2, 8.1]
     *_, most = judged.by_force.values()
-    # Noise and rounding leave some ug in means of 60 s; the nonlinear terms were hundreds of ug.
+    # Noise and rounding are some ug in means of 60 s; uncorrected nonlinear terms 100s of ug.
     assert most.rms < 10.0 * MICRO < 100.0 * MICRO < most.raw_rms
     narrow = replace(result.calibration.nonlinearity, force_range_m_s2=(9.0, 5.0 * G))
     outside = judge_bags(result.bags, replace(result.calibration, nonlinearity=narrow))
     assert outside.sections['outside'].n == most.n
     rows = results(evidence_of_fit(result), CertificateInfo(), ())
     assert {'K2 x', 'K3 z'} < {row.quantity for row in rows}
-    # A later tumble at 1 g, with this calibration as the prior, keeps the nonlinear terms.
+    # A fit to a later tumble at 1 g with the centrifuge calibration as prior keeps the nonlinear
+    # terms.
     still = [Position(program, position) for position in positions(6, 2)]
     later = arrays(unit, still, 9, rate_hz=2.0)
     tumble = [source(run, None, f'still{k}') for k, run in enumerate(later)]
@@ -281,7 +282,7 @@ def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
         replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
     ]
     assert population(siblings).nonlinearity is None
-    # A tumble alone leaves a nonlinear term at the bound of the data sheet, which is reported.
+    # A fit to a tumble alone leaves the sd of K2 at the bound of the data sheet, and reports so.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
     assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)

@@ -71,7 +71,7 @@ def test_the_reduction_does_not_depend_on_the_blocks(rng):
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz a cell of half a minute averaged several attitudes: |f| was 0.07 m/s^2.
+    # WHY: at 1 Hz a cell of 30 s averaged several attitudes, and |f| of its mean was 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -79,16 +79,16 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     assert len(bag.intervals) >= 18
     for interval in bag.intervals:
         size = np.linalg.norm(interval.mean, axis=1)
-        # The noise is 5 ug per sample, in windows of ten samples or, at the end, fewer samples.
+        # The noise is 5 ug per sample; a window has ten samples, the last window fewer.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
-    # Without short rests the cells of slow samples stay half a minute long.
+    # Without short rests the windows of samples at 1 Hz stay 30 s long.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
     assert reduced([alone], full_scale=None).window_s == 30.0
 
 
 @pytest.mark.parametrize('cycle_s', [0.01, 0.02, 0.04, 0.05, 0.1, 0.3, 1.0])
 def test_the_interval_between_samples_is_exact(rng, cycle_s):
-    # WHY: 10 Hz was stated as 9.9 Hz, since a cell holds 33 or 34 samples.
+    # WHY: a sample rate of 10 Hz was stated as 9.9 Hz, since a cell holds 33 or 34 samples.
     n = round(1800.0 / cycle_s)
     kept = rng.random(n) > 2.0 / n  # a few samples are lost
     samples = 9.8 + 0.01 * rng.standard_normal((n, 3))
@@ -101,7 +101,7 @@ def test_windows_are_means_of_their_samples(rng):
     (interval,) = reduced([block(samples)]).intervals
     assert interval.count.sum() == len(samples)
     assert len(interval.time) == 6
-    # A window of 10 s is 20 cells of half a second, 50 samples each.
+    # A window of 10 s consists of 20 cells of 0.5 s with 50 samples each.
     np.testing.assert_allclose(interval.mean[2], samples[2000:3000].mean(axis=0), atol=1e-10)
     assert interval.time[2] == pytest.approx(24.995, abs=1e-9)
     np.testing.assert_allclose(interval.sample_sd, 0.3, rtol=0.1)
@@ -124,7 +124,7 @@ def test_positions_in_one_bag_are_separated(rng):
 def test_a_chamber_whose_compressor_cycles_has_one_position(rng):
     # WHY: half of the recording was left out, and each pause of the compressor was a position: 18
     # bags had 1135 positions, and their fit took ten minutes. WHAT: twelve shakes of three times
-    # the noise belong to the rest, and a turn by 300 urad between two of them is still detected.
+    # the noise belong to the rest, and a turn by 300 urad between two shakes is detected.
     accel = still(rng, 720.0, (0.0, 0.0, 3000.0))
     for start in range(3000, 72000, 6000):
         accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
@@ -136,7 +136,7 @@ def test_a_chamber_whose_compressor_cycles_has_one_position(rng):
 
 
 def test_a_knock_starts_a_new_position(rng):
-    # Without vibration the attitude shifts by 1 count of 3000, 300 urad, or 20 sd of a cell mean.
+    # A knock turns the attitude by 1 count of 3000, which is 300 urad or 20 sd of a cell mean.
     accel = still(rng, 60.0, (0.0, 0.0, 3000.0))
     accel[3000:] += (1.0, 0.0, 0.0)
     assert len(reduced([block(accel)]).intervals) == 2
@@ -159,7 +159,7 @@ def test_bad_samples_are_counted_and_left_out(rng):
 
 
 def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
-    # WHY: with one reading in 60 of -127 degC the noise was 14 K, the error 25 times as large.
+    # WHY: one reading of -127 degC in 60 gave a thermometer noise of 14 K and 25 times the error.
     whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
@@ -170,7 +170,7 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     assert noise == pytest.approx(0.02, rel=0.1)
     (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'spikes')
     assert '33 readings' in finding.message
-    # The first and the last reading of a bag may be wrong, too.
+    # The first and the last reading of a bag are tested for spikes, too.
     at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
     assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
     # Slow readings of a fast change are not spikes.
@@ -181,7 +181,7 @@ def test_glitches_are_counted_and_end_no_rest(rng):
     # WHY: each wrong sample ended a rest, and a fit with 1 % of them took minutes instead of 2 s.
     whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
     whole.accel[50::100, 1] += 1500.0
-    # A tap of ten samples is a motion.
+    # A tap on the unit of ten samples is a motion, no glitch, and ends the rest.
     whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
     bag = reduced([whole])
     # A unit turned by hand for 20 s shakes: none of these samples is a glitch.
@@ -201,7 +201,7 @@ def test_samples_stamped_on_arrival_in_bursts_are_at_rest(rng):
     whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):
-        # 100 Hz: the samples of a burst are 0.3 ms apart.
+        # At a mean rate of 100 Hz the samples of a burst have stamps 0.3 ms apart.
         stamps = (number // size * size + size) * 10_000_000 + number % size * 300_000
         bag = reduced([replace(whole, accel_stamp_ns=whole.accel_stamp_ns[0] + stamps)])
         assert len(bag.intervals) == 1
@@ -254,7 +254,7 @@ def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # Cells of 0.5 s fill a window of 10 s; cells of 30 samples do not at 4 Hz and 1 Hz.
+    # 20 cells of 0.5 s fill a window of 10 s; at 4 Hz and 1 Hz a cell is as long as a window.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng):
@@ -334,9 +334,9 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Noise below a tenth of the quantum is invisible; a tenth is assumed.
+    # Noise below a tenth of the quantum is invisible; a tenth of the quantum is assumed as noise.
     assert learned.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
-    # From means of a minute the lag is estimated to a third.
+    # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
     assert learned.fastest_ramp_k_min >= 1.0
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The regression: mode, covariance and evidence against dense linear algebra, and its bounds."""
+"""The regression against dense linear algebra: mode, covariance, evidence, left-out errors."""
 
 from dataclasses import replace
 
@@ -77,7 +77,7 @@ class Dense:
         )  # fmt: skip
 
     def residual(self, x):
-        """All residuals in sd: those of the windows, then those of the prior."""
+        """Return all residuals in units of their sd: of the windows, then of the prior."""
         w, prior, state = self.windows, self.prior, self.state(x)
         rms = np.sqrt(np.mean(w.columns**2, axis=0))
         moved = w.columns.copy()
@@ -100,7 +100,7 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
             state.start.ravel() / np.sqrt(prior.start_share),
-            # The mean initial lag state of all bags has a tenth of the sd of one bag's state.
+            # The prior sd of the mean initial lag state of all bags is 0.1 of that of one bag.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
         ]
         if len(state.pose):
@@ -115,7 +115,7 @@ class Dense:
         return np.concatenate(parts)
 
     def jacobian(self, x):
-        """Return central differences with steps of a tenth of each sd: linear to some 1e-9."""
+        """Return the Jacobian by central differences with steps of 0.1 sd: linear to some 1e-9."""
         sd = np.sqrt(self.at.variance)
         columns = []
         for k in range(self.n):
@@ -133,7 +133,8 @@ class Dense:
 def solved(request):
     n_positions, pose_of = request.param
     rng = np.random.default_rng(5)
-    # The table draws an initial state per position; positions of one bag share one state, here 0.
+    # The table draws an initial lag state per position. Positions of one bag share a state, so the
+    # states are 0 for bags of several positions.
     truth = Truth(
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
@@ -145,8 +146,8 @@ def solved(request):
     bag = windows.position // n_positions
     windows = replace(windows, weight=weight, bag=bag, pose=pose)
     regression, state = begin(windows, up)
-    # Two poses do not determine the triad. A narrow prior of its scale and misalignment, and small
-    # tilts, keep their products small, which the regression omits from the derivatives.
+    # Two poses do not determine the triad. Narrow priors of scale and misalignment, and small
+    # tilts, keep products of parameters small, which the derivatives of the regression omit.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
@@ -188,7 +189,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # The prior of the mean initial lag state depends on the number of bags: allow for this.
+    # The prior of the mean initial lag state adds a constant, which is equal for both shares.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
@@ -207,7 +208,7 @@ def test_without_noise_the_regression_gives_the_truth(rng):
         weights = mode.weights[part] / regression.rms
         np.testing.assert_allclose(weights, truth.weights[part], atol=atol)
     np.testing.assert_allclose(mode.start, 0.0, atol=1e-2)
-    # The regression corrects windows as the compensator does, which inverts the model.
+    # `Regression.force` corrects windows by inverting the model, as the compensator does.
     force = regression.force(mode)
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 
@@ -229,7 +230,7 @@ def test_the_claimed_sd_of_the_regression_is_the_scatter_of_errors():
 
 
 def refit_of(whole, regression, prior, kept):
-    """Fit some rows alone; weights are in units of the whole table's RMS."""
+    """Fit the rows `kept` alone; weights stay in units of the RMS of the whole table."""
     windows = regression.windows
     rest = Regression(rows_of(windows, np.flatnonzero(kept)), GRAVITY, NOMINAL)
     units = rest.rms / regression.rms
@@ -243,13 +244,13 @@ def refit_of(whole, regression, prior, kept):
 
 
 #: With LINEAR groups the problem is linear in everything except directions, which are determined
-#: to some urad: the result is exact except for rounding. With PRODUCTS a score, found by one or
-#: two linear steps, neglects the product of the changes of initial lag state and of its weight.
+#: to some urad: a left-out score is exact except for rounding. With PRODUCTS a score, found by one
+#: or two linear steps, neglects the product of the changes of initial lag state and of its weight.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
 def scored(groups, n, rng, *, n_windows, step_s, **changes):
-    """Fit a unit whose errors are of the given groups; return windows, directions and fit."""
+    """Fit a unit with errors of the given groups; return table, fit and left-out score."""
     used = np.isin(GROUPS, groups)
     truth = Truth(on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used, start_sd=0.3,
                   **changes)  # fmt: skip
@@ -295,7 +296,7 @@ def test_the_left_out_error_of_a_section_is_that_of_a_fit_without_it(rng, groups
         size = np.sqrt(np.mean(expected**2))
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
-    # A single position cannot be left out: the score is the drift of the sections.
+    # A table of one position has no left-out position: its score is the drift of the sections.
     alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
     alone_score = score_of(alone, alone.solve(state, prior))
     assert np.isnan(alone_score.positions.rms)
@@ -313,7 +314,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The score of the drift needs neither bias nor scale; M keeps its value and its sd.
+    # The score of the drift needs neither bias nor scale; M keeps its prior value and prior sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment
@@ -322,7 +323,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
 def test_no_step_of_the_solver_increases_the_objective(seed):
-    # Bags with few data start far from rest, so the product of initial state and weight matters.
+    # The bags start far from thermal equilibrium: products of initial lag state and weight matter.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
@@ -391,7 +392,8 @@ def test_published_huygens_coefficients_come_back(rng):
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
 def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
-    # Linear problem: S is the inverse covariance of the columns, S^-1 Q the estimated weight.
+    # In a linear problem S is the inverse covariance of the weights of inactive columns, and
+    # S^-1 Q is the estimate of the weights.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)

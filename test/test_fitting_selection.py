@@ -94,7 +94,7 @@ def test_tried_models_show_their_left_out_errors(calm):
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
     assert chosen.score is selected.score
-    # Left-out windows have white noise, plus the uncertainty of the fit to the other windows.
+    # The left-out error is the white noise plus the uncertainty of the fit to the other windows.
     assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
@@ -110,7 +110,8 @@ def test_a_forced_group_stays_in_the_model(calm):
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen):
-    # The evidence favours the group in all cases; left-out data reject it in one bag or section.
+    # The evidence favours the group 'idle' in all cases; left-out data reject a group that acts in
+    # one bag or section only.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -126,7 +127,8 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
 def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, step_s):
-    # WHY: a bias that follows only a lagged temperature needs curve and lag together.
+    # WHY: a bias that follows only a lagged temperature needs 'curve' and 'board' together: with
+    # 'curve' alone the fit does not improve.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -147,7 +149,7 @@ def test_noise_parameters_are_estimated(noisy):
     # Positions last only six correlation times of the slow noise, and curves absorb a part of it.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
-    # 54 readings less 45 unknowns (directions, scale, bias, M) give the mounting sd to 24 %.
+    # 54 means less 45 unknowns (directions, scale, bias, M) determine the mounting sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
@@ -155,7 +157,7 @@ def test_flicker_noise_has_several_correlation_times():
     # WHY: with a single correlation time the initial lag states and the tilts explained the slower
     # processes, and the errors of the biases were 1.9 claimed sd.
     # Flicker noise whose shortest time is below the candidates, 3 windows, was taken for noise of
-    # one correlation time, because both were compared before their variances had been searched.
+    # one correlation time: the two noise models were compared before the search of variances.
     errors = []
     for seed, time_s in ((0, 400.0), (5, 400.0), (6, 400.0), (6, 180.0)):
         truth = Truth(noise=Noise(4.0, time_s, 3))
@@ -173,7 +175,8 @@ def test_flicker_noise_has_several_correlation_times():
 
 
 def test_rounding_excludes_no_correlation_time_from_the_search():
-    # WHY: 10**log10(180) is below 180, so the variance ratio kept its estimate from residuals.
+    # WHY: 10**log10(180) is below 180: the search left out 180 s, and the variance ratio kept its
+    # estimate from residuals.
     whitener = Whitener(np.zeros(300, np.int64), 60.0 * np.arange(300))
     assert whitener.times_s[0] == 180.0
     for time_s in whitener.times_s:
@@ -273,7 +276,7 @@ def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
     evidence = group_evidence(regression, chosen.posterior)
     explains = {(group.part, group.group): group.explains_m_s2 for group in evidence}
     expected = np.sqrt(np.mean((columns @ truth.on_bias[:, 2:4].T) ** 2))
-    # The group's effect is about 100 ug, the noise of a window 2 ug.
+    # The group 'board' changes the bias by about 100 ug; the noise of a window is 2 ug.
     assert explains['bias', 'board'] == pytest.approx(expected, rel=0.05)
 
 
@@ -297,7 +300,7 @@ def test_outliers_do_not_shift_the_fit(calm):
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(one.posterior.variance[one.posterior.layout.bias])
-    # 2 % outliers of 100 sd, each down-weighted to 3 sd, shift the result by less than 1 sd.
+    # 2 % outliers of 100 sd, each down-weighted to 3 sd, shift the bias by less than 1 sd.
     assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     used, used_with_outliers = (
@@ -307,7 +310,8 @@ def test_outliers_do_not_shift_the_fit(calm):
 
 
 def test_means_that_take_few_values_are_no_outliers():
-    # With a converter that carries its remainder most means are equal, some differ by a count.
+    # If a converter adds its rounding remainder to the next sample, most means are equal and some
+    # differ by a count.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -350,7 +354,8 @@ def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, up
 
 @pytest.mark.parametrize('offset', [0.0, 30.0])
 def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, offset):
-    # The units may differ by less or more than their sd: the evidence selects the true prior.
+    # A unit may differ from the mean of a prior by 0 or by 30 sd: the evidence selects the prior
+    # with the sd that fits.
     _, one, truth = calm
     state = one.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -429,7 +434,7 @@ def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
     (without, _), (within, _) = claimed(12), claimed(12, 5e-4)
     added = within - without
     kappa = np.arange(3) * ((len(without) - 3) // 3)
-    # The relative error of K is that of g in each axis; no other parameter has an error.
+    # An error of g adds its relative size to the error of K in each axis, and nothing elsewhere.
     both = np.ix_(kappa, kappa)
     np.testing.assert_allclose(added[both], (5e-4 / GRAVITY) ** 2, rtol=2e-3)
     correlation = added[both] / np.sqrt(np.outer(np.diag(added)[kappa], np.diag(added)[kappa]))
@@ -439,8 +444,8 @@ def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
 
 
 def test_the_drifts_of_scale_factors_show_how_well_turn_ons_repeat():
-    # WHY: nine constants explain the norms of nine positions. The fit kept offsets of 5 ug, with
-    # constants wrong by 75 claimed sd.
+    # WHY: nine constants explain the norms of nine positions. The fit kept an offset sd of 5 ug,
+    # with constants wrong by 75 claimed sd.
     truth = Truth(
         offset_sd=300.0 * MICRO,
         sigma=np.full(3, 0.5 * MICRO),
@@ -451,8 +456,8 @@ def test_the_drifts_of_scale_factors_show_how_well_turn_ons_repeat():
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     posterior = select(regression, state, constants(truth), candidates).posterior
-    # The drifts determine the 27 offsets, except for 9 combinations that the constants explain:
-    # the sd is uncertain by 1 / sqrt(2 * 18), 17 %, and three times this is allowed.
+    # The drifts determine the 27 offsets, except for 9 combinations that the constants explain.
+    # The offset sd is uncertain by 1 / sqrt(2 * 18), 17 %; the tolerance is three times 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three independent errors in units of their sd exceeds 2 by a chance of 0.7 %.

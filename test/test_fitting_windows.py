@@ -75,7 +75,7 @@ def test_memory_on_a_grid_equals_memory_stepped_reading_by_reading(rng):
             bank_.step(stamp, float(gradient[k]))
         row = memory.at(stamp, float(board[k]), [float(g[k]) for g in gradients])
         if k % 100 == 99:
-            # Grid and stream add the same terms in different orders, so they differ by rounding.
+            # Grid and stream add equal terms in different orders, so results differ by rounding.
             np.testing.assert_allclose(on_grid[k], row, atol=1e-9)
 
 
@@ -104,11 +104,12 @@ def test_columns_of_the_fit_are_those_of_the_tracker(bags):
     phi = table.values(np.array(states).T).T
     seconds = (grid - bag.start_ns) * 1e-9
     n_sets = rows.shape[1] - phi.shape[1]
-    # The expected columns are means over the windows of a minute.
+    # The expected columns are means of the columns of the tracker over windows of 60 s.
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # Plays reverse at other times: lags in the fit follow readings, not estimates.
+    # The tolerance allows for plays that reverse at other times: lags in the fit follow readings,
+    # lags of the tracker follow estimates.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
@@ -117,12 +118,13 @@ def test_columns_of_sets_and_start_states_by_hand(bags):
     data = windows.data
     t, w = windows.temperature - 20.0, windows.weight
     assert data.groups[:6] == ('curve',) * 3 + ('set',) * 3
-    # Means of products equal products of means, except for changes within a minute at 1 K/min.
+    # A mean of t^2 over 60 s is the square of the mean, except for the change of t at 1 K/min.
     np.testing.assert_allclose(data.columns[:, 0], t, atol=1e-9)
     np.testing.assert_allclose(data.columns[:, 1], t * t, atol=0.3)
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # An initial lag state decays with the time constant of the lag; products multiply it by t.
+    # An initial lag state decays with the time constant of the lag; in a product t multiplies the
+    # state.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
@@ -138,7 +140,7 @@ def test_columns_of_sets_and_start_states_by_hand(bags):
 @pytest.mark.parametrize('name', ['board', 'case'])
 @pytest.mark.parametrize('is_stuck', [False, True])
 def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
-    # The thermometer is silent or repeats a value from the first ramp until late in the second.
+    # The thermometer is silent, or repeats a value, from 900 s to 2200 s, in both ramps.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]
     age = (readings.stamp_ns - bag.start_ns) * 1e-9
@@ -150,7 +152,8 @@ def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A silent thermometer is missing after 60 s (time-out), 5 intervals and a window.
+    # A silent thermometer counts as missing after 60 s (time-out), 5 intervals and a window; a
+    # stuck thermometer after 600 s.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -198,7 +201,7 @@ def test_curves_of_the_fit_by_hand(bags, options, static, dynamic, is_shared):
     weight = np.linspace(0.0, 1.0, 9)
     columns = sets.columns(t, weight)
     assert len(columns) == len(sets.groups) == sets.static.n_free + 1 + sets.dynamic.n_free
-    # At the reference temperature only the level of the dynamic set is not 0.
+    # At the reference temperature all columns are 0 except the level of the dynamic set.
     nothing = sets.columns(np.zeros(3), np.array([0.0, 0.5, 1.0]))
     for k, column in enumerate(nothing):
         expected = [0.0, 0.5, 1.0] if k == sets.level else 0.0
@@ -264,7 +267,7 @@ def test_the_calibration_file_corrects_as_the_regression(fitted):
 
 
 def test_the_covariance_of_the_file_is_that_of_the_regression(fitted):
-    # The parameters of the file and of the regression give the same variance of levels.
+    # The file must give bias, K and M the sd that the claim of the regression gives.
     result, claim = fitted
     calibration = result.calibration
     layout = parameter_layout(calibration)

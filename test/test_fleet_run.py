@@ -157,7 +157,7 @@ def test_an_interrupted_fleet_run_continues(client, tmp_path):
         fit_fleet(str(fleet), out, OPTIONS, client=client, progress=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
-    # The files of this unit were cut off as by a power failure.
+    # The result file of unit A/u0 is cut off, as by a power failure.
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, client=client)
@@ -171,7 +171,7 @@ def children_of(pid):
 
 
 def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
-    # WHY: on Ctrl-C each starting worker, and then Dask, printed a traceback.
+    # WHY: on Ctrl-C each starting worker, and Dask, printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
     process = subprocess.Popen(
@@ -189,7 +189,7 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
     printed, _ = process.communicate(timeout=60)
     assert process.returncode == 130
     printed = printed.splitlines()
-    # Ctrl-C may come before or after the first test has begun.
+    # Ctrl-C may arrive before or after the fit of the first unit has begun.
     assert printed in (
         [f'thermo_comp: interrupted: {state}, kept in out; the same command continues']
         for state in ('no test has begun', '0 of 1 test done')
@@ -220,7 +220,7 @@ class TestScheduler:
         refused = str(fleet / 'B')
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)
         assert [row['verdict'] for row in result.rows] == ['refused']
-        # A worker with another version of thermo_comp could give another result for the same test.
+        # Workers with another version of thermo_comp are refused: results could differ.
         monkeypatch.setattr('thermo_comp.fleet.work.__version__', '9.9')
         with pytest.raises(ThermoCompError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
@@ -306,7 +306,8 @@ def test_other_options_fit_a_unit_again(client, fleet, tmp_path):
 
 
 def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
-    # WHY: one position in the chamber does not separate bias from scale.
+    # WHY: one position in the chamber does not separate bias from scale: a unit with one position
+    # needs the prior of its siblings.
     kind = unit_preset('mems', 1)
     siblings = [sibling(kind, number) for number in range(4)]
     for number, unit in enumerate(siblings):
@@ -325,7 +326,7 @@ def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
     assert contents(tmp_path / 'out' / 'units') == before
     assert [bool(row['prior']) for row in helped.rows] == [True, False, False, False]
     (before_row, *_), (row, *_) = alone.rows, helped.rows
-    # The error of one axis may be small by chance, so all three axes are judged together.
+    # The scale error of one axis may be small by chance, so the norm over all axes is compared.
     scale = np.array(siblings[0].scale_factor)
     errors, sds = (
         [np.array([float(one[name.format(axis)]) for axis in 'xyz']) for one in (row, before_row)]
@@ -376,7 +377,7 @@ def test_a_prior_does_not_repair_units_that_contradict_themselves(client, tmp_pa
         ('no better than raw', 0, False),
         ('thermometers exchanged or loose: not judged', 1, False),
         ('thermometers exchanged or loose: not judged', 0, False),
-        # Refusals of contradictory data, and of missing data.
+        # A refusal is of contradictory data if `is_whole` is None, and of missing data if it is 0.
         ('refused', None, False),
         ('refused', 0, True),
         ('failed', None, False),
