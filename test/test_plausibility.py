@@ -111,7 +111,7 @@ def test_a_frozen_sensor_is_found_by_changes_of_the_second_sensor(sensor, frozen
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # A frozen board is wrong by some quanta and 1 K, a frozen case by up to 10 K.
+    # A frozen board is wrong by up to 4 quanta and 2 K, a frozen case by 10 K more.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead

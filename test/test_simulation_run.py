@@ -169,7 +169,7 @@ def test_a_run_refuses_impossible_arguments(unit):
         simulate(unit, SHORT, UP, gravity=float('nan'))
 
 
-# Both solutions of a thermal network are closed forms: they differ by rounding of tens of degC.
+# Both solutions of a thermal network are closed forms: they differ by rounding, at tens of degC.
 ROUNDING = 1e-9
 
 
