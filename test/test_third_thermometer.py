@@ -3,8 +3,8 @@
 """
 A third thermometer is found in the bags, fitted, applied by replay, and improves the result.
 
-Electronics under the lid, which heat neither board nor case, are switched at random. Only the
-thermometer of the lid explains the effect of the lid on the axes.
+Electronics under the lid, which warm board and case by 0.1 K only, are switched at random. Only
+the thermometer of the lid explains the effect of the lid on the axes.
 """
 
 import math

@@ -68,15 +68,17 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
+    # Products without the lag leave more than the effect of the lag; the fit must take away most.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 
 
-def test_a_single_turn_on_is_claimed_as_that_of_separate_recordings():
+def test_a_single_turn_on_is_claimed_with_the_repeatability_of_its_grade():
     # WHY: for one recording the sd of turn-ons had the prior of mountings, which is half as large:
     # a MEMS whose turn-ons differ by 0.6 mg erred by 5 times its claimed sd at the next turn-on.
     rng = np.random.default_rng(3)
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
-    # The noise of 0.25 mg in 1 Hz is that of a MEMS, whose turn-ons repeat within 0.1 to 1 mg.
+    # The noise of 0.25 mg in 1 Hz is that of a MEMS, whose turn-ons repeat within 0.1 to 1 mg:
+    # the claim is at least the geometric mean, 0.3 mg, and at most half more than the largest.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY

@@ -30,6 +30,7 @@ from .regression import Posterior, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalWindows
 
+#: Group of the heat flow, whose columns are gradients of sensors.
 GRADIENT = 'gradient'
 #: Large sd of mounting offsets relative to the prior's scale: turn-ons of tactical triads repeat
 #: within 0.3 to 1 mg by data sheets, which is 10 to 20 times the scale of the prior.
