@@ -73,7 +73,8 @@ class Dense:
             at.kappa + x[layout.kappa], at.bias + x[layout.bias],
             at.weights + padded[layout.weights], at.misalignment + x[layout.misalignment],
             up / np.linalg.norm(up, axis=1, keepdims=True), at.offset + x[layout.offset],
-            at.tilt + x[layout.tilt], at.start + x[layout.start], pose=pose, pose_of=pose_of,
+            at.tilt + x[layout.tilt], at.start + x[layout.start], at.turn_on + x[layout.turn_on],
+            pose=pose, pose_of=pose_of,
         )  # fmt: skip
 
     def residual(self, x):
@@ -91,6 +92,8 @@ class Dense:
         across = np.einsum('pij,pkj->pki', state.tangents, state.tilt)[w.position]
         predicted += state.kappa * GRAVITY * np.einsum('nk,nki->ni', w.tilt, across) @ A.T
         predicted += state.bias + moved @ state.weights[0].T + state.offset[w.position]
+        if state.turn_on.size:
+            predicted += state.turn_on[w.bag]
         left = w.mean / NOMINAL - predicted
         parts = [self.roots[axis] @ left[:, axis] for axis in range(3)]
         parts += [
@@ -99,6 +102,7 @@ class Dense:
             state.misalignment / prior.misalignment_sd,
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
+            state.turn_on.ravel() / prior.turn_on_sd,
             state.start.ravel() / np.sqrt(prior.start_share),
             # The prior sd of the mean initial lag state of all bags is 0.1 of that of one bag.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),

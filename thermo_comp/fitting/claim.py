@@ -88,20 +88,34 @@ def claim_of(
     posterior = regression.solve(chosen.state, prior, n_steps=0)
     layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
     # A stated offset sd is that of a mounting or a turn-on: beside the independent offsets of m
-    # mountings the covariance contains the offsets of n turn-ons with 1 - n / m of the variance.
-    shared_variance = offset_sd**2 * (1.0 - n_turn_ons / n_mountings)
+    # mountings the covariance contains the offset of a single turn-on with 1 - 1 / m of the
+    # variance. Offsets of several turn-ons are unknowns of the regression.
+    is_shared = n_turn_ons < n_mountings
+    shared_variance = chosen.prior.turn_on_sd**2 if regression.has_turn_ons else 0.0
+    if is_shared and not regression.has_turn_ons:
+        shared_variance = offset_sd**2 * (1.0 - 1.0 / n_mountings)
+    of_turn_ons = np.zeros_like(covariance)
     if prior.offset_scale > 0.0:
-        kind = 'both' if n_turn_ons == n_mountings else 'mounting'
+        kind = 'mounting' if is_shared else 'both'
         tried = _offsets_tried(prior.offset_scale, known_offset_sd, kind)
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
-        tried = _offsets_tried(prior.offset_scale, known_offset_sd, 'turn-on')
-        shared_variance = _turn_on_sd(regression, posterior, *tried) ** 2
+        kind = 'both' if regression.has_turn_ons else 'turn-on'
+        tried = _offsets_tried(prior.offset_scale, known_offset_sd, kind)
+        if regression.has_turn_ons:
+            mixture, turn_on_sd = _over_turn_ons(regression, posterior, *tried)
+            of_turn_ons = _excess(mixture, posterior.covariance)
+            shared_variance = turn_on_sd**2
+        elif is_shared and regression.gravity:
+            # The norms of a single turn-on do not show how well turn-ons repeat.
+            weight = np.exp(tried[1])
+            shared_variance = float(weight @ tried[0] ** 2 / weight.sum())
         offset_sd = float(np.sqrt(offset_sd**2 + shared_variance))
+    covariance = covariance + of_turn_ons
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
     if lacks_effects:
         covariance = covariance + _excess(jackknife_covariance(regression, posterior), covariance)
-    if shared_variance:
-        covariance = covariance + shared_variance * _of_turn_ons(regression, posterior)
+    if shared_variance and not regression.has_turn_ons:
+        covariance = covariance + shared_variance * _of_turn_on(regression, posterior)
     if candidates is not None:
         # The covariance with unseen columns is computed at the mode's mounting sd. Add to it the
         # excess, by mixtures, jackknife and turn-ons, over the covariance of the mode.
@@ -264,8 +278,33 @@ def _over_mountings(
     if n_rests > 1.0:
         # All rests of a mounting share its offset: only the mountings' means determine its sd.
         fits, weight = solved(n_rests**0.5 * tried), of_norms
-    weight = weight + log_density
-    weight = np.exp(weight - weight.max())
+    covariance, weight = _mixture(posterior, fits, weight + log_density)
+    return covariance, float(np.sqrt(weight @ tried**2))
+
+
+def _over_turn_ons(
+    regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
+) -> tuple[Floats, float]:
+    """Return covariance and sd of the mixture of fits over the sd of turn-ons."""
+    fits = [
+        regression.solve(
+            posterior.state, replace(posterior.prior, turn_on_sd=float(sd)), n_steps=1
+        )
+        for sd in tried
+    ]
+    evidence = np.array([fit.log_evidence for fit in fits])
+    covariance, weight = _mixture(posterior, fits, evidence + log_density)
+    return covariance, float(np.sqrt(weight @ tried**2))
+
+
+def _mixture(
+    posterior: Posterior, fits: Sequence[Posterior], log_weight: Floats
+) -> tuple[Floats, Floats]:
+    """
+    Return the covariance of the unit's unknowns by a mixture of fits, about the mode of the
+    posterior, and the weights of the fits, whose sum is 1.
+    """
+    weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit
     mode = as_vector(posterior.state, posterior.layout)[:n]
@@ -273,7 +312,7 @@ def _over_mountings(
     for share, fit in zip(weight, fits, strict=True):
         difference = as_vector(fit.state, fit.layout)[:n] - mode
         covariance += share * (fit.covariance + np.outer(difference, difference))
-    return covariance, float(np.sqrt(weight @ tried**2))
+    return covariance, weight
 
 
 def _excess_over_priors(
@@ -291,13 +330,7 @@ def _excess_over_priors(
         regression.solve(posterior.state, replace(posterior.prior, informative=each), n_steps=3)
         for each in informative
     ]
-    weight = np.array([fit.log_evidence for fit in fits])
-    weight = np.exp(weight - weight.max())
-    mode = as_vector(posterior.state, posterior.layout)[:n]
-    mixture = np.zeros((n, n))
-    for share, fit in zip(weight / weight.sum(), fits, strict=True):
-        difference = as_vector(fit.state, fit.layout)[:n] - mode
-        mixture += share * (fit.covariance + np.outer(difference, difference))
+    mixture, _ = _mixture(posterior, fits, np.array([fit.log_evidence for fit in fits]))
     return _excess(mixture, posterior.covariance)
 
 
@@ -309,55 +342,22 @@ def _excess(covariance: Floats, other: Floats) -> Floats:
     return np.asarray(root @ root.T)
 
 
-def _turn_on_sd(
-    regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
-) -> float:
+def _of_turn_on(regression: Regression, posterior: Posterior) -> Floats:
     """
-    Return the sd of the bias offset of a turn-on [m/s^2], in addition to the sd of a mounting; 0
-    if each mounting has a separate turn-on, whose offset is part of the mounting's offset.
-
-    The norms show how well turn-ons repeat only if there are several turn-ons; for a single
-    turn-on the sd is that of the prior. `tried` and `log_density` are as in `_over_mountings`.
-    """
-    windows = regression.windows
-    if not regression.gravity or windows.n_turn_ons == windows.mounting[-1] + 1:
-        return 0.0
-    without_norms = replace(posterior.prior, offset_sd=float(tried[-1]))
-    by_drifts = regression.solve(posterior.state, without_norms, n_steps=1).root
-    evidence = _norm_evidence(regression, posterior, tried, by_drifts, of_turn_ons=True)
-    weight = evidence + log_density
-    weight = np.exp(weight - weight.max())
-    return float(np.sqrt(weight @ tried**2 / weight.sum()))
-
-
-def _of_turn_ons(regression: Regression, posterior: Posterior) -> Floats:
-    """
-    Return the covariance of the unit's unknowns by bias offsets of turn-ons, of unit variance and
-    common to the positions of a turn-on, shape (n_unit, n_unit).
-
-    Offsets of turn-ons at different temperatures change the curve; offsets of turn-ons with one
-    temperature program change the bias by the mean of the offsets.
+    Return the covariance of the unit's unknowns by a bias offset of unit variance that all
+    positions of a single turn-on share, shape (n_unit, n_unit).
     """
     point = regression.at(posterior.state, posterior.prior)
-    turn_on = regression.windows.turn_on_of_position
-    by_offsets = np.array([
-        point.by_offset(np.flatnonzero(turn_on == number), axis)
-        for number in np.unique(turn_on) for axis in range(3)
-    ])  # fmt: skip
-    return np.asarray(by_offsets.T @ by_offsets)
+    by_offset = np.array([point.by_offset(axis) for axis in range(3)])
+    return np.asarray(by_offset.T @ by_offset)
 
 
 def _norm_evidence(
-    regression: Regression,
-    posterior: Posterior,
-    offset_sd: Floats,
-    by_drifts: Floats,
-    *,
-    of_turn_ons: bool = False,
+    regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
     Return the log evidence of the mean norms of the mountings for each of k values of `offset_sd`,
-    the sd of the offsets of mountings or, with `of_turn_ons`, of turn-ons.
+    the sd of the offsets of mountings.
 
     `by_drifts`: root of the covariance without the norms, for the thermal weights
     """
@@ -370,11 +370,10 @@ def _norm_evidence(
     # Covariance of the norms, without the mounting offsets.
     errors = np.sum(point.norm_by_axes * (residual + state.offset), axis=1)
     first = np.flatnonzero(np.diff(regression.windows.mounting, prepend=-1))
-    rows = np.column_stack((point.norm_by_axes, along, errors, np.ones(len(along))))
+    rows = np.column_stack((along, errors, np.ones(len(along))))
     rows = np.add.reduceat(rows * weight[:, None], first, axis=0)
     weight = rows[:, -1]
-    by_axes, along, (errors,) = np.split(rows[:, :-1].T / weight, [3, 3 + along.shape[1]])
-    along = along.T
+    along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
     if prior.informative is None:
         # The prior of the constants is almost flat, so it is centred on the state.
         weights = layout.axis[:, 2:].ravel()
@@ -387,16 +386,7 @@ def _norm_evidence(
         errors += along @ point.deviation[: layout.n_unit]
         of_prior = solve_triangular(prior.informative.root, along.T, trans='T').T
     noise = float(np.mean(prior.sigma**2)) * (1.0 / weight + prior.noise.variance)
-    known = of_prior @ of_prior.T
-    if not of_turn_ons:
-        variances, vectors = np.linalg.eigh(known + np.diag(noise))
-        variances = np.maximum(variances, noise.min()) + offset_sd[:, None] ** 2
-        square = np.sum((vectors.T @ errors) ** 2 / variances, axis=1)
-        return np.asarray(-0.5 * (square + np.sum(np.log(variances), axis=1)))
-    known += np.diag(noise + prior.offset_sd**2)
-    turn_on = regression.windows.turn_on_of_position[first]
-    shared = (by_axes.T @ by_axes) * (turn_on[:, None] == turn_on)
-    roots = [np.linalg.cholesky(known + sd**2 * shared) for sd in offset_sd.tolist()]
-    squares = [np.sum(solve_triangular(root, errors, lower=True) ** 2) for root in roots]
-    logs = [2.0 * np.sum(np.log(np.diag(root))) for root in roots]
-    return np.asarray(-0.5 * (np.array(squares) + np.array(logs)))
+    variances, vectors = np.linalg.eigh(of_prior @ of_prior.T + np.diag(noise))
+    variances = np.maximum(variances, noise.min()) + offset_sd[:, None] ** 2
+    square = np.sum((vectors.T @ errors) ** 2 / variances, axis=1)
+    return np.asarray(-0.5 * (square + np.sum(np.log(variances), axis=1)))

@@ -4,8 +4,8 @@
 Owns the elimination of the unknowns of positions and bags from the normal equations.
 
 Each position has unknowns (attitude, offsets, tilts) that occur in no other position. The
-unknowns of positions are eliminated first, then the initial lag states of each bag. After the
-elimination, normal equations for the unknowns of the unit remain.
+unknowns of positions are eliminated first, then the initial lag states and the turn-on offset of
+each bag. After the elimination, normal equations for the unknowns of the unit remain.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class Reduced:
     The normal equations of the unit's n unknowns, with all other unknowns eliminated.
 
     layout: places of the unknowns
-    starts_prior: precision of the initial lag states, and precision times state, (2, n_bags, r)
+    of_bag_prior: precision of the unknowns of bags, and precision times value, (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
     positions: the blocks of the positions, with their cross blocks for the initial lag states of
         the bag, then for the unknowns of the unit
@@ -118,7 +118,7 @@ class Reduced:
     """
 
     layout: Layout
-    starts_prior: Floats
+    of_bag_prior: Floats
     matrix: Floats
     positions: Blocks
     shares: tuple[Floats, Floats]
@@ -138,9 +138,10 @@ class Reduced:
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
         """Add a prior of mean 0 to the sum of the initial lag states, at present `total`."""
-        cross = self.bags.solved.sum(axis=0, keepdims=True)
+        r = len(total)
+        cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total
-        block = self.bags.inverse.sum(axis=0, keepdims=True) + variance * np.eye(len(total))
+        block = self.bags.inverse[:, :r, :r].sum(axis=0, keepdims=True) + variance * np.eye(r)
         return replace(self, common=Blocks.of(block, cross))
 
     def follow(self, step: Floats) -> tuple[Floats, Floats]:
@@ -149,7 +150,7 @@ class Reduced:
         starts = self.bags.solved[..., -1] - self.bags.solved[..., :-1] @ step
         if self.common is not None:
             excess = self.common.solved[0, :, -1] - self.common.solved[0, :, :-1] @ step
-            starts -= self.bags.inverse @ excess
+            starts -= self.bags.inverse[..., : len(excess)] @ excess
         positions = solved[..., -1] - solved[..., r:-1] @ step
         positions -= np.einsum('pkr,pr->pk', solved[..., :r], starts[self.layout.bag])
         return positions, starts
@@ -172,7 +173,7 @@ class Reduced:
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)
-        rest = _of_bags(others.astype(np.float64), self.shares, self.starts_prior[:, at])
+        rest = _of_bags(others.astype(np.float64), self.shares, self.of_bag_prior[:, at])
         gone = _of_unit(normal.unit, self.layout) - _square(self.positions.turned[places][..., r:])
         return np.asarray(self.whole - gone + _square(self.bags.turned[at]) - _square(rest.turned))
 
@@ -187,7 +188,7 @@ class Reduced:
         """
         layout, turned = self.layout, self.positions.turned
         n_positions, n_own, _ = turned.shape
-        n_local, r, m = layout.n_local, layout.start.shape[1], rows.shape[2]
+        n_local, r, m = layout.n_local, layout.of_bag.shape[1], rows.shape[2]
         local = np.zeros((n_positions, n_own + r, m, 3))
         unit = np.zeros((layout.n_unit + 1, m, 3))
         for axis, at in enumerate(layout.columns):
@@ -203,7 +204,8 @@ class Reduced:
         gone = _square(of_positions, of_bags)
         if self.common is not None:
             # The prior on the sum of the initial lag states adds information.
-            of_sum = self.common.root @ (np.swapaxes(self.bags.root, 1, 2) @ of_bags).sum(axis=0)
+            starts = (np.swapaxes(self.bags.root, 1, 2) @ of_bags).sum(axis=0)
+            of_sum = self.common.root @ starts[: layout.start.shape[1]]
             cross += _summed(self.common.turned, of_sum)
             gone -= _square(of_sum)
         return gone, cross
@@ -217,7 +219,7 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floa
     precision, deviation: inverse prior variances, and values less prior means, shape (n,)
     """
     n_positions, n_own = layout.own.shape
-    r, n_local = layout.start.shape[1], layout.n_local
+    r, n_local = layout.of_bag.shape[1], layout.n_local
     rows = np.zeros((n_positions, n_own + r, n_own + r + layout.n_unit + 1))
     for axis, at in enumerate(layout.columns):
         rows[:, at[:n_local, None], at] += normal.local[:, axis]
@@ -235,7 +237,7 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floa
     diagonal = np.einsum('pii->pi', starts[..., :r])
     starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
     shares = (starts, diagonal)
-    prior = np.stack((precision, precision * deviation))[:, layout.start]
+    prior = np.stack((precision, precision * deviation))[:, layout.of_bag]
     bags = _of_bags(_membership(layout), shares, prior)
     matrix = _of_unit(normal.unit, layout)
     matrix -= _square(positions.turned[..., r:], bags.turned)

@@ -5,8 +5,8 @@ Owns the measurement equation of the windows, and its linearisation.
 
 Equation of window w of position p and axis i, in m/s^2 of the nominal scale factor K0::
 
-    N / K0 = kappa a (1 + S s) + b + B beta + o_p + kappa (A l_p)_i g + noise,
-    a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support
+    N / K0 = kappa a (1 + S s) + b + B beta + o_p + o_b + kappa (A l_p)_i g + noise,
+    a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support,  o_b: offset of the turn-on
 
 B and S are columns of the table in `unit.columns`, each divided by its RMS. With g = 0 the
 equation is that of an angular rate: the terms b, B beta and o_p remain. If |f| differs between
@@ -83,6 +83,7 @@ class Equations(Series):
         self.gravity = gravity
         self.forces = windows.forces if gravity else None
         self.n_coefficients = 2 * len(self.forces.kinds) if self.forces else 0
+        self.has_turn_ons = windows.has_turn_ons and gravity != 0.0
         t = np.zeros((len(windows.time), 0)) if self.forces is None else self.forces.t[:, None]
         super().__init__(windows, nominal_scale, t)
         self._layouts: dict[bytes, Layout] = {}
@@ -98,6 +99,7 @@ class Equations(Series):
             offset=np.zeros((len(up), 3)),
             tilt=np.zeros((len(up), self.windows.tilt.shape[1], 2)),
             start=np.zeros((self.n_bags, self.start_root.shape[1])),
+            turn_on=np.zeros((self.n_bags, 3 * self.has_turn_ons)),
             nonlinear=np.zeros((3, self.n_coefficients)),
             radius=np.zeros(1),
             stretch=np.zeros((len(up), 1)),
@@ -132,6 +134,7 @@ class Equations(Series):
             self._layouts[key] = lay_out(
                 *(used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces),
                 pose_of=self.windows.pose,
+                has_turn_ons=self.has_turn_ons,
             )
         return self._layouts[key]
 
@@ -166,6 +169,7 @@ class Equations(Series):
             ([0], 1.0),
             (np.repeat(base.tilts, 2), np.tile(by_rotation, len(base.tilts))),
             (starts, 1.0),
+            ([0] * self.has_turn_ons, 1.0),
             ([by_kappa, 0], 1.0),
             (in_bias, 1.0),
             (in_scale, without_bias[..., None]),
@@ -236,6 +240,8 @@ class Equations(Series):
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size))
         result[:, :, 0] = self.level - (without_bias + state.bias + state.offset)
+        if self.has_turn_ons:
+            result[:, :, 0] -= state.turn_on[self.bag_of_position]
         result[:, :, 1 : 1 + len(base.columns)] = -(on_bias + without_bias[..., None] * on_scale)
         result[:, :, base.t] = -(state.kappa * bend_by_t)[..., None]
         result[:, :, base.tilts] = -np.einsum('pkt,pit->pik', state.tilt, by_rotation)
@@ -284,6 +290,7 @@ class Equations(Series):
         result[layout.offset] = prior.offset_sd**-2
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_share
+        result[layout.turn_on] = prior.turn_on_sd**-2
         # The prior of attitudes is flat, so its precision is 0. An angular rate does not depend on
         # the attitude, and a precision of 1 keeps the attitude's equations regular.
         result[layout.up] = 0.0 if self.gravity else 1.0
@@ -308,7 +315,7 @@ def _added(layout: Layout) -> list[str]:
     """Return the unknowns to which a step is added: all but the attitudes."""
     names = (
         *('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt'),
-        *('start', 'nonlinear', 'radius', 'stretch'),
+        *('start', 'turn_on', 'nonlinear', 'radius', 'stretch'),
     )
     return [name for name in names if getattr(layout, name).size]
 

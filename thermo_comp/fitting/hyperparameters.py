@@ -90,7 +90,9 @@ def _updated(
     new = np.where(moves, np.minimum(safe * np.exp(step), candidates.largest), sd)
     is_informed = moves & (effective > 0.3)
     changes = [float(np.abs(np.log(np.where(is_informed, new / safe, 1.0))).max(initial=0.0))]
-    offset_sd, change = _offset_sd(posterior)
+    offset_sd, change = _offset_sd(posterior, prior.offset_sd, posterior.layout.offset)
+    changes.append(change)
+    turn_on_sd, change = _offset_sd(posterior, prior.turn_on_sd, posterior.layout.turn_on)
     changes.append(change)
     tilt_sd, change = _tilt_sd(posterior, float(regression.windows.kelvins[0]))
     changes.append(change)
@@ -120,6 +122,7 @@ def _updated(
         prior,
         column_sd=new,
         offset_sd=offset_sd,
+        turn_on_sd=turn_on_sd,
         tilt_sd=tilt_sd,
         pose_sd=pose_sd,
         misalignment_sd=misalignment_sd,
@@ -175,31 +178,35 @@ def _toward(
     return np.asarray(np.clip(gradient / curvature, -2.0, 2.0))
 
 
-def _offset_sd(posterior: Posterior) -> tuple[float, float]:
+def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, float]:
     """
-    Move the sd of mounting offsets towards its mode, under a half-Student prior; return also the
-    change of its logarithm, 0 if the data do not determine the offsets.
+    Move the sd of the offsets of mountings or turn-ons, the unknowns at `places`, towards its
+    mode, under a half-Student prior; return also the change of its logarithm, 0 if the data do not
+    determine the offsets.
     """
-    prior, places = posterior.prior, posterior.layout.offset
-    if prior.offset_scale <= 0.0:
-        return prior.offset_sd, 0.0
+    scale = posterior.prior.offset_scale
+    if scale <= 0.0 or not places.size:
+        return sd, 0.0
     effective = float(posterior.determined[places].sum())
-    power = float(np.sum(posterior.state.offset**2))
-    square = (prior.offset_sd / prior.offset_scale) ** 2
+    power = float(np.sum(as_vector(posterior.state, posterior.layout)[places] ** 2))
+    square = (sd / scale) ** 2
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
-    step = _toward(effective, power, prior.offset_sd, slope, bend + 0.1)
+    step = _toward(effective, power, sd, slope, bend + 0.1)
     # Bounds of the offset sd [m/s^2]: 1/1000 of the prior's scale; 5 mg, as of the cheapest MEMS.
-    new = float(np.clip(prior.offset_sd * np.exp(step), 1e-3 * prior.offset_scale, 0.05))
-    return new, float(np.abs(np.log(new / prior.offset_sd))) if effective > 1.0 else 0.0
+    new = float(np.clip(sd * np.exp(step), 1e-3 * scale, 0.05))
+    return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
 
 
 def log_density(posterior: Posterior) -> float:
-    """Return the log evidence plus the log prior density of the sd of mountings and poses."""
+    """
+    Return the log evidence plus the log prior density of the sd of mountings, turn-ons and poses.
+    """
     prior, result = posterior.prior, posterior.log_evidence
     if prior.offset_scale:
-        square = (prior.offset_sd / prior.offset_scale) ** 2
-        result -= (STUDENT_NU + 1.0) / 2.0 * float(np.log1p(square / STUDENT_NU))
+        sd = [prior.offset_sd, *[prior.turn_on_sd] * bool(posterior.layout.turn_on.size)]
+        squares = (np.array(sd) / prior.offset_scale) ** 2
+        result -= (STUDENT_NU + 1.0) / 2.0 * float(np.log1p(squares / STUDENT_NU).sum())
     if posterior.layout.pose.size:
         result -= 0.5 * float(np.log(prior.pose_sd / POSE_SD)) ** 2 / LOG_VARIANCE
     return result
@@ -210,6 +217,8 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     n = len(regression.weight)
     determined, layout = posterior.determined, posterior.layout
     of_axis = determined[layout.axis].sum(axis=1) + determined[layout.offset].sum(axis=0)
+    if layout.turn_on.size:
+        of_axis += determined[layout.turn_on].sum(axis=0)
     # Attitudes, tilts, misalignment and lag states are determined by all three axes.
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0

@@ -173,7 +173,8 @@ def _initial_prior(
     if data.forces is not None:
         prior = replace(prior, nonlinear_sd=starting_sd(data.forces, options))
     if options.mounting_sd is not None:
-        prior = replace(prior, offset_sd=options.mounting_sd, offset_scale=0.0)
+        sd = options.mounting_sd
+        prior = replace(prior, offset_sd=sd, turn_on_sd=sd, offset_scale=0.0)
     return prior
 
 

@@ -24,6 +24,8 @@ class Layout:
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
     weights, nonlinear: shapes (2, 3, m) and (3, 2 k); -1 for an inactive unknown
+    start, turn_on: unknowns of each bag: initial lag states, and the bias offset of its turn-on,
+        shapes (n_bags, r) and (n_bags, 3) or (n_bags, 0)
     own: unknowns of each position: up, stretch, offset, tilt, shape (n_positions, k)
     pose_of: pose of each position, -1 for none
     bag: bag of each position
@@ -37,6 +39,7 @@ class Layout:
     offset: Ints
     tilt: Ints
     start: Ints
+    turn_on: Ints
     nonlinear: Ints
     radius: Ints
     stretch: Ints
@@ -71,12 +74,13 @@ class Layout:
     def columns(self) -> Ints:
         """
         The unknowns of each axis in the order of `Tangent`, as columns of the equations of a
-        position: unknowns of the position, initial lag states, unknowns of the unit, residual;
-        shape (3, k).
+        position: unknowns of the position, of the bag, of the unit, residual; shape (3, k).
         """
         n_own, r = self.own.shape[1], self.start.shape[1]
         starts = np.tile(n_own + np.arange(r), (3, 1))
-        return np.hstack((self.of_axis, starts, n_own + r + self.unit))
+        turn_ons = n_own + r + np.arange(self.turn_on.shape[1]).reshape(3, -1)
+        unit = n_own + self.of_bag.shape[1] + self.unit
+        return np.hstack((self.of_axis, starts, turn_ons, unit))
 
     @cached_property
     def unit(self) -> Ints:
@@ -87,7 +91,12 @@ class Layout:
     @property
     def n_local(self) -> int:
         """Number of unknowns of each axis that belong to positions and bags."""
-        return len(self.of_axis[0]) + len(self.start[0])
+        return len(self.of_axis[0]) + len(self.start[0]) + len(self.turn_on[0]) // 3
+
+    @cached_property
+    def of_bag(self) -> Ints:
+        """The unknowns of each bag, shape (n_bags, r + 3) or (n_bags, r)."""
+        return np.hstack((self.start, self.turn_on))
 
     @cached_property
     def of_axis(self) -> Ints:
@@ -121,6 +130,7 @@ def lay_out(
     forces: Forces | None = None,
     *,
     pose_of: Ints | None = None,
+    has_turn_ons: bool = False,
 ) -> Layout:
     """
     Assign a place to every unknown, given the active columns of bias and scale, shape (2, m), and
@@ -149,13 +159,15 @@ def lay_out(
     n_stretches = int(forces is not None and bool(forces.sd.any()))
     own = np.empty((n_positions, 2 + n_stretches + 3 + 2 * n_tilts), dtype=np.int64)
     start = np.empty((n_bags, n_starts), dtype=np.int64)
+    turn_on = np.empty((n_bags, 3 * has_turn_ons), dtype=np.int64)
     for bag in range(n_bags):
         for p in np.flatnonzero(bag_of_position == bag):
             own[p] = take(own.shape[1])
         start[bag] = take(n_starts)
+        turn_on[bag] = take(3 * has_turn_ons)
     up, stretch, offset, tilt = np.split(own, np.cumsum([2, n_stretches, 3]), axis=1)
     return Layout(
         *(axis, weights, misalignment, up, offset, tilt.reshape(n_positions, n_tilts, 2), start),
-        *(nonlinear, radius, stretch, pose, pose_of),
+        *(turn_on, nonlinear, radius, stretch, pose, pose_of),
         *(own, bag_of_position, n_unit, n),
     )

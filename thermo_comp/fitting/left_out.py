@@ -290,6 +290,8 @@ def _is_norm_determined(point: Point, posterior: Posterior, root: Floats, p: int
         return False
     along = point.norms_by_unit[p]
     by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
+    if point.regression.has_turn_ons:
+        by_all += point.prior.turn_on_sd**2
     return _is_determined(float(np.sum((along @ root) ** 2)), by_all)
 
 

@@ -183,13 +183,13 @@ class Point:
             normal = self.tangent.at(places).normal(at_state[places])
             yield places, self.reduced.without(places, normal.scaled(self.prior.sigma**-2.0))
 
-    def by_offset(self, places: Ints, axis: int) -> Floats:
+    def by_offset(self, axis: int) -> Floats:
         """
-        Return the derivatives of the unit's unknowns by the prior mean of a bias offset that some
+        Return the derivatives of the unit's unknowns by the prior mean of a bias offset that all
         positions share, shape (n_unit,).
         """
         deviation = self.deviation.copy()
-        deviation[self.layout.offset[places, axis]] -= 1.0
+        deviation[self.layout.offset[:, axis]] -= 1.0
         step, _ = self.unit_step(self._reduced(self.normal, deviation).whole)
         return step - self.solution[0][: self.layout.n_unit]
 
@@ -223,7 +223,7 @@ class Point:
         unit, factor = self.unit_step(reduced.whole)
         step = np.empty(self.layout.n)
         step[: self.layout.n_unit] = unit
-        step[self.layout.own], step[self.layout.start] = reduced.follow(unit)
+        step[self.layout.own], step[self.layout.of_bag] = reduced.follow(unit)
         return step, factor
 
     def linear_step(self) -> Floats:
@@ -267,7 +267,7 @@ class Point:
         n, unit_root = layout.n_unit, inverse_root(factor)
         variance = np.empty(layout.n)
         variance[:n] = np.sum(unit_root**2, axis=1)
-        variance[layout.own], variance[layout.start] = reduced.variances(unit_root)
+        variance[layout.own], variance[layout.of_bag] = reduced.variances(unit_root)
         determined = 1.0 - precision * variance
         of_prior = float(np.log(precision[n:][precision[n:] > 0.0]).sum())
         if prior.informative is None:

@@ -280,7 +280,8 @@ def select(
     # a large prior sd of mounting offsets.
     priors = [prior]
     if prior.offset_scale > 0.0:
-        priors.append(replace(prior, offset_sd=float(prior.sigma.mean())))
+        large = float(prior.sigma.mean())
+        priors.append(replace(prior, offset_sd=large, turn_on_sd=large))
     fits = [growth.fit(growth.forced, state, initial, candidates.typical) for initial in priors]
     constants = first = better_start(fits)
     trials = [constants]
@@ -414,6 +415,7 @@ def _with_large_offsets(
     prior, scale = posterior.prior, posterior.prior.offset_scale
     if prior.offset_sd >= scale:
         return []
-    prior = replace(prior, offset_sd=LARGE_OFFSETS * scale)
+    large = LARGE_OFFSETS * scale
+    prior = replace(prior, offset_sd=large, turn_on_sd=large)
     posterior = settle(regression, posterior.state, prior, candidates)
     return [replace(fitted, posterior=posterior, score=score_of(regression, posterior))]

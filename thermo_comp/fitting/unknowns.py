@@ -146,6 +146,11 @@ class Windows:
         """Number of turn-ons."""
         return len(np.unique(self.turn_on_of_position))
 
+    @cached_property
+    def has_turn_ons(self) -> bool:
+        """Whether there are several turn-ons, and one of them has several mountings."""
+        return 1 < self.n_turn_ons <= int(self.mounting[-1])
+
     @property
     def inner(self) -> Ints:
         """Windows that are followed by two further windows of their position."""
@@ -213,9 +218,11 @@ class Prior:
     column_sd: sd of the weights of each column in units of its RMS, in the bias [m/s^2] and in the
         scale (relative); 0 for an inactive column, shape (2, m)
     offset_sd: sd of the bias offset of each position and axis by mounting and turn-on [m/s^2]
+    turn_on_sd: sd of the bias offset that all positions of a bag share, by its turn-on [m/s^2]
     sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
     noise: slow noise
-    offset_scale: scale of the half-Student prior of offset_sd [m/s^2]; 0: offset_sd is constant
+    offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd [m/s^2]; 0: both
+        are constant
     misalignment_scale: value of misalignment_sd before the data are used [rad]
     unseen_misalignment_sd: sd of the elements of M in the covariance, if the positions do not show
         M [rad]: `misalignment_sd` is constant and smaller in such a fit; 0 for other fits
@@ -238,6 +245,7 @@ class Prior:
     noise: Noise = field(default_factory=Noise)
     scale_mean: Floats = field(default_factory=lambda: np.ones(3))
     offset_scale: float = 0.0
+    turn_on_sd: float = 1e-5
     misalignment_scale: float = MISALIGNMENT_SD
     unseen_misalignment_sd: float = 0.0
     tilt_sd: float = 1e-7
@@ -259,6 +267,7 @@ class State:
     offset: bias offset of each position [m/s^2], shape (n_positions, 3)
     tilt: tilts of the support along the attitude's tangents, shape (n_positions, k, 2)
     start: initial lag states of each bag, in units of their sd, shape (n_bags, r)
+    turn_on: bias offset of each bag's turn-on [m/s^2], shape (n_bags, 3) or (n_bags, 0)
     nonlinear: nonlinear coefficients in the order of `Forces`, shape (3, 2 k)
     radius: relative error of the radius, shape (1,) or (0,)
     stretch: relative error of the known |f|, shape (n_positions, 1) or (n_positions, 0)
@@ -274,6 +283,7 @@ class State:
     offset: Floats
     tilt: Floats
     start: Floats
+    turn_on: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     nonlinear: Floats = field(default_factory=lambda: np.zeros((3, 0)))
     radius: Floats = field(default_factory=lambda: np.zeros(0))
     stretch: Floats = field(default_factory=lambda: np.zeros((0, 0)))
