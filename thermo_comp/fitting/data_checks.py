@@ -170,7 +170,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
         # Soaks at one temperature of a chamber differ by less than 1 K, or a tenth of the span.
         is_gap = steps > max(1.0, 0.1 * steps.sum())
         n = 1 + int(is_gap.sum())
-        # A slow drift through a range is not a soak.
+        # A slow drift of the temperature through a range is not a soak.
         has_soaks = steps[~is_gap].sum() < n * max(1.0, 0.1 * steps.sum())
         # Five temperatures determine a cubic, and show whether the cubic fits.
         if has_soaks and n < 5:
@@ -279,7 +279,8 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     Refuse data that appear to be compensated already.
 
     `raw`: RMS of |f| - g with the constants of the triad alone [m/s^2].
-    No triad is built with all constants below 1e-4 and a drift of |f| below 2e-5 g over 20 K.
+    No raw triad has biases [g], errors of the scale and misalignments [rad] all below 1e-4, and an
+    RMS of |f| - g below 2e-5 g over 20 K.
     """
     state, K = fit.posterior.state, fit.posterior.state.kappa * fit.regression.nominal_scale
     span = float(np.ptp(fit.windows.temperature))

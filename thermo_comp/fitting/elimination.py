@@ -35,7 +35,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
     index = np.arange(matrix.shape[-1])
-    # Relative jitters, added one after another until a factor exists.
+    # Relative jitters, added to the diagonal in turn until a Cholesky factor exists.
     jitters = 1e-13, 1e-11, 1e-9, 1e-7
     for jitter in jitters:
         scaled[..., index, index] += jitter
@@ -79,8 +79,7 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower: `inv` does not use that factors are
-        # triangular.
+        # `numpy.linalg.inv` of all factors at once is slower: it ignores that they are triangular.
         root = np.stack([inverse_root(factor).T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
@@ -114,7 +113,7 @@ class Reduced:
         gradients, shape (n_positions, r, r + n + 1); and to the diagonals before the elimination
         of the positions, shape (n_positions, r)
     bags: the blocks of the bags
-    common: the prior on the sum of the initial lag states as a further block; None without it
+    common: the prior on the sum of the initial lag states as a further block, or None
     """
 
     layout: Layout

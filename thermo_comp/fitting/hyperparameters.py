@@ -98,8 +98,8 @@ def _updated(
     changes.append(change)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
-        # The elements change their sd only if the data determine more than one element of M.
+        # Three elements of M determine their sd poorly, so the built-in prior counts as a fourth,
+        # and the sd changes only if the data determine more than one element of M.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
@@ -142,7 +142,8 @@ def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
     square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
     effective = posterior.determined[posterior.layout.tilt].sum()
     step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
-    # An sd of tilts that is off by 15 % hardly changes the fit: a third of its log change counts.
+    # An sd of tilts that is off by 15 % hardly changes the fit, so convergence counts only a third
+    # of the change of its logarithm.
     return float(sd * np.exp(step)), float(np.abs(step)) / 3.0
 
 
@@ -168,7 +169,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd to ``power / sd^2 = effective + slope``, within -2 .. 2."""
+    """Return Newton's step of log sd to ``power / sd^2 = effective + slope``, from -2 to 2."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
@@ -321,8 +322,8 @@ def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
     Return which column, shape (2, m), is the only lag of a model that has products or squares of
     lags.
 
-    A product t m approximates the lag m at the rates of one program, but not at other rates, so a
-    model with products keeps a lag (marginality, [3]_).
+    A product t m of temperature and lag approximates the lag m at the rates of one program, but
+    not at other rates, so a model with products keeps a lag (marginality, [3]_).
     """
     groups, used = np.array(windows.groups), column_sd > 0.0
     is_lag = used & np.isin(groups, LAGS) & (windows.lag >= 0)

@@ -64,15 +64,15 @@ class Layout:
 
     @property
     def posed(self) -> Ints:
-        """Places of the attitudes of the positions in a pose, shape (k, 2)."""
+        """Places of the attitudes of those positions that are in a pose, shape (k, 2)."""
         return self.up[self.pose_of >= 0]
 
     @cached_property
     def columns(self) -> Ints:
         """
-        The unknowns of each axis in the order of `Tangent`, as columns of the equations of a
-        position: unknowns of the position, initial lag states, unknowns of the unit, residual;
-        shape (3, k).
+        The unknowns of each axis in the order of `Tangent`, as indices of the columns of a
+        position's equations, which are the unknowns of the position, the initial lag states, the
+        unknowns of the unit and the residual, shape (3, k).
         """
         n_own, r = self.own.shape[1], self.start.shape[1]
         starts = np.tile(n_own + np.arange(r), (3, 1))
@@ -91,7 +91,7 @@ class Layout:
 
     @cached_property
     def of_axis(self) -> Ints:
-        """The unknowns of a position that each axis has, as places in `own`, shape (3, k)."""
+        """The unknowns of a position that each axis has, as column indices of `own`, (3, k)."""
         first = self.up.shape[1] + self.stretch.shape[1]
         before, after = range(first), range(first + 3, self.own.shape[1])
         return np.array([[*before, first + axis, *after] for axis in range(3)])

@@ -30,7 +30,7 @@ from .windows import Model, Sets
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """Return the response as columns; FitError if a term acts in one regime only (version 1)."""
+    """Return the response's columns; raises FitError if a term acts in one regime (version 1)."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(

@@ -71,7 +71,7 @@ class Whitener:
         """Whether a search may try a correlation time: from `times_s[0]` to `_longest_s`."""
         if not self.times_s:
             return False
-        # Rounding must not exclude the shortest time.
+        # Rounding must not exclude the shortest correlation time.
         return bool(0.999 * self.times_s[0] < time_s < 1.001 * self._longest_s)
 
     def _innovations(
@@ -311,7 +311,7 @@ class Series:
         return np.asarray(np.add.reduceat(values, self._first, axis=0) / count)
 
     def of(self, base: Base) -> Floats:
-        """Return the series of a base, shape (n, n_base)."""
+        """Return the base series in the order of `base`, shape (n, n_base)."""
         at_start = self._starts[:, base.columns[base.moved]]
         return np.hstack((self._ones, self.columns[:, base.columns], at_start, self._others))
 
@@ -331,6 +331,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Apply `at_starts` to products of the base series, (n_positions, n_base, n_base)."""
+        """Convert products of the base series, (n_positions, n_base, n_base), as `at_starts`."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

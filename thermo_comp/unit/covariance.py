@@ -3,18 +3,18 @@
 """
 Owns the covariance of a corrected sample as polynomials in the forces of the three axes.
 
-x, y, z are the specific forces along the axes, before the misalignment. A sample has nine errors
-u: a constant error and a scale error of each axis, and the errors of the three elements of the
-misalignment M. To first order the error of the corrected force is ::
+x, y, z are the specific forces along the axes, before the misalignment. The vector u has the nine
+errors of a sample: a constant error and a scale error of each axis, and the errors of the three
+elements of the misalignment M. To first order the error e of the corrected force is ::
 
     e_x = u0 + x u1
     e_y = yx (u0 + x u1) + u2 + y u3 + x u6
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
-so that each element of the covariance of e is a polynomial of second degree in x, y, z. The
-coefficients of the polynomials are sums over the elements of the covariance of u, which are called
-rows here: first a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then one
-row for each pair in `BETWEEN`.
+Each element of the covariance of e is a polynomial of second degree in x, y, z, and its
+coefficients are sums over the elements of the covariance of u. In an array the rows of the
+covariance of u are a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then
+one row for each pair in `BETWEEN`.
 """
 
 from collections.abc import Sequence

@@ -32,7 +32,7 @@ Kind = Literal['square', 'odd_square', 'cube']
 #: The nonlinear terms in the order of a calibration file, and the power of 1/g in the unit of each
 #: coefficient.
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
-#: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 .. 60 ug/g^2.
+#: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 to 60 ug/g^2.
 K2_SD = 1e-4
 #: Largest |f| / gravity of a rest that counts as at 1 g.
 AT_REST = 1.01
