@@ -168,7 +168,7 @@ def _widened(
     # The curve of the positions' means is an alternative to a curve that the drifts of a warm-up
     # determine, because a warm-up heats the board in another way than a chamber does.
     other = _with_curve(regression, state, of_means)
-    # An sd of 1e-9 gives columns of the means' curve alone a place in the covariance.
+    # Columns that only the curve of the means has get a place in the covariance by an sd of 1e-9.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -211,7 +211,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # Lags differ from soak to soak by errors of the thermometer, which determine no weight.
+        # At constant temperatures lags are errors of the thermometer, which determine no weight.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:

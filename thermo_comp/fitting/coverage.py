@@ -133,9 +133,9 @@ def rough_centre(means: Floats) -> Floats:
     # readings are spread over the sphere: their RMS distance from the mean is at least half of the
     # radius (1 radius for six faces, and 0.1 radius for readings within 6 degrees).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # There is a sphere through any four readings, so the axes of its centre must also agree: codes
-    # at zero force of an analog sensor's axes agree within 20 % of their mean (ADXL335 data sheet:
-    # 1.2 to 1.8 V), while the axes of a unit in one pose read differently.
+    # There is a sphere through any four readings, so the coordinates of its centre must agree: the
+    # codes at zero force of an analog sensor's axes agree within 20 % of their mean (ADXL335 data
+    # sheet, 1.2 to 1.8 V), while the axes of a unit in one pose read differently.
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero

@@ -264,9 +264,9 @@ def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate M.
 
-    The largest sd of a constant, in units of the noise of one position, must be at most 6. The
-    largest sd is 1 for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held
-    three times each by hand.
+    The largest sd of a constant, in units of the noise of one position, must be at most 6: it is 1
+    for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held three times each
+    by hand.
     """
     distinct = distinct_directions(up)
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:

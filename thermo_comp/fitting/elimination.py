@@ -43,7 +43,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
-                # Only the matrices without a factor get more jitter.
+                # Each matrix gets only the jitter with which its Cholesky factor exists.
                 return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise
@@ -201,7 +201,7 @@ class Reduced:
         cross -= _summed(turned[..., r:], of_positions) + _summed(self.bags.turned, of_bags)
         gone = _square(of_positions, of_bags)
         if self.common is not None:
-            # The prior on the sum of the initial lag states adds information.
+            # The prior on the sum of the initial lag states adds information: less is removed.
             of_sum = self.common.root @ (np.swapaxes(self.bags.root, 1, 2) @ of_bags).sum(axis=0)
             cross += _summed(self.common.turned, of_sum)
             gone -= _square(of_sum)

@@ -138,7 +138,7 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
         return np.zeros(3)
     if options.prior is not None:
         known = constants_of(options.prior)
-        # A bias above 0.5 g is an offset code.
+        # A bias above 0.5 g is the offset of a code.
         is_far = np.abs(known.bias / known.scale).max() > 0.5 * options.gravity
         return np.asarray(np.rint(known.bias) * is_far)
     middle = max(bag.middle for bag in bags)

@@ -211,11 +211,11 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     n = len(regression.weight)
     determined, layout = posterior.determined, posterior.layout
     of_axis = determined[layout.axis].sum(axis=1) + determined[layout.offset].sum(axis=0)
-    # Attitudes, tilts, misalignment and lag states are determined by all three axes.
+    # Each axis counts a third of the effective parameters of the unknowns that all axes share.
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # At least 1e-8 m/s^2, below any sensor's noise: the estimate for constant samples is 0.
+    # The noise is at least 1e-8 m/s^2, below any sensor's; from constant samples it would be 0.
     least = np.full(3, 1e-8)
     if not regression.windows.has_drifts:
         # If no column changes within a position, slow noise explains the whole drift, and white

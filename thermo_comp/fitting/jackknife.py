@@ -54,8 +54,8 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     remaining windows, ``remaining.T @ remaining``, shape (n, n), both in units of the fit's root
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # A combination of the unknowns counts as not measured by the windows left out, if they have
-    # less than 1e-6 of its information.
+    # A combination of the unknowns counts as measured by the windows left out, if these windows
+    # have more than 1e-6 of the information about the combination.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

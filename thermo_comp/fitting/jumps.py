@@ -12,8 +12,8 @@ almost constant in a rotation, or the gyroscope, if there is one, measures no ro
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
 hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares
 for first-order noise), so a step within one sample is significant in these differences. A shock
-that decays is also significant; therefore the mean levels of the quiet samples before and after
-the step must differ, too.
+that decays is also significant, so the mean levels of the quiet samples before and after a jump
+must differ, too.
 """
 
 from __future__ import annotations
@@ -146,8 +146,9 @@ def _examine(
     size = float(np.linalg.norm(step))
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
     needed_rad = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
-    # A step is not a rotation if the gyroscope measured less than a third of the angle needed, or
-    # if |a| changed: a rotation by d changes |a| by at most 2 d times the sensor's error (10 %).
+    # A step is not a rotation if the gyroscope measured less than a third of the angle that gives
+    # the step, or if |a| changed: a rotation by d changes |a| by at most 2 d times the sensor's
+    # error (10 %).
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )

@@ -80,7 +80,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """The unknowns of the unit that each axis has, and the place after them, shape (3, k)."""
+        """The unknowns of the unit that each axis has, then the place of the residual, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 

@@ -206,8 +206,8 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return [(shortest, share**column.term.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
-    # The shares are a cubic interpolation over the logarithm of the time constant, by Lagrange's
-    # polynomials.
+    # The shares of four lags of the bank are Lagrange's polynomials over the logarithm of the time
+    # constant.
     first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
     near = FINE_TAUS[first : first + 4]
     result = []

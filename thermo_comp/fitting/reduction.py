@@ -179,8 +179,7 @@ def reduce_source(
     3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
     is chosen so that the rests determine bias and scale best. Slow samples make cells so long that
     a bias which changes within minutes looks like a motion, and that short rests are lost. Slow
-    samples therefore get shorter cells, of 10 or 5 samples, if shorter cells interrupt or lose
-    fewer rests.
+    samples get cells of only 10 or 5 samples if shorter cells interrupt or lose fewer rests.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:

@@ -216,7 +216,7 @@ class Growth:
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
         if {*LAGS} & {*absent} and not {*LAGS} & {*chosen.groups}:
-            # Products and powers of lags are tried only with lags, see `hyperparameters`.
+            # Products and powers of lags are tried only in a model with lags (marginality).
             sets = [each for each in sets if {*LAGS} & {*each} or not {*PRODUCTS} & {*each}]
         gains = {groups: inactive.gain(typical, np.isin(self._names, groups)) for groups in sets}
         likely = [groups for groups in sets if gains[groups] > CLEAR_GAIN]
@@ -236,7 +236,7 @@ class Growth:
         state = posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
-            # Attitudes and offsets of the rests in a pose absorb errors of an incomplete model.
+            # Errors of an incomplete model also enter attitudes and offsets of rests in a pose.
             turned = regression.gravity * state.from_pose
             square += float(np.mean(state.offset**2) + np.mean(turned**2))
         slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)

@@ -3,9 +3,8 @@
 """
 Owns the base series of the windows, and their products whitened for a noise model.
 
-All terms of the measurement equation (`equations`) are linear combinations of a few base series.
-The products of the whitened base series of each position and section are therefore sufficient for
-the regression.
+All terms of the measurement equation (`equations`) are linear combinations of a few base series,
+so the products of the whitened base series of each position and section are sufficient statistics.
 
 The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a

@@ -134,7 +134,7 @@ class Correction:
 
     def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
         result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
-        # Eq. (8) of the paper: scale factor at the board temperature.
+        # Equation 8 of the paper gives the scale factor at the board temperature.
         result[3:] *= self.K
         return result
 

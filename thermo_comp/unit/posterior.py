@@ -134,7 +134,7 @@ class ParameterLayout(NamedTuple):
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """Find the smallest factor of a covariance matrix; raises ValueError if it is none."""
+    """Find the smallest factor of a matrix; raises ValueError if the matrix is no covariance."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')

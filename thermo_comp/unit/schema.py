@@ -183,7 +183,7 @@ def _joined(key: str, name: str) -> str:
 
 
 def _shown_name(name: str) -> str:
-    # An invalid name may be any text of any length.
+    # An invalid name may be any text: unprintable text is shown by `repr`, long text is cut.
     shown = name if name.isprintable() and len(name) < _LONGEST_NAME else repr(name)
     return shown[:_LONGEST_NAME]
 
