@@ -73,7 +73,7 @@ def judge_windows(
     """
     Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest.
 
-    A prior calibration of the same unit contains the effects of temperature and ramps already.
+    Span and ramps are not judged with a prior calibration of the unit, which has both effects.
     """
     yield _judge_positions(up)
     used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())

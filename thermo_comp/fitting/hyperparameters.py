@@ -4,7 +4,7 @@
 Owns the estimation of prior standard deviations and noises, and drops columns of small gain.
 
 Each column has one prior standard deviation for the bias of all axes and one for the scale, found
-by MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence plus
+by MacKay's fixed point with a log-normal hyperprior per kelvin. The mode of log evidence plus
 hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w the
 weights of the column, sd0 and tau^2 centre and variance of the hyperprior. The sd of a column
 about which the data have no information stays at the centre sd0 of the hyperprior.

@@ -4,13 +4,13 @@
 Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
-temperature of one part of the unit, where t is the board temperature T less the reference
-temperature, and m = T - L(T + v G) the difference between T and the temperature of the part, L
-being the lag operator. The part lags a temperature T + v G between board and case, G being the
-gradient and v its share. The lag has one stage or, for a part that is heated through another part,
-two stages in series. Without a case thermometer, the temperature that the part lags may lead that
-of the board. The time constants, the share v and the lead minimise the RMS residual of a spline of
-the bias and a cubic of the scale factor, over the temperature x of the part.
+temperature of one part of the unit. The board temperature T less the reference temperature is t,
+and m = T - L(T + v G) is T less the temperature of the part, L being the lag operator, G the
+gradient and v its share. The part lags the temperature T + v G, which is between board and case.
+The lag has one stage or, for a part that is heated through another part, two stages in series.
+Without a case thermometer, the temperature that the part lags may lead that of the board. The time
+constants, the share v and the lead minimise the RMS residual of a spline of the bias and a cubic
+of the scale factor, over the temperature x of the part.
 """
 
 from __future__ import annotations
