@@ -167,7 +167,7 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return `whole` without some positions, given their normal equations."""
+        """Return the Hessian `whole` without some positions, given their normal equations."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)
@@ -201,7 +201,7 @@ class Reduced:
         cross -= _summed(turned[..., r:], of_positions) + _summed(self.bags.turned, of_bags)
         gone = _square(of_positions, of_bags)
         if self.common is not None:
-            # The prior on the sum of the initial lag states adds information: less is removed.
+            # The prior on the sum of the initial lag states adds information to the equations.
             of_sum = self.common.root @ (np.swapaxes(self.bags.root, 1, 2) @ of_bags).sum(axis=0)
             cross += _summed(self.common.turned, of_sum)
             gone -= _square(of_sum)

@@ -219,7 +219,7 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     least = np.full(3, 1e-8)
     if not regression.windows.has_drifts:
         # If no column changes within a position, slow noise explains the whole drift, and white
-        # noise would be estimated as 0: it is at least that of differences, where a drift cancels.
+        # noise would be 0: it is at least that of differences of windows, where a drift cancels.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 

@@ -235,7 +235,7 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
     """
     Return thermometer, stamp and value of each reading in the order of the stamps.
 
-    Readings with equal stamps are in the order of `inputs`.
+    Readings with equal stamps are in the order of the thermometers in `inputs`.
     """
     rows: list[tuple[str, int, float]] = []
     for name in inputs:

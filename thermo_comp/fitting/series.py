@@ -217,7 +217,7 @@ class Products:
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Products of each position without some sections; their shape is that of `whole`."""
+        """Products of each position without some sections, (n_positions, n_base, n_base)."""
         result: Floats = self.whole.copy()
         gone = np.flatnonzero(np.isin(self.section, sections))
         position = np.searchsorted(self.first, gone, side='right') - 1
@@ -330,6 +330,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert products of the base series, (n_positions, n_base, n_base), as `at_starts`."""
+        """Convert products of base series, (n_positions, n_base, n_base), to lags of `state`."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

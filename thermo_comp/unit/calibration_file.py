@@ -49,7 +49,7 @@ def load_calibration(path: str | Path) -> Calibration:
 
 
 def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibration:
-    """Build a Calibration from the bytes of a calibration file; raises as `load_calibration`."""
+    """Build a Calibration from the bytes of a file; raises CalibrationError if it is not valid."""
     try:
         data = load_plain_yaml(content.decode('utf-8'))
     except UnicodeDecodeError as error:

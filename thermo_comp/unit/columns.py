@@ -347,7 +347,7 @@ class ColumnTable:
         return np.asarray((numbers - self._centres) / self._widths)
 
     def held(self, raw: Floats) -> Floats:
-        """Limit the values of `raw` to the columns' ranges."""
+        """Limit the values u of the columns to the columns' ranges."""
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:

@@ -137,8 +137,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Return the variance of the bias by the parameters at thermal states (n, width), and the
-        variance of the bias less its mean by `mean_of`, shapes (n, 3) [m^2/s^4].
+        Return the variance of the bias by the parameters at thermal states (n, width), and that of
+        the difference of the bias from its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)
