@@ -192,7 +192,7 @@ def models() -> tuple[dict[str, Model], float, Floats, float]:
 
 
 def draw(path: Path, results: dict[str, dict[str, Flights]]) -> None:
-    """Draw the position error of both programs over time."""
+    """Draw the position error over time: free flights, and flights with zero-velocity updates."""
     mpl.use('Agg')
     from matplotlib import pyplot as plt
 

@@ -71,7 +71,7 @@ def tail_latencies(file: Path) -> tuple[Floats, Floats]:
 
 
 def measure(rate: int, seconds: int, folder: Path) -> None:
-    """Print the figures of one rate."""
+    """Measure the node at one sample rate [Hz], and print the results."""
     calibration = _calibration_for(rate, folder)
     latencies = folder / f'{rate}.npy'
     options = [f'--rate={rate}', '--reliability=best_effort', f'--seconds={seconds + 4}']

@@ -33,7 +33,7 @@ _RULES: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a number, or of the length of a text or list; `why` gives the reason."""
+    """Bounds of a number, or of the length of a text or list; `why`: reason for the bounds."""
 
     above: float | None = None
     at_least: float | None = None

@@ -33,7 +33,7 @@ _FLOOR_SD = 2e-5
 # Ratio of a rest's noise to the median of all rests, above which the rest is 'restless'; ratio to
 # the noise of the previous rest, above which the unit is held by hand.
 _RESTLESS, _LOUDEST = 3.0, 10.0
-# Backward step of the stamps from which on the driver has restarted [ns].
+# Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
 # A stamp earlier than any other [ns].
 _FIRST_NS = -(1 << 62)

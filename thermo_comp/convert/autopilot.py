@@ -107,7 +107,7 @@ def read_autopilot(
 
 
 def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
-    """Drop samples that the autopilot has corrected; RecordingError if none is left."""
+    """Drop samples that the autopilot has corrected; RecordingError if no sample is left."""
     name, since_ns, values, advice = correction
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
@@ -206,7 +206,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the angular rate to the accelerometer's stamps; None if logged sparsely."""
+    """Interpolate the angular rate to the accelerometer's stamps; None for sparse rates."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)

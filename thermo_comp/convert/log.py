@@ -31,8 +31,8 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| of a still sensor in each unit. The tolerance of 20 % exceeds the errors of bias and scale of
-# cheap sensors, even in a thermal chamber, and is far below the ratios between the units.
+# |a| of a still sensor in each unit. The tolerance of |a|, 20 %, exceeds the errors of bias and
+# scale of cheap sensors, even in a chamber, and is far below the ratios of m/s^2, g and mg.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
@@ -66,7 +66,7 @@ class ForeignLog:
     input: Literal['counts', 'imu'] = 'imu'  # type of the messages to write
     unit: Unit = 'm/s^2'
     counts_per_g: float | None = None
-    clip: tuple[float, float] | None = None  # readings from which on the sensor is saturated
+    clip: tuple[float, float] | None = None  # readings at which the sensor is saturated
     frame_id: str = 'imu_link'
     serial: str = ''
     n_short: int = 0  # number of rows dropped for missing cells
@@ -223,7 +223,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock. For
-    a thermometer `shifts` are those of the samples, so that the readings stay among the samples.
+    a thermometer the `shifts` of the samples are given: its readings stay among the samples.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

@@ -97,7 +97,7 @@ def leftovers(folder: Path) -> dict[Path, int]:
 def finish(path: Path, number: int) -> Path | None:
     """
     Turn an unfinished bag into a bag with `number`, or the next free number, and delete the
-    unfinished bag; None if it has no message. RecordingError if nothing can be read.
+    unfinished bag; None for a bag without messages. RecordingError for an unreadable bag.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

@@ -37,7 +37,7 @@ _LEVEL_S = 120.0
 _ROTATION_S = 10.0
 # Size of a step that ends a rest, in robust sd of all steps; noise alone does not reach it.
 _STEP_SDS = 8.0
-# Number of steps whose median is the drift, and the largest drift [g/s].
+# Number of steps between cells whose median is the drift, and the largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
 # Number of samples searched for a quantum, and smallest number of changes that prove a quantum
 # by being whole multiples of it.

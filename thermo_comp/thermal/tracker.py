@@ -48,7 +48,7 @@ class ThermalTracker:
         self.board = Thermometer(detector.board)
         beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **beside}
-        #: The leading sensor is the first sensor beside the board.
+        #: The leading sensor: the first thermometer other than the board's.
         self.case = beside[self.spec.sensors[0]]
         self.checks = {
             BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
