@@ -230,7 +230,7 @@ def best_baseline(row: Row, name: str) -> float:
 
 
 def misses(row: Row, others: Sequence[Row]) -> list[str]:
-    """Describe the limits that a row exceeds; `others` are the rows of its case."""
+    """Describe the limits that a row exceeds; `others` are the rows of the same case."""
     exceeded = ['refused'] if row.refused else []
     if 'fit' not in row.scores:
         return exceeded

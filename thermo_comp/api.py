@@ -108,7 +108,7 @@ def correct(
     Parameters
     ----------
     calibration : Calibration
-        Calibration of the unit; ``calibration.correct(time_s, ...)`` is the same call.
+        Calibration of the unit; ``calibration.correct(time_s, ...)`` is equal to this function.
     time_s : array_like, shape (n,)
         Time of each sample, strictly rising: seconds since any origin, or datetime64.
     counts : array_like, shape (n, 3)
@@ -225,7 +225,7 @@ def fit(
     Returns
     -------
     Calibration
-        Calibration of the unit; `save` writes it to a file, `Calibration.correct` applies it.
+        Calibration of the unit; its method `save` writes a file, its method `correct` applies it.
 
     Raises
     ------

@@ -5,9 +5,9 @@ Owns tables with a column map: the content and unit of each column, and the mess
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table of numbers alone, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: times rise from row to row, readings at rest are gravity, which
-gives their unit, and an angular rate that would be faster in rad/s than any turn by hand is in
-deg/s.
+wz]`` as for imu_tk, is guessed: times rise from row to row, and readings at rest are gravity,
+which gives their unit. An angular rate is in deg/s if its numbers in rad/s were faster than any
+turn by hand.
 """
 
 from collections.abc import Sequence

@@ -3,9 +3,9 @@
 """
 Owns the tracker of a unit's thermal state: thermometers, regime, memory, dynamic weight.
 
-The compensator, the fit and the report all run this class, so a regressor means the same when it
-is fitted and when it is applied. The class is causal and reads no clock: each reading has a
-stamp, and the thermal state is requested for a stamp.
+The compensator, the fit and the report all run `ThermalTracker`, so a regressor means the same
+when it is fitted and when it is applied. `ThermalTracker` is causal and reads no clock: each
+reading has a stamp, and the thermal state is requested for a stamp.
 """
 
 from copy import copy
