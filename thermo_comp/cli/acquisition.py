@@ -111,7 +111,7 @@ class Acquisition:
         # Samples kept until there are enough to choose the length of a cell.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
-        #: Stamp before which no later position begins.
+        #: The next position cannot begin before this stamp [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
         # Mean of the position's first rest, which the search no longer finds after a quieter rest.

@@ -279,7 +279,7 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     """Read a message type: its columns, and the number of truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
-    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # numpy uses the codes of `struct`
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes: as in `struct`
     kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
     if len({*layout.columns}) < len(layout.columns):
         raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)

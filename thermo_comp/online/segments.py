@@ -117,7 +117,7 @@ class ThermalSide:
         self._slow = _NO_STATE
         self._slow_evaluated = _NO_STATE
         self._slow_rows: Floats = np.empty(0)
-        #: End and thermal state of the last segment: the begin of the next segment if no reading
+        #: End and thermal state of the last segment: the start of the next segment if no reading
         #: is applied in between.
         self._last_end: tuple[int, int, tuple[float, ...]] | None = None
 

@@ -56,11 +56,10 @@ class Evidence:
     """
     The content of a report; missing parts are None or empty.
 
-    `windows`: windows at rest of all bags; `judgement`: judgement of the windows; `steps`:
-    residuals after each step of the model; `left_out`: by `Windows.position` the RMS of
-    ``|f| - g`` of a fit to the other positions [m/s^2]; `findings`: reservations about calibration
-    or bags; `checks`: passed checks; `gravity_sd`: uncertainty of gravity included in the
-    covariance [m/s^2].
+    `windows`: windows at rest of all bags; `judgement`: judgement of `windows`; `steps`: residuals
+    after each step of the model; `left_out`: by `Windows.position` the RMS of ``|f| - g`` of a fit
+    to the other positions [m/s^2]; `findings`: reservations about calibration or bags; `checks`:
+    passed checks; `gravity_sd`: uncertainty of gravity included in the covariance [m/s^2].
     """
 
     serial: str

@@ -196,7 +196,7 @@ class Relay:
         compensator = self.running.compensator
         last_ns = compensator.now_ns
         if last_ns is not None:
-            # The clock advanced by at most `silence_ns` since the stamp of the last sample.
+            # Use readings stamped at most `silence_ns` after the last sample.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:
