@@ -45,7 +45,7 @@ def _qos(reliability: str, depth: int = DEPTH) -> Any:
 
 
 def _source(arguments: argparse.Namespace) -> None:
-    """Publish samples at the rate, temperatures at 10 Hz."""
+    """Publish samples at the given rate, temperatures at 10 Hz."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.serialization import serialize_message
