@@ -81,7 +81,7 @@ class ForeignLog:
 
 @dataclass(frozen=True)
 class Stillness:
-    """Rests of a log, and its samples at rest in the unit of the log; NaN without a rest."""
+    """Rests of a log, and its samples at rest in the unit of the log, NaN without a rest."""
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells
@@ -101,7 +101,7 @@ class Finding:
 class ConversionReport:
     """Summary of a conversion."""
 
-    log: ForeignLog  # the part of the log that was written
+    log: ForeignLog  # the rows of the log that were written to the bag
     rows: int
     messages: Mapping[str, int]  # number of messages by the name of the input
     rate_hz: float

@@ -71,7 +71,7 @@ class LiveField:
         return float(message)
 
     def read(self, data: bytes) -> tuple[int, float] | None:
-        """Read stamp [ns] (`NO_STAMP_NS` without a header) and number; None for unreadable bytes."""
+        """Read stamp [ns] (`NO_STAMP_NS` without a header) and number; None if unreadable."""
         try:
             message = deserialize_message(data, self.kind)
             header = getattr(message, 'header', None)
