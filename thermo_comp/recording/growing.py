@@ -4,7 +4,7 @@
 Owns live recording: new messages of a bag that another program writes, and numbered bags.
 
 Each pass reads the growing bag from its beginning, so the pauses grow with the duration of a pass.
-The messages are written to a folder of bags, `01.mcap`, ... with the node's topic names. The end
+New messages are written to a folder of bags, `01.mcap`, ... with the node's topic names. The end
 of a position is recognised with a delay, so the newest messages are held back.
 """
 

@@ -62,7 +62,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 def widest(bags: Sequence[ReducedBag]) -> int:
     """Choose the bag to show: the widest in temperature, then the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
-    # Spans within 5 %, and lengths within a minute, count as equal; the first equal bag is taken.
+    # Spans within 5 % and lengths within a minute count as equal; of equal bags take the first.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
     return max(candidates, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
 

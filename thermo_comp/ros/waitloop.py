@@ -10,7 +10,7 @@ loop.
 
 Undocumented parts of rclpy in use: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message`, `get_publisher_count`, `service_take_request` and `publish_raw` of handles, and the
-node's `_parameter_overrides`; `test/test_waitloop.py` fails when a part in use changes.
+node's `_parameter_overrides`, all of them tested by `test/test_waitloop.py`.
 """
 
 import time

@@ -178,7 +178,7 @@ class ThermalTracker:
         if before_ns is not None and (is_new or has_restarted):
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
             if has_restarted and not is_gap and n_before < 2 * RESTART_READINGS:
-                # The few readings before the restart were wrong, not those after it.
+                # The few readings before the restart were wrong: begin at the present reading.
                 self._begin_again(name, sensor)
                 sensor.update(stamp_ns, celsius)
                 self.updated_ns = max(self.updated_ns or stamp_ns, stamp_ns)
