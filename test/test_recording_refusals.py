@@ -202,7 +202,7 @@ def test_torn_bags_of_other_storages_are_one_line(tmp_path):
 
 
 def driver_bag(path, *topics, metadata=None):
-    """Write five messages per topic: Imu, Temperature, Bool or Vector3Stamped, by its kind."""
+    """Write five messages per topic, whose kind is Imu, Temperature, Bool or Vector3Stamped."""
     stamp_ns = START_NS + np.arange(5) * 10**7
     with BagWriter(path, metadata=metadata or {}) as bag:
         for topic, kind in topics:
