@@ -51,7 +51,8 @@ def left_by(pair, **options):
 @pytest.mark.slow
 def test_two_positions_tell_the_thermal_response():
     # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine the sd to 6 %, and
-    # superfluous columns may add 10 %. The median of all 36 pairs is 1.3 ug (docs/accuracy.md).
+    # superfluous columns may add 10 %. The median error of all 36 pairs of bags is 1.3 ug
+    # (docs/accuracy.md).
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 

@@ -79,7 +79,7 @@ def test_metres_of_a_navigator_by_hand():
 def test_map_of_the_sphere_keeps_areas():
     assert of_bags.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert of_bags.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees is 1 - sin 45 of a hemisphere, and maps to this part of the disc.
+    # The cap above 45 degrees is 1 - sin 45 of a hemisphere and maps to the same part of the disc.
     x, y = of_bags.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
