@@ -320,9 +320,9 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
         # The leverage of the curve at the ends is 5/6 for a line through three equidistant
-        # points, 1 for a parabola; the next turn-on adds its variance. The stated sd may also
-        # be that of mountings: bias and scale keep a third each of the variance of nine
-        # independent offsets.
+        # points, 1 for a parabola; the next turn-on adds its variance. The stated sd of
+        # turn-ons may also be that of mountings: bias and scale keep a third each of the
+        # variance of nine independent offsets.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
