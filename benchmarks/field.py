@@ -199,7 +199,7 @@ def simulated(kind: str, n_units: int, days: int) -> None:
 
 
 def log_size() -> None:
-    """Print the size of a month's log of an ageing unit."""
+    """Print the size of a month's rest log of an ageing unit."""
     history = live('carried', 0, 30, Process())
     size = sum(len(encode(rest)) for _, rest in history.rests)
     size += sum(len(encode(start)) for start in {start for start, _ in history.rests})

@@ -35,7 +35,7 @@ def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generat
     """Draw the days until the RMS of |f| - g exceeds a bound, for 200 futures, in steps of 8 h."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
-    # The norm of `root @ (1, levels)` is the RMS over the probes.
+    # The norm of `root @ (1, levels)` is the RMS over the rests of `probe`.
     joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
     root = np.asarray(np.linalg.qr(joined, mode='r'))
     for step in range(3 * 3650):

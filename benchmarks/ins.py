@@ -139,7 +139,7 @@ def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> 
     )  # fmt: skip
     F = np.eye(4) + A * dt + 0.5 * A @ A * dt * dt
     Q = np.diag([0.0, model.noise_density**2, 0.0, 2.0 * model.bias_sd**2 / BIAS_S]) * dt
-    # Levelling turns the error of the accelerometer into a tilt that compensates it.
+    # Levelling turns an error of the accelerometer into a tilt that compensates this error.
     tilt = np.array([0.0, 0.0, 1.0 / gravity, 1.0])
     P = np.outer(tilt, tilt) * model.bias_sd**2
     P[2, 2] += model.noise_density**2 / ALIGN_S / gravity**2
@@ -192,7 +192,7 @@ def models() -> tuple[dict[str, Model], float, Floats, float]:
 
 
 def draw(path: Path, results: dict[str, dict[str, Flights]]) -> None:
-    """Draw the position error of both programs over time."""
+    """Draw the position error over time: free flights, and flights with zero-velocity updates."""
     mpl.use('Agg')
     from matplotlib import pyplot as plt
 

@@ -4,7 +4,7 @@
 Owns the figures of docs/beyond_1g.md: nonlinear terms from centrifuge runs, against their truth.
 
 Run ``python benchmarks/nonlinearity.py``, or with fewer units: ``--units 4``. The runs come from
-the generator below, not from `thermo_comp.simulation`. A test has 12 mountings, each in three
+a generator in this file, not from `thermo_comp.simulation`. A test has 12 mountings, each in three
 soaks at 1 g and at 2, 4, 7 and 10 g. |f| is stated with 1 ppm (1 sd), the samples in m/s^2 have a
 noise of 5 ug/sqrt(Hz), and bias and scale are quadratic in the board's temperature.
 """
@@ -45,7 +45,7 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit by its truth: columns are x, y, z; K2 [g/g^2] and K3 [g/g^3] change by `share`/K."""
+    """A unit by its truth, columns x, y, z; K2 [g/g^2], K3 [g/g^3] change by a `share` per K."""
 
     scale: Floats
     scale_slope: Floats
@@ -188,7 +188,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
     result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # The same fit with terms pinned to 0 by their prior shows the change of bias and scale.
+        # A fit with nonlinear terms pinned to 0 by their prior shows the change of bias and scale.
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])
@@ -204,7 +204,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
         result[f'{one.kind} ratio'] = (np.array(one.coefficient) - true) / of_terms[:, 0, k]
         slope = np.array(one.per_kelvin) - unit.share * true
         result[f'{one.kind} slope ratio'] = slope / of_terms[:, 1, k]
-    # The new mounting is nearly along an axis, where the terms are largest.
+    # The new mounting is nearly along an axis, where the nonlinear terms are largest.
     direction = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
     new = run(unit, direction / np.linalg.norm(direction), rng, (5.0,))
     result['after'] = np.array([residual_ug(calibration, new, 5.0)])

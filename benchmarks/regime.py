@@ -5,8 +5,8 @@ Owns the figures of docs/regime.md: the detector over ramps and soaks, in one ru
 
 Closed-form responses of a case (first-order lag) and a board (a second lag behind it) to a
 chamber's ramp, with the chamber's ripple and a self-heating drift, are read by sensors of several
-noises, quanta and rates. The detector runs as shipped. All runs are seeded: the command always
-prints the same figures.
+noises, quanta and rates. The detector has its default settings. All runs are seeded: the command
+always prints the same figures.
 
     python benchmarks/regime.py --quick            # seconds
     python benchmarks/regime.py --workers 2        # some minutes

@@ -86,7 +86,7 @@ def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
 
 
 def run_ramps(job: Job) -> tuple[Scene, Outcome]:
-    """Run the shipped detector over ramps of one scene."""
+    """Run the package's detector over ramps of one scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
     # The ramp lasts four quanta of the sensor and two lags, within 40 min and 2 h.

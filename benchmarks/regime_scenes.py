@@ -98,7 +98,7 @@ def known_signature_delays(
         energy = np.cumsum(signature**2)
         sums = np.zeros(len(x))
         for length in range(1, longest + 1):
-            # signature[0] is for the reading `length - 1` ago, the last for the newest reading
+            # `signature[length - 1]` is for the newest reading, `signature[0]` for the oldest
             sums = np.convolve(x, signature[:length][::-1])[: len(x)]
             np.maximum(best, (sums - 0.5 * energy[length - 1]) / scene.noise_sd**2, out=best)
         return best

@@ -45,7 +45,7 @@ def _qos(reliability: str, depth: int = DEPTH) -> Any:
 
 
 def _source(arguments: argparse.Namespace) -> None:
-    """Publish samples at the rate, temperatures at 10 Hz."""
+    """Publish samples at the given rate, temperatures at 10 Hz."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.serialization import serialize_message
@@ -184,8 +184,8 @@ def _floor(arguments: argparse.Namespace) -> None:
         Vector3Stamped, 'accel/counts', print, _qos(arguments.reliability), raw=True
     )
     take, publish = subscription.handle.take_message, publisher.handle.publish_raw
-    # The frame_id of both kinds of samples has the same length, so the values are always at the
-    # end.
+    # The frame_ids of warm-up and counted samples have the same length, so the values are always
+    # the end of a message.
     head, frame = COUNTS.size - 24, bytearray(COUNTS.size - 24 + 37 * 8)
     with subscription.handle, node.context.handle:
         wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)

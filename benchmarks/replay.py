@@ -86,7 +86,7 @@ def compensate(path: Path) -> tuple[int, float]:
     n = 0
     with open_recording(path) as reader:
         for block in reader.blocks():
-            # Measure the CPU time of this thread: the reader's is not part of the correction.
+            # Measure this thread's CPU time in the correction, without the time of reading.
             begin = time.thread_time()
             n += len(process_block(compensator, block).index)
             spent += time.thread_time() - begin

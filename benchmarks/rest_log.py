@@ -45,7 +45,7 @@ from thermo_comp.typing import Floats
 def cost(
     node: CompensationNode, relay: Relay, keeper: RestKeeper, seconds: int
 ) -> tuple[list[float], list[float]]:
-    """Return CPU time per sample [us] of seconds with the log, and without."""
+    """Return CPU time per sample [us] of seconds with the rest log, and without."""
     found: tuple[list[float], list[float]] = ([], [])
     time.sleep(2.0 - time.time() % 2.0)
     for _ in range(seconds):
@@ -71,7 +71,7 @@ def tail_latencies(file: Path) -> tuple[Floats, Floats]:
 
 
 def measure(rate: int, seconds: int, folder: Path) -> None:
-    """Print the figures of one rate."""
+    """Measure the node at one sample rate [Hz], and print the results."""
     calibration = _calibration_for(rate, folder)
     latencies = folder / f'{rate}.npy'
     options = [f'--rate={rate}', '--reliability=best_effort', f'--seconds={seconds + 4}']

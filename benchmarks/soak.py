@@ -254,7 +254,7 @@ def _resident_kib(pid: int) -> float:
 
 def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, float] | None:
     """
-    Return the slope per hour and its standard error, from means over windows; None if too short.
+    Return the slope per hour and its standard error, from means over windows; None in a short run.
     """
     table = np.array(rows)
     table = table[table[:, 0] >= 0.1 * table[-1, 0]]

@@ -219,8 +219,8 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     Return a calibration whose covariance has no constants: bias, scale and misalignment.
 
     One pose determines the constants to 50 mg only. The constants cancel in the drift of one pose,
-    but not in a difference of two variances: ``a^2`` times the variance of a scale factor has the
-    noise of `a`.
+    but not in the difference of two variances: an acceleration `a` contributes ``a^2`` times the
+    variance of the scale factor, and has noise.
     """
     if calibration.posterior is None:
         return calibration

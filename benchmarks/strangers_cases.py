@@ -197,7 +197,7 @@ def returned(number: int) -> Iterator[Study]:
         for celsius in (-15.0, 22.0, 45.0, 5.0):
             for number_of_pose, up in enumerate(ups, 1):
                 turned = up + np.cross(2e-4 * rng.standard_normal(3), up)
-                # At 10 Hz the noise of a sample is as large as a count: means resolve parts of it.
+                # At 10 Hz a sample's noise is as large as a count: means resolve parts of a count.
                 fit += (record(unit, program(celsius, 30), turned / np.linalg.norm(turned), rng,
                                name=f'{celsius:g} degC, pose {number_of_pose}', rate_hz=10.0,
                                is_cold=True),)  # fmt: skip
@@ -237,7 +237,7 @@ def mems(number: int) -> Iterator[Study]:
         for sd in (100, 300, 1000):
             rng = rng_of('mems', n, sd, number)
             unit = consumer_grade(rng)
-            # At 10 Hz the noise is as large as a count, so that rounding leaves no bias.
+            # At 10 Hz a sample's noise is as large as a count, so that rounding leaves no bias.
             fit, held = (
                 positions(
                     unit,
@@ -339,7 +339,7 @@ def cold_start(number: int) -> Iterator[Study]:
 
 
 def slow_thermometer(number: int) -> Iterator[Study]:
-    """Read a board thermometer that lags the board by 30 to 90 s; all bags have the same thaw."""
+    """Record with a board thermometer that lags by 30 to 90 s; bags of the fit have FROST."""
     rng = rng_of('slow-thermometer', number)
     unit = navigation(rng, thermometer_s=rng.uniform(30, 90), sensors=('board',))
     fit = positions(unit, FROST, spread(12, rng), rng)
@@ -360,7 +360,7 @@ def flicker(number: int) -> Iterator[Study]:
 
 
 def third_node(number: int) -> Iterator[Study]:
-    """Add a node without a thermometer, and a bag in still air, fitted jointly or with a prior."""
+    """Add a node of unknown temperature; fit a bag in still air jointly or with a prior."""
     rng = rng_of('third-node', number)
     unit = navigation(rng, hidden_bias=signed(rng, 20, 60), hidden_s=rng.uniform(900, 2500))
     fit = positions(unit, HALF, spread(12, rng), rng)

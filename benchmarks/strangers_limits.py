@@ -121,7 +121,7 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # In 'returned' the variance that `score` subtracts, at the reference, is that of a slope.
+    # In 'returned' `score` subtracts the variance of a slope, that at the reference: no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
@@ -132,7 +132,7 @@ LIMITS = {
     'bump': Limit(norm=60.0),
     'carry': Limit(),
     'support': Limit(vector=60.0),
-    # The baselines use the same wrong gravity, which no data show: limit only error / claimed sd.
+    # The baselines use the fit's wrong gravity, which no data show: limit only error / claimed sd.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
     # The claimed sd contains flicker noise over times that are longer than the recordings.
@@ -230,7 +230,7 @@ def best_baseline(row: Row, name: str) -> float:
 
 
 def misses(row: Row, others: Sequence[Row]) -> list[str]:
-    """Describe the limits that a row exceeds; `others` are the rows of its case."""
+    """Describe the limits that a row exceeds; `others` are the rows of the same case."""
     exceeded = ['refused'] if row.refused else []
     if 'fit' not in row.scores:
         return exceeded

@@ -40,7 +40,7 @@ def sample_bag(path: Path) -> Bag:
 
 
 def samples(which: str) -> Iterator[Study]:
-    """Return the sample bags: with board and case, with the board, or with the board as both."""
+    """Return the sample bags with board and case, the board alone, or the board as case, too."""
     bags = [sample_bag(path) for path in sorted((ROOT / 'bags/fit').glob('*.mcap'))]
     bags.append(sample_bag(ROOT / 'bags/held_out.mcap'))
     if which != 'sample-bags':

@@ -194,7 +194,7 @@ def spread(n: int, rng: np.random.Generator) -> Floats:
 def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:
     """Return A, b, h of ``x' = A x + b air + h``; x: case, board, parts, hidden node [degC]."""
     A, b, h = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    # The case is heavier than the board: it is coupled to the board by 0.1, to the air by `film`.
+    # The case is heavy: its relative conductance to the board is 0.1, to the air `film`.
     A[CASE, CASE] = -environment.film - 0.1
     A[CASE, BOARD] = 0.1
     b[CASE] = environment.film

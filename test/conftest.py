@@ -26,7 +26,7 @@ from hypothesis import settings
 ROOT = Path(__file__).resolve().parent.parent
 
 # Use one BLAS thread: several BLAS threads wait for each other on a busy machine. OpenBLAS
-# reads the variable when numpy is imported.
+# reads OPENBLAS_NUM_THREADS when numpy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 # Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.

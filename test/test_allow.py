@@ -130,7 +130,7 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
     ('spoil', 'name', 'text'),
     [
         (late_by(120.0), 'unmeasured', '^2[0-9] % .* has no temperatures .* use the same clock'),
-        # WHY: if readings dropped out in the middle, the message asked about the same clock.
+        # WHY: if readings dropped out in the middle, the message asked whether two clocks differ.
         (
             dropping_out,
             'unmeasured',

@@ -182,7 +182,7 @@ def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
 
 def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
     # WHY: a temperature difference of 10 K, after bags with 0.1 K, exceeds the range 100 times,
-    # and its square 10000 times. The claimed sd was 0.1 g, that of 10000 half ranges.
+    # and its square 10000 times. For 10 K the claimed sd was 0.1 g, that of 10000 half ranges.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(Layout(correction.memory).width)

@@ -63,8 +63,8 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # Counts at +g and -g: offset = sum / 2, scale = difference / 2. Eq. (3) and (4) exchange sum
-    # and difference.
+    # Counts at +g and -g: offset = sum / 2, scale = difference / 2. Equations 3 and 4 of the paper
+    # exchange sum and difference.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))

@@ -68,7 +68,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return each lot of the undisturbed bag, and the end, with a copy of `Direct` before it."""
+    """Return each lot of the undisturbed bag, an empty last lot, and `Direct` before each lot."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))

@@ -51,7 +51,8 @@ def left_by(pair, **options):
 @pytest.mark.slow
 def test_two_positions_tell_the_thermal_response():
     # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine the sd to 6 %, and
-    # superfluous columns may add 10 %. The median of all 36 pairs is 1.3 ug (docs/accuracy.md).
+    # superfluous columns may add 10 %. The median error of all 36 pairs of bags is 1.3 ug
+    # (docs/accuracy.md).
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 
@@ -319,9 +320,9 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
         # The leverage of the curve at the ends is 5/6 for a line through three equidistant
-        # points, 1 for a parabola; the next turn-on adds its variance. The stated sd may also
-        # be that of mountings: bias and scale keep a third each of the variance of nine
-        # independent offsets.
+        # points, 1 for a parabola; the next turn-on adds its variance. The stated sd of
+        # turn-ons may also be that of mountings: bias and scale keep a third each of the
+        # variance of nine independent offsets.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()

@@ -210,7 +210,7 @@ def test_a_link_is_written_through(tmp_path):
     (tmp_path / 'store').mkdir()
     link = tmp_path / 'current.yaml'
     link.symlink_to('store/unit.yaml')
-    for overwrite in (False, True):  # first, the link has no target
+    for overwrite in (False, True):  # in the first pass the link has no target
         save_calibration(calibration(), link, overwrite=overwrite)
         assert link.is_symlink()
         assert not (tmp_path / 'store' / 'unit.yaml').is_symlink()

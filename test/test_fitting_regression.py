@@ -219,7 +219,8 @@ def test_without_noise_the_regression_gives_the_truth(rng):
 
 def test_the_claimed_sd_of_the_regression_is_the_scatter_of_errors():
     # With true priors the inverse Hessian is the Cramer-Rao bound, and errors / sd have an RMS of
-    # 1. Over 36 units with 33 correlated parameters each, this RMS scatters by at most 13 %.
+    # 1. Over 36 units with 33 correlated parameters each, the RMS of errors / sd scatters by at
+    # most 13 %.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []

@@ -267,7 +267,7 @@ def test_the_calibration_file_corrects_as_the_regression(fitted):
 
 
 def test_the_covariance_of_the_file_is_that_of_the_regression(fitted):
-    # The file must give bias, K and M the sd that the claim of the regression gives.
+    # The calibration file must give bias, K and M the sd that the regression claims.
     result, claim = fitted
     calibration = result.calibration
     layout = parameter_layout(calibration)

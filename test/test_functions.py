@@ -46,7 +46,7 @@ def test_sums_do_not_depend_on_the_size_of_the_other_axes(seed, size, before, af
 
 
 def test_polynomial_by_hand():
-    # Golovach's paper prints the fourth term of Eq. (10) as a4 t, which should be a4 t^4.
+    # Equation 10 of Golovach's paper has a4 t as its fourth term, which should be a4 t^4.
     assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 

@@ -121,7 +121,7 @@ class TestWindows:
             np.testing.assert_allclose(windows.board, 30.0, rtol=0.0, atol=1e-6)
 
     def test_a_window_is_the_mean_of_what_the_node_publishes(self, tmp_path):
-        # In this ramp of 1 K/min a wrong time or reading would change the correction.
+        # In a ramp of 1 K/min a wrong time or reading would change the correction.
         bag = resting(tmp_path / 'bag', (15.0, 33.0), minutes=18.0, noise=0.2)
         unit = corrected_by(SLOPE)
         windows = judged(bag, unit).windows
@@ -242,8 +242,8 @@ class TestVerdict:
     @pytest.mark.parametrize(
         ('residual', 'raw', 'claimed', 'verdict'),
         [
-            (90.0, 1000.0, 10.0, 'valid'),  # 9 times the claimed sd, within the tolerance
-            (110.0, 1000.0, 200.0, 'recalibrate'),  # within the claimed sd, beyond the tolerance
+            (90.0, 1000.0, 10.0, 'valid'),  # error 9 times the claimed sd, within the tolerance
+            (110.0, 1000.0, 200.0, 'recalibrate'),  # error within the claimed sd only
             (90.0, 1000.0, 200.0, 'valid, but it only claims 200 ug'),
             (90.0, 80.0, 60.0, 'no better than raw'),
         ],

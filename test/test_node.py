@@ -286,7 +286,7 @@ def test_the_sample_rate_is_compared_with_the_calibrated_rate(peer, saved):
     with node_in_thread(*saved(calibration())) as node:
         driver = drive(peer, node)
         driver.temperatures(START_NS, 20.0, 20.0)
-        # The unit's cycle is 10 ms; the stamps of these samples are 20 ms apart.
+        # The unit's cycle is 10 ms; the samples have stamps 20 ms apart.
         for k in range(50):
             driver.counts(START_NS + 2 * k * CYCLE_NS, *standing(k))
         wait(lambda _, values: values['samples in'] == '50')

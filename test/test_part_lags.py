@@ -222,7 +222,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 def test_a_bump_is_no_disturbance_and_no_motion():
     # At 0.5 Hz a cell of 30 samples takes 60 s; the unit passes the bias bump within two cells.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # A fit of all groups chooses the three groups below, but takes three times as long.
+    # A fit of all groups chooses curve, part and bend, too, but takes three times as long.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
     # The bias bump, a bell with an sd of 0.85 K, is fitted by lines between knees every 0.5 K.
@@ -273,7 +273,7 @@ def test_soaks_determine_the_curve_by_their_norms(grade):
 @pytest.mark.slow
 def test_six_faces_in_three_soaks():
     # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
-    # unit with drifts of 10 mg left 40 mg. With a stated repeatability the fit divided by zero.
+    # unit with drifts of 10 mg left 40 mg. With a stated `mounting_sd` the fit divided by zero.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
@@ -320,7 +320,7 @@ def lags_of(calibration):
 def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
     # A hidden part without a thermometer: no axis' bias is a curve of one part's temperature.
     study = next(third_node(0))
-    # A fit of all groups chooses the six groups below, but takes 1.5 times as long.
+    # A fit of all groups chooses the six groups in `groups`, but takes 1.5 times as long.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}

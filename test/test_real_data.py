@@ -147,7 +147,7 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
 @pytest.mark.slow
 def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
-    # The parts are after the last jump; the freezer was knocked near 860 and 1134 s.
+    # The fitted parts follow the last jump; the freezer was knocked near 860 and 1134 s.
     parts = [Part(518.5, 638.5), Part(860.5, 1130.5), Part(1134.5, 1938.5)]
     seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
     calibration = fit(seen, OPTIONS).calibration

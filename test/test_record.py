@@ -77,7 +77,7 @@ def check_positions(result):
         assert np.array(position['up']) @ up > np.cos(np.radians(1.0))
         assert position['reason'] == ''
         assert set(position['thermometers']) == {'board', 'case', 'lid'}
-        # Cells beside a motion, three seconds long at this rate, do not count as rest.
+        # Cells beside a motion, three seconds long at 10 Hz, do not count as rest.
         assert position['still_s'] == pytest.approx(SOAK_S, abs=20.0)
 
 

@@ -49,7 +49,7 @@ def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
 def test_a_conversion_tells_what_the_bag_lacks(tmp_path, cli):
     messages = regular_messages(400, accel=IMU_IN)
     for message in messages:
-        if message.topic == IMU_IN:  # at rest: `convert` refuses another magnitude
+        if message.topic == IMU_IN:  # `convert` requires |f| = g at rest
             message.numbers = (*message.numbers[:25], 0.0, 0.0, 9.81, *message.numbers[28:])
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     with sqlite3.connect(tmp_path / 'bag' / 'bag.db3') as database:

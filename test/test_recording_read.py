@@ -361,7 +361,7 @@ def test_two_passes_over_a_recording_are_equal(tmp_path, monkeypatch):
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
     with open_recording(path) as reader:
-        first = next(iter(reader.blocks()))  # reading stops after one block
+        first = next(iter(reader.blocks()))  # the first pass stops after one block
         again = next(iter(reader.blocks()))
     assert first.accel.tobytes() == again.accel.tobytes()
 
@@ -385,6 +385,6 @@ def test_a_closed_recording_refuses_to_read(tmp_path):
     for name in ('bag.mcap', 'bag.bag'):
         with open_recording(tmp_path / name) as reader:
             pass
-        reader.close()  # a second call has no effect
+        reader.close()  # to close a closed reader has no effect
         with pytest.raises(RecordingError, match=rf'{name}: the recording is closed'):
             next(reader.blocks())

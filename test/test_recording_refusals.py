@@ -202,7 +202,7 @@ def test_torn_bags_of_other_storages_are_one_line(tmp_path):
 
 
 def driver_bag(path, *topics, metadata=None):
-    """Write five messages per topic: Imu, Temperature, Bool or Vector3Stamped, by its kind."""
+    """Write five messages per topic, whose kind is Imu, Temperature, Bool or Vector3Stamped."""
     stamp_ns = START_NS + np.arange(5) * 10**7
     with BagWriter(path, metadata=metadata or {}) as bag:
         for topic, kind in topics:
@@ -225,7 +225,7 @@ def driver_bag(path, *topics, metadata=None):
         # Free acceleration and angular rate of an Xsens are vectors, but no specific force.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
-        # Of a filter's input (imu/data_raw) and output (imu/data) the input is chosen.
+        # A filter's input, imu/data_raw, is chosen, not the filter's output, imu/data.
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),

@@ -134,7 +134,7 @@ def test_metadata_of_a_written_bag_are_read_back(tmp_path, name):
     pairs = {'serial': 'Ünit 7', 'git': 'a: b\n- c'}
     small(tmp_path / name, metadata=pairs)
     assert read_recording(tmp_path / name, require=()).info.metadata == pairs
-    if name == 'bag.mcap':  # a truncated file keeps its metadata
+    if name == 'bag.mcap':  # a truncated MCAP file keeps its metadata
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: len(content) // 2])
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs

@@ -272,7 +272,8 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
 def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     # The case lags by 3 min, the board by another 15 min. After the ramp the case's rate falls as
     # exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): they reach the relaxed rate, a
-    # tenth of the ramp's, after 7 and 38 min. Steps of 62.5 mK hide the last 5 min of the case.
+    # tenth of the ramp's, after 7 and 38 min. Steps of 62.5 mK hide the last 5 min of the case's
+    # change.
     noise, quantum = SENSORS[sensor]
     lag, behind = 180.0, 900.0
     board_too = DetectorSettings(

@@ -70,7 +70,8 @@ def test_a_soak_measures_what_the_calibration_lacks():
 
 
 def test_metres_of_a_navigator_by_hand():
-    # An error of 1 mg gives 9.80665e-3 * 1800 m in 60 s; 1 ug at most 1e-6 Earth diameters.
+    # A bias of 1 mg gives a position error of 9.80665e-3 * 1800 m in 60 s, a bias of 1 ug at most
+    # 1e-6 Earth diameters.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
 
@@ -78,7 +79,7 @@ def test_metres_of_a_navigator_by_hand():
 def test_map_of_the_sphere_keeps_areas():
     assert of_bags.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert of_bags.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees is 1 - sin 45 of a hemisphere, and maps to this part of the disc.
+    # The cap above 45 degrees is 1 - sin 45 of a hemisphere and maps to the same part of the disc.
     x, y = of_bags.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 

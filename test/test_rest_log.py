@@ -168,7 +168,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [one for _, one in decode(bytes(changed))[0]]
-    # A changed byte in a file loses one rest, a lost newline two rests, a damaged start all.
+    # A changed byte in a rest log loses one rest, a lost newline two, a damaged start line all.
     assert all(one in [rest(k) for k in range(9)] for one in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 

@@ -31,7 +31,7 @@ class Square:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A value of every kind."""
+    """A dataclass with a field of every kind of type hint."""
 
     name: Annotated[str, Bounds(shortest=2, longest=20)]
     shapes: tuple[Circle | Square, ...] = ()

@@ -35,7 +35,7 @@ def test_memory_of_a_ramp_is_the_closed_form(step_s):
     feed(tracker, 20.0 + rate * np.maximum(t - soak_s, 0.0), step_s=step_s)
     end_ns = int(t[-1]) * SECOND_NS
     expected = rate * TAU_S * (1.0 - math.exp(-ramp_s / TAU_S))
-    # The thermometer follows the ramp with a delay, which changes m by some 10 mK of 6.5 K.
+    # The thermometer follows the ramp late, which changes the lag by some 10 mK of 6.5 K.
     lag = Layout(LAG).places[Lag('board', TAU_S)]
     assert tracker.sample(end_ns)[lag] == pytest.approx(expected, abs=0.05)
     assert tracker.is_settled(end_ns)

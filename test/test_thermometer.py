@@ -298,7 +298,7 @@ def test_reset_forgets_the_readings():
     thermometer = settled()
     thermometer.reset()
     assert thermometer.stamp_ns is None
-    assert thermometer.update(0, 30.0)  # earlier than before the reset
+    assert thermometer.update(0, 30.0)  # a stamp before those of the old readings
     assert thermometer.temperature == 30.0
 
 

@@ -81,7 +81,7 @@ class Corrected:
     covariance : ndarray, shape (n, 3, 3)
         Covariance of the specific force [m^2/s^4]; NaN where the force is NaN.
     dynamic : ndarray of bool, shape (n,)
-        Whether the regime was dynamic; False while it is unknown.
+        Whether the regime was dynamic; False while the regime is unknown.
     counters : Counters
         Numbers of samples and readings used, and of those dropped for each reason.
 
@@ -108,7 +108,7 @@ def correct(
     Parameters
     ----------
     calibration : Calibration
-        Calibration of the unit; ``calibration.correct(time_s, ...)`` is the same call.
+        Calibration of the unit; ``calibration.correct(time_s, ...)`` is equal to this function.
     time_s : array_like, shape (n,)
         Time of each sample, strictly rising: seconds since any origin, or datetime64.
     counts : array_like, shape (n, 3)
@@ -225,7 +225,7 @@ def fit(
     Returns
     -------
     Calibration
-        Calibration of the unit; `save` writes it to a file, `Calibration.correct` applies it.
+        Calibration of the unit; its method `save` writes a file, its method `correct` applies it.
 
     Raises
     ------
@@ -292,7 +292,7 @@ def _numbers(name: str, value: npt.ArrayLike) -> Floats:
 
 
 def _stamps(name: str, value: npt.ArrayLike) -> Ints:
-    """Convert times to nanoseconds; ValueError if they do not rise strictly."""
+    """Convert times to nanoseconds; ValueError if the times do not rise strictly."""
     given = np.asarray(value)
     if given.ndim != 1:
         raise ValueError(f'`{name}` must have one dimension, got the shape {given.shape}')

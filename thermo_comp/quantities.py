@@ -33,7 +33,7 @@ _RULES: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a number, or of the length of a text or list; `why` gives the reason."""
+    """Bounds of a number, or of the length of a text or list; `why`: reason for the bounds."""
 
     above: float | None = None
     at_least: float | None = None
@@ -126,7 +126,7 @@ _PREPARED: dict[str, Bounds] = {
 }
 Positive = Annotated[float, Bounds(above=0.0, below=math.inf)]
 NotNegative = Annotated[float, Bounds(at_least=0.0, below=math.inf)]
-#: Bounds by the name of the quantity; the keys of a calibration refer to them.
+#: Bounds by the name of the quantity; the keys of a calibration refer to these names.
 QUANTITIES: Final[Mapping[str, Bounds]] = MappingProxyType(_PREPARED)
 
 

@@ -33,7 +33,7 @@ _FLOOR_SD = 2e-5
 # Ratio of a rest's noise to the median of all rests, above which the rest is 'restless'; ratio to
 # the noise of the previous rest, above which the unit is held by hand.
 _RESTLESS, _LOUDEST = 3.0, 10.0
-# Backward step of the stamps from which on the driver has restarted [ns].
+# Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
 # A stamp earlier than any other [ns].
 _FIRST_NS = -(1 << 62)
@@ -111,7 +111,7 @@ class Acquisition:
         # Samples kept until there are enough to choose the length of a cell.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
-        #: Stamp before which no later position begins.
+        #: The next position cannot begin before this stamp [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
         # Mean of the position's first rest, which the search no longer finds after a quieter rest.

@@ -137,7 +137,7 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
 
 @contextmanager
 def flags_named() -> Iterator[None]:
-    """Turn a ValueError of a `with` block into a usage error; its `names` become --names."""
+    """Turn a ValueError of a `with` block into a usage error, with `names` turned into --names."""
     with options.usage_of():
         try:
             yield

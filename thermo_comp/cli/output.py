@@ -71,7 +71,7 @@ class Output:
             self.line(f'- {finding}')
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = '') -> None:
-        """Print a table of aligned columns, numbers flush right; None is a dash."""
+        """Print a table of aligned columns, numbers flush right; a None is printed as a dash."""
         if not (self.as_json or self.quiet):
             for line in aligned(head, rows, title):
                 _print(line, sys.stdout)

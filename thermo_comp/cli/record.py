@@ -53,7 +53,7 @@ def record(
     Listens to the driver (or follows a growing bag). Shows rests, their
     temperatures and ramps, the expected accuracy of bias, scale and
     misalignment, and the direction for the next position. Ends when the test
-    is complete, or with Ctrl-C; the same command continues.
+    is complete, or with Ctrl-C; the same command continues the test.
 
     Example:
       thermo_comp record --positions 18 --soak 45min -o bags/unit43
@@ -83,7 +83,7 @@ def record(
             live = stack.enter_context(LiveTopics(topics=topics, ros_args=context.obj))
             news, problems = live.blocks(over.wait), lambda: live.problems
             out.line('listening; Ctrl-C ends the recording with complete bags')
-            sys.stdout.flush()  # a program that reads the pipe waits for this line
+            sys.stdout.flush()  # a program that reads the pipe waits for 'listening'
         show = stack.enter_context(out.live())
         for account in _accounts(out, news, test, bags):
             if show is None:

@@ -310,7 +310,7 @@ def fitting(
 
 
 def acceleration(text: str | None, name: str) -> float | None:
-    """Parse an acceleration with its unit [m/s^2]; None if not given."""
+    """Parse an acceleration with its unit [m/s^2]; None if no text is given."""
     with usage_of(f'{name}: '):
         return None if text is None else parse_acceleration(text)
 

@@ -107,7 +107,7 @@ def read_autopilot(
 
 
 def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
-    """Drop samples that the autopilot has corrected; RecordingError if none is left."""
+    """Drop samples that the autopilot has corrected; RecordingError if no sample is left."""
     name, since_ns, values, advice = correction
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
@@ -206,7 +206,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the angular rate to the accelerometer's stamps; None if logged sparsely."""
+    """Interpolate the angular rate to the accelerometer's stamps; None for sparse rates."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -279,7 +279,7 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     """Read a message type: its columns, and the number of truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
-    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # numpy uses the codes of `struct`
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes: as in `struct`
     kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
     if len({*layout.columns}) < len(layout.columns):
         raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)

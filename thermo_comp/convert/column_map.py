@@ -5,9 +5,9 @@ Owns tables with a column map: the content and unit of each column, and the mess
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table of numbers alone, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: times rise from row to row, readings at rest are gravity, which
-gives their unit, and an angular rate that would be faster in rad/s than any turn by hand is in
-deg/s.
+wz]`` as for imu_tk, is guessed: times rise from row to row, and readings at rest are gravity,
+which gives their unit. An angular rate is in deg/s if its numbers in rad/s were faster than any
+turn by hand.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: dryer warms a board by some 0.1 K/s.
 _FASTEST_K_S = 0.5
 # Largest share of rows in which a temperature in whole degrees changes. A column of board or
-# sensor numbers, whose rows alternate, changes in more rows.
+# sensor numbers alternates from row to row, so a larger share of its rows changes.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
 #: Share of a counter's range at each end: a step from the upper to the lower end is an overflow.
@@ -142,7 +142,7 @@ class ColumnMap:
 
 
 def load_column_map(path: Path) -> ColumnMap:
-    """Read a column map; RecordingError, with the key, if it is not valid."""
+    """Read a column map; RecordingError, with the key, for an invalid map."""
     data = read_plain_yaml(path)
     try:
         if not isinstance(data, dict):

@@ -46,8 +46,8 @@ def export_calibration(
     on the parts of the calibration that are lost.
 
     `number` is the number of the set or IMU, if the file numbers them; PX4 matches the sensor by
-    `device_id`. With `up`, the attitude as a unit vector, the scale's drift in `up` is added
-    to the offset.
+    `device_id`. With `up`, the attitude as a unit vector, the drift of the scale times gravity is
+    added to the offset.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')

@@ -24,7 +24,7 @@ _TIMES = {
     **dict.fromkeys(('us', 'µs', 'μs', 'usec', 'micros', 'microseconds'), 'us'),
     **dict.fromkeys(('ns', 'nsec', 'nanos', 'nanoseconds'), 'ns'),
 }
-# Units of time that a column map does not have; a table in them is refused.
+# Units of time that no column map has: a table with times in such a unit is refused.
 _LONG_TIMES = {
     **dict.fromkeys(('min', 'mins', 'minute', 'minutes'), 'min'),
     **dict.fromkeys(('h', 'hr', 'hrs', 'hour', 'hours'), 'h'),
@@ -73,7 +73,7 @@ class Headings:
     """The recognised columns, by heading or number, with their stated units; '' if not stated."""
 
     time: Column | None
-    time_unit: str  # also min, h, days
+    time_unit: str  # a unit of a column map, or min, h, days
     accel: Columns
     accel_unit: str
     gyro: Columns | None
@@ -155,7 +155,7 @@ def map_lines(columns: Any) -> list[str]:
 
 
 def _given(value: Any) -> Any:
-    """Turn dataclasses into the keys that differ from their defaults, and the units."""
+    """Turn dataclasses into mappings of the keys that differ from their defaults, and `unit`."""
     if is_dataclass(value):
         pairs = ((field, getattr(value, field.name)) for field in fields(value))
         return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}

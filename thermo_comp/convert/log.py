@@ -31,8 +31,8 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| of a still sensor in each unit. The tolerance of 20 % exceeds the errors of bias and scale of
-# cheap sensors, even in a thermal chamber, and is far below the ratios between the units.
+# |a| of a still sensor in each unit. The tolerance of |a|, 20 %, exceeds the errors of bias and
+# scale of cheap sensors, even in a chamber, and is far below the ratios of m/s^2, g and mg.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
@@ -66,7 +66,7 @@ class ForeignLog:
     input: Literal['counts', 'imu'] = 'imu'  # type of the messages to write
     unit: Unit = 'm/s^2'
     counts_per_g: float | None = None
-    clip: tuple[float, float] | None = None  # readings from which on the sensor is saturated
+    clip: tuple[float, float] | None = None  # readings at which the sensor is saturated
     frame_id: str = 'imu_link'
     serial: str = ''
     n_short: int = 0  # number of rows dropped for missing cells
@@ -81,7 +81,7 @@ class ForeignLog:
 
 @dataclass(frozen=True)
 class Stillness:
-    """Rests of a log, and its samples at rest in the unit of the log; NaN without a rest."""
+    """Rests of a log, and its samples at rest in the unit of the log, NaN without a rest."""
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells
@@ -101,7 +101,7 @@ class Finding:
 class ConversionReport:
     """Summary of a conversion."""
 
-    log: ForeignLog  # the part of the log that was written
+    log: ForeignLog  # the rows of the log that were written to the bag
     rows: int
     messages: Mapping[str, int]  # number of messages by the name of the input
     rate_hz: float
@@ -223,7 +223,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock. For
-    a thermometer `shifts` are those of the samples, so that the readings stay among the samples.
+    a thermometer the `shifts` of the samples are given: its readings stay among the samples.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():
@@ -299,8 +299,8 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
-    # The quiet level is the lower quartile, since a unit may be handled for most of a log. The
-    # quiet level is at least a quantum, since noise below the quantum is not visible.
+    # The quiet level is the lower quartile of the cells' sd, since a unit may be handled for most
+    # of a log, and is at least a quantum, since noise below the quantum is not visible.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []

@@ -97,7 +97,7 @@ class Table:
 def read_text(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
 ) -> Table:
-    """Read columns of a table of text, by headings or numbers from 0; None reads all of them."""
+    """Read columns of a table of text, by headings or numbers from 0; None reads all columns."""
     try:
         with TextIOWrapper(
             open_regular(path), encoding='utf-8-sig', errors='replace', newline=''
@@ -173,9 +173,9 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
 
 def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str], _Rows]:
     """
-    Skip the preamble; return the headings, if any, and the rows of a table. A row has the usual
-    width, except for a blank last cell. The table begins at the first row of numbers, or at rows
-    of the same width directly before it, the first of which has the headings.
+    Skip the preamble; return the headings, if any, and the rows of a table. A row has `width`
+    cells, apart from blank cells at its end. Rows directly before the first row of numbers belong
+    to the table, and the first of these rows has the headings.
     """
     first = list(islice(rows, _PREAMBLE_ROWS))
     is_row = [_n_cells(row) <= width <= len(row) for _, row in first]
@@ -204,7 +204,7 @@ def _commented(head: str, delimiter: str, width: int) -> list[str]:
 
 
 def _number(cell: str) -> float | None:
-    """Read a cell as a number, including NaN and infinity; None if it is not a number."""
+    """Read a cell as a number, including NaN and infinity; None for any other text."""
     try:
         return float(cell)
     except ValueError:
@@ -265,7 +265,7 @@ def _collect(
 
 
 def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int:
-    """Return the index of a column; RecordingError if it does not exist exactly once."""
+    """Return the index of a column; RecordingError unless the column exists exactly once."""
     if isinstance(name, int):
         if 0 <= name < width:
             return name

@@ -110,7 +110,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for another text."""
+    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for any other text."""
     values = _Parameters(text)
     numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not numbers:
@@ -138,7 +138,7 @@ def _read_px4(text: str, number: int | None) -> Content | None:
 
 
 def _read_ardupilot(text: str, number: int | None) -> Content | None:
-    """Read ArduPilot parameters (Mission Planner, MAVProxy); None for another text."""
+    """Read ArduPilot parameters (Mission Planner, MAVProxy); None for another tool's text."""
     values = _Parameters(text)
     numbers = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
     if not numbers:
@@ -213,7 +213,7 @@ def _qr(matrix: Floats) -> tuple[Floats, Floats]:
 
 def turned(rotation: Floats) -> list[str]:
     """
-    Describe the rotation from another tool's frame to thermo_comp's, for tf; empty without it.
+    Describe the rotation from a tool's frame to thermo_comp's, for tf; empty if the frames agree.
     """
     if np.abs(rotation - np.eye(3)).max() < 1e-9:
         return []
@@ -256,7 +256,7 @@ def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
 
 
 def _read_imu_tk(text: str, _number: int | None) -> Content | None:
-    """Read imu_tk's ``.calib``: 21 numbers, with or without headings; None for another file."""
+    """Read imu_tk's ``.calib``: 21 numbers, with or without headings; None for another format."""
     lines = (line for line in text.splitlines() if not _HEADING.match(line))
     try:
         numbers = np.array([float(cell) for line in lines for cell in line.split()])
@@ -269,7 +269,7 @@ def _read_imu_tk(text: str, _number: int | None) -> Content | None:
 
 
 def _read_imu_calib(text: str, _number: int | None) -> Content | None:
-    """Read imu_calib's YAML; None for another file."""
+    """Read imu_calib's YAML; None for another tool's file."""
     data = _mapping(text)
     if not {'SM', 'bias'} <= data.keys():
         return None
@@ -334,7 +334,7 @@ class Tool:
     """The file of a tool: a bias over temperature, or scale and misalignment."""
 
     write: Callable[[Content, int | None, int], str]
-    read: Callable[[str, int | None], Content | None]  # None for a text of another kind
+    read: Callable[[str, int | None], Content | None]  # None for another tool's text
     is_thermal: bool = False
     reference_c: float | None = None  # the fixed reference temperature of an autopilot
 

@@ -45,7 +45,7 @@ class Start:
 class Rest:
     """
     One window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of
-    samples; `mean`, `sd`: of these samples [input units]; `state`: mean thermal state, laid out by
+    samples; `mean`, `sd` of the samples [input units]; `state`: mean thermal state, laid out by
     the `thermal.state.Layout` of `Start.memory`; `shares`: share of each lag's unknown initial
     value that remains; `rate`: mean angular rate [rad/s], empty if unknown.
     """

@@ -197,7 +197,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> Series:
-    """Evaluate rests at the logged or given gravity; RecordingError if the log lacks a lag."""
+    """Evaluate rests at logged or given gravity; RecordingError for a lag that is not logged."""
     correction = Correction(calibration)
     layout, K = Layout(correction.memory), correction.K[:, 0]
     places = {spec: _places(spec, correction.memory) for spec in {s.memory for s, _ in rests}}

@@ -31,7 +31,7 @@ _WINDOW_DAYS = 7
 _LEAST_STARTS = 10
 #: Probabilities of the forecast, its horizon [days], and number of simulated random walks.
 _QUANTILES, _HORIZON, _WALKS = (0.1, 0.5, 0.9), 3650.0, 2000
-#: Width of a class of temperature [K], and largest number of periods in the table.
+#: Width of a temperature class [K], and largest number of periods, in the tables of a watch.
 _CLASS_K, _PERIODS = 10.0, 30
 
 
@@ -198,9 +198,9 @@ def _forecasts(
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # The offsets of the starts add to the error, so their variance reduces the limit. An earlier
-    # disturbance increases the model's variance of the offsets, so the variance of the recent
-    # rests is used if it is smaller.
+    # The offsets of the starts add to the error, so their variance reduces the bound of the random
+    # walk. An earlier disturbance increases the model's variance of the offsets, so the variance
+    # of the recent rests is used if it is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     scatter = min(
         scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)
@@ -249,7 +249,7 @@ def passage(
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # Reduce the walk to as many independent variables as directions, with the same covariance.
+    # Reduce the walk's independent variables to one per direction, with the same covariance.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -262,7 +262,7 @@ def passage(
     for step in np.diff(times):
         if stays[-1] <= 1.0 - _QUANTILES[-1]:
             break
-        # Remove the walks beyond the bound once they are more than a fifth.
+        # Remove the walks beyond the bound once they are more than a fifth of all walks.
         is_in = inside > 0.0
         if is_in.mean() < 0.8:
             error, speed, left, inside = error[is_in], speed[is_in], left[is_in], inside[is_in]

@@ -31,7 +31,7 @@ def model_of(
     Return the model of the prior or, without a prior, a model with all columns that the bags can
     determine.
 
-    `parts`: the lag of each axis, see `Model`; None for the bank of time constants
+    `parts`: the lag of each axis, or None for the bank of time constants
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -88,7 +88,7 @@ def windows_of(
     """
     Return the windows of bags, with the known |f| of each position.
 
-    `tracks`: as in `thermal_windows`; `undisturbed`: factors of the weights, see `Parts`
+    `tracks`: thermal states of the bags, if known; `undisturbed`: factors of the windows' weights
     """
     windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))

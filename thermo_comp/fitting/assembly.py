@@ -152,7 +152,7 @@ def _valid_columns(
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
         if k in of_parts and column.term.order % 2:
-            # A part lags as far in cooling as in warming: odd powers are valid with both signs.
+            # A part lags as far in cooling as in warming, so odd powers are valid with both signs.
             valid = union((valid, (-valid[1], -valid[0])))
         # A column used only in the curves over parts' temperatures gets the group of these curves.
         group = PART if k in weighed and not alone[k] else column.group
@@ -301,7 +301,7 @@ def file_jacobian(
     """
     sets, sums = model.sets, model.part_curves.sums
     n, m = sets.static.n_free, sets.dynamic.n_free
-    # The last row is zero, because the place -1 marks a parameter that is not estimated.
+    # The last row, at place -1, is zero: the place -1 marks a parameter that is not estimated.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
     for axis, K in enumerate(regression.nominal_scale):

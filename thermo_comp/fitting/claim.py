@@ -7,7 +7,8 @@ do not determine, and by the effects that the model lacks.
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. The weight of a fit in the mixture is its
 evidence, limited by the evidence of the positions' norms, times a half-Student prior of the offset
-sd. An error of gravity is common to all axes; `jackknife` adds effects that the model lacks.
+sd. An error of gravity changes the scale factors of all axes by the same ratio. `jackknife` adds
+the variance due to effects that the model lacks.
 
 References
 ----------
@@ -37,7 +38,8 @@ from .windows import CURVE, LAGS, PART
 #: Largest usual sd of the offsets of mountings within a turn-on, of turn-ons, and of mountings
 #: that each have their own turn-on, relative to `Prior.offset_scale`. By data sheets, turn-ons
 #: of tactical triads repeat within 0.3 to 1 mg, those of MEMS within some mg: 10 to 20 times that
-#: scale. The factors are smaller, a compromise with units whose turn-ons repeat perfectly.
+#: scale. The factors 2 and 5 of turn-ons are a compromise between data sheets and units whose
+#: turn-ons repeat perfectly.
 LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
@@ -117,8 +119,8 @@ def claim_of(
     if shared_variance and not regression.has_turn_ons:
         covariance = covariance + shared_variance * _of_turn_on(regression, posterior)
     if candidates is not None:
-        # The covariance with unseen columns is computed at the mode's mounting sd. Add to it the
-        # excess, by mixtures, jackknife and turn-ons, over the covariance of the mode.
+        # The covariance with unseen columns is computed at the mode's mounting sd, and lacks the
+        # variance that mixtures, jackknife and turn-ons add to the covariance of the mode.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, candidates, of_means)
         at = _places(posterior.layout, layout)
@@ -136,7 +138,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     density per step of the logarithm.
 
     `scale`: scale of the fit's prior, 3 times the noise in 1 Hz; `known_sd`: the sd by a prior
-    calibration, 0 for none; `kind`: a key of `LARGEST_USUAL`
+    calibration, 0 for none; `kind`: what has the offsets, a key of `LARGEST_USUAL`
     """
     if known_sd:
         # Twelve positions determine the sd of their mounting offsets to a factor of 1.5.
@@ -171,16 +173,16 @@ def _widened(
     """
     Return the covariance with the columns that the data do not determine, and its layout.
 
-    Arguments as in `claim_of`.
+    `candidates`: prior sd of the columns, shape (2, m); `of_means`: fit to the positions' means
     """
     prior, state = _with_unseen(regression, posterior, candidates), posterior.state
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
         return with_unseen.layout, with_unseen.covariance.copy()
-    # A warm-up of the unit heats the board in another way than a chamber does. If the drifts
-    # in bags at rest determine the curve, the curve of the positions' means is an alternative.
+    # The curve of the positions' means is an alternative to a curve that the drifts of a warm-up
+    # determine, because a warm-up heats the board in another way than a chamber does.
     other = _with_curve(regression, state, of_means)
-    # An sd of 1e-9 gives columns of the means' curve alone a place in the covariance.
+    # Columns that only the curve of the means has get a place in the covariance by an sd of 1e-9.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -223,19 +225,18 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # Lags differ from soak to soak by errors of the thermometer, which determine no weight.
+        # At constant temperatures lags are errors of the thermometer, which determine no weight.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
-        # A lag delays the curve. The prior sd of a lag's weight is therefore at most the largest
-        # slope of the curve (RMS of the three axes), which includes the columns that the data do
-        # not exclude.
+        # A lag delays the curve, so the prior sd of a lag's weight is at most the largest slope of
+        # the curve (RMS of the three axes), including the columns that the data do not exclude.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
-        # An unseen column of a curve changes its slope by up to half of the largest slope.
+        # An unseen column changes the slope of a curve by up to half of the largest slope.
         unseen = 0.5 * of_curve
         typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
         sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)

@@ -100,7 +100,7 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return the directions of mean readings (n, 3) from a centre; NaN at the centre."""
+    """Return unit vectors from a centre to mean readings (n, 3), NaN for one at the centre."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
@@ -118,13 +118,11 @@ def rough_centre(means: Floats) -> Floats:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The origin is the centre if the sd of the norms is below 30 % of the RMS distance to the
-    # mean.
+    # The origin is the centre if the norms' sd is below 30 % of the RMS distance to the mean.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
-    # Points with less than 2 % of their variance across a plane do not determine a sphere's
-    # centre.
+    # Points with less than 2 % of their variance across a plane do not determine a sphere.
     if values[0] < 0.02 * values[2]:
         return zero
     # A sphere about c satisfies |m|^2 = 2 c m + const; subtracting the mean keeps numbers small.
@@ -135,9 +133,9 @@ def rough_centre(means: Floats) -> Floats:
     # readings are spread over the sphere: their RMS distance from the mean is at least half of the
     # radius (1 radius for six faces, and 0.1 radius for readings within 6 degrees).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # There is a sphere through any four readings, so the axes of its centre must also agree: codes
-    # at zero force of an analog sensor's axes agree within 20 % of their mean (ADXL335 data sheet:
-    # 1.2 to 1.8 V), while the axes of a unit in one pose read differently.
+    # There is a sphere through any four readings, so the coordinates of its centre must agree: the
+    # codes at zero force of an analog sensor's axes agree within 20 % of their mean (ADXL335 data
+    # sheet, 1.2 to 1.8 V), while the axes of a unit in one pose read differently.
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero
@@ -204,7 +202,7 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the attitude of the largest sd of |f| by positions (n, 3); None without covariance."""
+    """Find the attitude of largest sd of |f|; `up`: positions (n, 3); None without covariance."""
     if calibration.posterior is None:
         return None
     layout, axes = parameter_layout(calibration), calibration.axes

@@ -73,7 +73,7 @@ def judge_windows(
     """
     Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest.
 
-    A prior calibration of the same unit contains the effects of temperature and ramps already.
+    Span and ramps are not judged with a prior calibration of the unit, which has both effects.
     """
     yield _judge_positions(up)
     used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
@@ -170,7 +170,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
         # Soaks at one temperature of a chamber differ by less than 1 K, or a tenth of the span.
         is_gap = steps > max(1.0, 0.1 * steps.sum())
         n = 1 + int(is_gap.sum())
-        # A slow drift through a range is not a soak.
+        # A slow drift of the temperature through a range is not a soak.
         has_soaks = steps[~is_gap].sum() < n * max(1.0, 0.1 * steps.sum())
         # Five temperatures determine a cubic, and show whether the cubic fits.
         if has_soaks and n < 5:
@@ -264,9 +264,9 @@ def determines_misalignment(up: Floats) -> bool:
     """
     Whether the number and the spread of positions are sufficient to estimate M.
 
-    The largest sd of a constant, in units of the noise of one position, must be at most 6. The
-    largest sd is 1 for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held
-    three times each by hand.
+    The largest sd of a constant, in units of the noise of one position, must be at most 6: it is 1
+    for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held three times each
+    by hand.
     """
     distinct = distinct_directions(up)
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
@@ -279,7 +279,8 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     Refuse data that appear to be compensated already.
 
     `raw`: RMS of |f| - g with the constants of the triad alone [m/s^2].
-    No triad is built with all constants below 1e-4 and a drift of |f| below 2e-5 g over 20 K.
+    No raw triad has biases [g], errors of the scale and misalignments [rad] all below 1e-4, and an
+    RMS of |f| - g below 2e-5 g over 20 K.
     """
     state, K = fit.posterior.state, fit.posterior.state.kappa * fit.regression.nominal_scale
     span = float(np.ptp(fit.windows.temperature))

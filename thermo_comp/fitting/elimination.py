@@ -35,7 +35,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
     index = np.arange(matrix.shape[-1])
-    # Relative jitters, added one after another until a factor exists.
+    # Relative jitters, added to the diagonal in turn until a Cholesky factor exists.
     jitters = 1e-13, 1e-11, 1e-9, 1e-7
     for jitter in jitters:
         scaled[..., index, index] += jitter
@@ -43,7 +43,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
-                # Only the matrices without a factor get more jitter.
+                # Each matrix gets only the jitter with which its Cholesky factor exists.
                 return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise
@@ -79,8 +79,7 @@ class Blocks:
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
         """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower: `inv` does not use that factors are
-        # triangular.
+        # `numpy.linalg.inv` of all factors at once is slower: it ignores that they are triangular.
         root = np.stack([inverse_root(factor).T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
@@ -114,7 +113,7 @@ class Reduced:
         gradients, shape (n_positions, r, r + n + 1); and to the diagonals before the elimination
         of the positions, shape (n_positions, r)
     bags: the blocks of the bags
-    common: the prior on the sum of the initial lag states as a further block; None without it
+    common: the prior on the sum of the initial lag states as a further block, or None
     """
 
     layout: Layout
@@ -169,7 +168,7 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return `whole` without some positions, given their normal equations."""
+        """Return the Hessian `whole` without some positions, given their normal equations."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)
@@ -203,7 +202,7 @@ class Reduced:
         cross -= _summed(turned[..., r:], of_positions) + _summed(self.bags.turned, of_bags)
         gone = _square(of_positions, of_bags)
         if self.common is not None:
-            # The prior on the sum of the initial lag states adds information.
+            # The prior on the sum of the initial lag states adds information to the equations.
             starts = (np.swapaxes(self.bags.root, 1, 2) @ of_bags).sum(axis=0)
             of_sum = self.common.root @ starts[: layout.start.shape[1]]
             cross += _summed(self.common.turned, of_sum)

@@ -5,7 +5,7 @@ Owns the exclusion of bags of another environment, and the error that is publish
 
 In still air the board temperature follows the case temperature by another law than in a chamber
 with a fan. The bias of a part without a thermometer depends on the environment, and no set of
-coefficients describes two environments: a bag of still air would increase the error in a chamber
+coefficients describes two environments. A bag of still air would increase the error in a chamber
 with a fan. The fit excludes a bag of another environment and publishes the error of its correction
 as a lack of fit.
 """

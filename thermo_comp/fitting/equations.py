@@ -8,8 +8,8 @@ Equation of window w of position p and axis i, in m/s^2 of the nominal scale fac
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + o_b + kappa (A l_p)_i g + noise,
     a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support,  o_b: offset of the turn-on
 
-B and S are columns of the table in `unit.columns`, each divided by its RMS. With g = 0 the
-equation is that of an angular rate: the terms b, B beta and o_p remain. If |f| differs between
+B and S are columns of the table in `unit.columns`, each divided by its RMS. With g = 0 the terms
+b, B beta and o_p remain, and the equation is that of an angular rate. If |f| differs between
 positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added
 (`forces`). All terms are linear combinations of the base series of the windows (`series`).
 """
@@ -75,8 +75,8 @@ class Equations(Series):
     The measurement equations of a fit.
 
     windows: the data of the fit
-    gravity: local gravity; 0 for an angular rate
-    nominal_scale: K0 [input units per m/s^2], shape (3,)
+    gravity: local gravity [m/s^2]; 0 for an angular rate
+    nominal_scale: nominal scale factors K0 [input units per m/s^2], shape (3,)
     """
 
     def __init__(self, windows: Windows, gravity: float, nominal_scale: Floats) -> None:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the evidence that a fit reports: the residuals of each step of the model and of each
-position, and the contribution of each group of columns.
+Owns the evidence that a fit reports: the residuals of each position, the residuals with constants,
+curves and response added in turn, and the contribution of each group of columns.
 
 Each position has two residuals: in sample, and with the unit's parameters fitted without this
 position, which estimates the error in a new attitude.
@@ -53,7 +53,7 @@ class PositionReport:
 @dataclass(frozen=True)
 class ResidualRow:
     """
-    Statistics of ``|f| - g`` over the windows of one section, after each step of the model.
+    Statistics of ``|f| - g`` over the windows of one section, after each step of the correction.
 
     section: regime of the windows, ``static``, ``dynamic`` or ``all``
     raw: corrected with the constants at the reference temperature
@@ -74,8 +74,8 @@ class ResidualRow:
 
 def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     """
-    Return residuals of the steps of the model, and ``|f| - g`` in sample and the left-out error of
-    each window [m/s^2], shape (n,).
+    Return statistics of the residuals after each step of the correction, and of each window
+    ``|f| - g`` in sample and the left-out error [m/s^2], shape (n,).
     """
     windows, regression, selected, state = *fit[:3], fit.posterior.state
     steps = [
@@ -156,9 +156,8 @@ def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupE
     """
     Return RMS contribution, effective parameters and log Bayes factor of each group in use.
 
-    The Bayes factor compares the fit with a fit without the group. An informative prior has
-    weights that are not 0: the factor then compares with a fit in which the group keeps the
-    prior's mean.
+    The Bayes factor compares the fit with a fit without the group or, if the prior is informative,
+    with a fit in which the group keeps the weights of the prior's mean.
     """
     names = np.array(regression.windows.groups)
     prior, state, layout = posterior.prior, posterior.state, posterior.layout

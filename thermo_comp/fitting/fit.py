@@ -85,7 +85,7 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """Reduce a source to its sufficient statistics; FitError if it has no still interval."""
+    """Reduce a source to sufficient statistics; raises FitError if it has no still interval."""
     bag = reduce_source(
         source,
         min_rest_s=options.min_rest_s,
@@ -103,7 +103,7 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
 def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
-    """Fit a calibration to reduced bags; FitError if the bags contradict themselves."""
+    """Fit a calibration to reduced bags; raises FitError if the bags contradict themselves."""
     # The fit multiplies many small matrices, and threads would only slow these products down.
     with threadpool_limits(1, 'blas'):
         return _fit_about_offset(bags, options, progress)
@@ -138,7 +138,7 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
         return np.zeros(3)
     if options.prior is not None:
         known = constants_of(options.prior)
-        # A bias above 0.5 g is an offset code.
+        # A bias above 0.5 g is the offset of a code.
         is_far = np.abs(known.bias / known.scale).max() > 0.5 * options.gravity
         return np.asarray(np.rint(known.bias) * is_far)
     middle = max(bag.middle for bag in bags)
@@ -311,7 +311,7 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
-    """Return the unit's serial; FitError if the bags have different or invalid serials."""
+    """Return the unit's serial; raises FitError if the bags have different or invalid serials."""
     serials = {source.serial: source.name for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         names = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))

@@ -88,8 +88,7 @@ def add_gyroscope(
     fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
     chosen = replace(fit.posterior, prior=fixed_sd)
     claim = claim_of(regression, chosen, lacks_effects=fit.selected.lacks_effects)
-    # The Earth's rate, which the offsets contain, is a true rate and not an error of the
-    # gyroscope.
+    # The Earth's rate, which the offsets contain, is a true rate and no error of the gyroscope.
     turn_on = math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0))
     claim = replace(claim, offset_sd=turn_on)
     triad = build_calibration(fit, claim, bags, calibration.unit)

@@ -4,7 +4,7 @@
 Owns the estimation of prior standard deviations and noises, and drops columns of small gain.
 
 Each column has one prior standard deviation for the bias of all axes and one for the scale, found
-by MacKay's fixed point with a log-normal hyperprior per kelvin: the mode of log evidence plus
+by MacKay's fixed point with a log-normal hyperprior per kelvin. The mode of log evidence plus
 hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w the
 weights of the column, sd0 and tau^2 centre and variance of the hyperprior. The sd of a column
 about which the data have no information stays at the centre sd0 of the hyperprior.
@@ -100,8 +100,8 @@ def _updated(
     changes.append(change)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly: the built-in prior counts as a fourth.
-        # The elements change their sd only if the data determine more than one element of M.
+        # Three elements of M determine their sd poorly, so the built-in prior counts as a fourth,
+        # and the sd changes only if the data determine more than one element of M.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
@@ -145,7 +145,8 @@ def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
     square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
     effective = posterior.determined[posterior.layout.tilt].sum()
     step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
-    # An sd of tilts that is off by 15 % hardly changes the fit: a third of its log change counts.
+    # An sd of tilts that is off by 15 % hardly changes the fit, so convergence counts only a third
+    # of the change of its logarithm.
     return float(sd * np.exp(step)), float(np.abs(step)) / 3.0
 
 
@@ -171,7 +172,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd to ``power / sd^2 = effective + slope``, within -2 .. 2."""
+    """Return Newton's step of log sd to ``power / sd^2 = effective + slope``, from -2 to 2."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
@@ -219,15 +220,15 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     of_axis = determined[layout.axis].sum(axis=1) + determined[layout.offset].sum(axis=0)
     if layout.turn_on.size:
         of_axis += determined[layout.turn_on].sum(axis=0)
-    # Attitudes, tilts, misalignment and lag states are determined by all three axes.
+    # Each axis counts a third of the effective parameters of the unknowns that all axes share.
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # At least 1e-8 m/s^2, below any sensor's noise: the estimate for constant samples is 0.
+    # The noise is at least 1e-8 m/s^2, below any sensor's; from constant samples it would be 0.
     least = np.full(3, 1e-8)
     if not regression.windows.has_drifts:
         # If no column changes within a position, slow noise explains the whole drift, and white
-        # noise would be estimated as 0: it is at least that of differences, where a drift cancels.
+        # noise would be 0: it is at least that of differences of windows, where a drift cancels.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 
@@ -330,8 +331,8 @@ def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
     Return which column, shape (2, m), is the only lag of a model that has products or squares of
     lags.
 
-    A product t m approximates the lag m at the rates of one program, but not at other rates, so a
-    model with products keeps a lag (marginality, [3]_).
+    A product t m of temperature and lag approximates the lag m at the rates of one program, but
+    not at other rates, so a model with products keeps a lag (marginality, [3]_).
     """
     groups, used = np.array(windows.groups), column_sd > 0.0
     is_lag = used & np.isin(groups, LAGS) & (windows.lag >= 0)

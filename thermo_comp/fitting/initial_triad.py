@@ -44,7 +44,7 @@ def constant_calibration(
     means: Floats, gravity: float | Floats, misalignment_sd: float
 ) -> ConstantCalibration:
     """
-    Fit the triad to position means, shape (n, 3); FitError if the means are on no ellipsoid.
+    Fit the triad to position means, shape (n, 3); raises FitError if they are on no ellipsoid.
 
     `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2];
     `misalignment_sd`: prior sd of the elements of M [rad]; 0 for axes at right angles

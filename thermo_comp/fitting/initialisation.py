@@ -35,7 +35,7 @@ from .windows import CURVE, PART, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-#: Factor of the prior sd of the scale factor's slopes with two to eight attitudes. In so few
+#: Factor of the prior sd of the scale factor's slopes with two to eight attitudes: in few
 #: attitudes a tilt of the support explains a drift that the scale factor of a nearly level axis
 #: explains only by a slope of several hundred ppm/K.
 OF_FEW_ATTITUDES = 0.5
@@ -182,12 +182,13 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     Return the prior with a smaller misalignment sd for a noisy sensor in positions near the six
     faces. Faces hardly determine the misalignment, and misalignments of some degrees would explain
-    other errors of the norms to second order. The covariance keeps the larger sd.
+    other errors of the norms to second order. The published covariance keeps the larger
+    misalignment sd.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
     of_faces, sd = 2.5e-3, prior.misalignment_scale
-    # The RMS of `by_element` is below 0.1 for faces within a few degrees, and 0.3 for edges.
+    # The RMS product of two components of `up` is below 0.1 near the faces, and 0.3 for edges.
     if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= of_faces:
         return prior
     return replace(prior, misalignment_sd=of_faces, unseen_misalignment_sd=sd)

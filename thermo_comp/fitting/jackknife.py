@@ -39,7 +39,7 @@ def jackknife_covariance(regression: Regression, posterior: Posterior) -> Floats
         changes.append(other[:n] - step[:n])
         ratios.append(_ratios_to_noise(factor.T @ changes[-1], remaining.T @ posterior.root))
     ratio, without = np.concatenate(ratios), np.array(changes)
-    # Under noise alone each ratio has mean 1 and variance 2.
+    # Under noise alone each ratio of a squared change to its variance has mean 1 and variance 2.
     if ratio.sum() - len(ratio) < 2.0 * np.sqrt(2.0 * len(ratio)):
         return np.zeros((n, n))
     return np.asarray(last / (last + 1) * without.T @ without)
@@ -50,12 +50,12 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     Return the squared changes of the unknowns without some windows, along the principal directions
     that these windows measure, in units of the variance of these changes by noise, shape (k,).
 
-    `change`: in units of the fit's root, shape (n,); `remaining`: root of the information of the
-    remaining windows in the same units, ``remaining.T @ remaining``, shape (n, n)
+    `change`: change of the unknowns, shape (n,), and `remaining`: root of the information of the
+    remaining windows, ``remaining.T @ remaining``, shape (n, n), both in units of the fit's root
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # A combination of the unknowns counts as not measured by the windows left out, if they have
-    # less than 1e-6 of its information.
+    # A combination of the unknowns counts as measured by the windows left out, if these windows
+    # have more than 1e-6 of the information about the combination.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

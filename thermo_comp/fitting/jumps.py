@@ -12,8 +12,8 @@ almost constant in a rotation, or the gyroscope, if there is one, measures no ro
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
 hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares
 for first-order noise), so a step within one sample is significant in these differences. A shock
-that decays is also significant; therefore the mean levels of the quiet samples before and after
-the step must differ, too.
+that decays is also significant, so the mean levels of the quiet samples before and after a jump
+must differ, too.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Jump:
     step: change of the reading, per axis [input units]
     along: change of the norm, that is, along the specific force [input units]
     temperature_change, temperature_change_sd: step of the board's readings at the time of the jump
-        about a linear drift, and the step's sd [K]; NaN with too few readings
+        about a linear drift, and the step's sd [K], both NaN with too few readings
     """
 
     time: float
@@ -114,7 +114,7 @@ def _margin(samples: Floats, quiet_sd: Floats) -> float:
 def _examine(
     samples: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
 ) -> Jump | None:
-    """Test the readings beside a gap for a jump; None without a jump."""
+    """Return the jump in the readings beside a gap, or None if there is no jump."""
     time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
@@ -146,7 +146,7 @@ def _examine(
     size = float(np.linalg.norm(step))
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
     needed_rad = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
-    # A step is not a rotation if the gyroscope measured less than a third of the angle needed, or
+    # A step is not a rotation if the gyroscope measured less than a third of the step's angle, or
     # if |a| changed: a rotation by d changes |a| by at most 2 d times the sensor's error (10 %).
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
@@ -213,9 +213,9 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = whitened(accel, r)
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
-    # The whitened step H_k = (i >= k) is 1 at k and 1 - r after k. The product of H_k with a
-    # residual is a sum from k on; the square of H_k without the trend follows from sums of the
-    # trend.
+    # The step H_k = (i >= k), whitened for the lag-1 correlation r, is 1 at k and 1 - r after k.
+    # The product of the whitened step H_k with a residual is a sum over the samples from k on; the
+    # square of the whitened step H_k without the trend follows from sums of the trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)

@@ -89,7 +89,7 @@ class KnownForce:
                     return Magnitude(section.size, sd=section.sd)
             return Magnitude(None)
         inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
-        n, needed = int(inside.sum()), 3  # fewer readings give no standard error of the mean
+        n, needed = int(inside.sum()), 3  # fewer than 3 readings give no error of the mean
         if n < needed:
             since_s = (start_ns - first_ns) * 1e-9
             raise FitError(

@@ -67,14 +67,15 @@ class Layout:
 
     @property
     def posed(self) -> Ints:
-        """Places of the attitudes of the positions in a pose, shape (k, 2)."""
+        """Places of the attitudes of those positions that are in a pose, shape (k, 2)."""
         return self.up[self.pose_of >= 0]
 
     @cached_property
     def columns(self) -> Ints:
         """
-        The unknowns of each axis in the order of `Tangent`, as columns of the equations of a
-        position: unknowns of the position, of the bag, of the unit, residual; shape (3, k).
+        The unknowns of each axis in the order of `Tangent`, as indices of the columns of a
+        position's equations, which are the unknowns of the position, of the bag, of the unit and
+        the residual, shape (3, k).
         """
         n_own, r = self.own.shape[1], self.start.shape[1]
         starts = np.tile(n_own + np.arange(r), (3, 1))
@@ -84,7 +85,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """The unknowns of the unit that each axis has, and the place after them, shape (3, k)."""
+        """The unknowns of the unit that each axis has, then the place of the residual, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
@@ -100,7 +101,7 @@ class Layout:
 
     @cached_property
     def of_axis(self) -> Ints:
-        """The unknowns of a position that each axis has, as places in `own`, shape (3, k)."""
+        """The unknowns of a position that each axis has, as column indices of `own`, (3, k)."""
         first = self.up.shape[1] + self.stretch.shape[1]
         before, after = range(first), range(first + 3, self.own.shape[1])
         return np.array([[*before, first + axis, *after] for axis in range(3)])

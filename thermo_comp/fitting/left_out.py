@@ -75,11 +75,12 @@ class Folds:
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
         """
         Return the log ratio of the mean square error to that of another model, and its standard
-        error, over the folds that both models have; None without common folds.
+        error, over the folds that both models have, or None without common folds.
 
         There are two estimates: the mean over folds of their log ratios, robust to a few large
-        folds, and the log ratio of the sums with its jackknife error, robust to small folds. The
-        more significant estimate is returned if both estimates have the same sign, else 0.
+        folds, and the log ratio of the sums with its jackknife error, robust to small folds. If
+        both estimates of the log ratio have the same sign, the more significant estimate is
+        returned, else 0.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())

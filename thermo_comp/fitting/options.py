@@ -52,29 +52,29 @@ REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compens
 @dataclass(frozen=True)
 class FitOptions:
     """
-    Options of a fit; ValueError if an option is outside its range.
+    Options of a fit; raises ValueError if an option is outside its range.
 
-    gravity: local gravity [m/s^2]; FitError if it does not occur on Earth
+    gravity: local gravity [m/s^2]; a value that does not occur on Earth raises FitError
     model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper: a
         linear static and a quadratic dynamic set, no response
-    static_curve, dynamic_curve: families of the two sets' curves; None: the model's default
+    static_curve, dynamic_curve: families of the two sets' curves, or None for the model's default
     groups, forced: groups of columns that may take part (None: all); groups that are kept without
         a selection
     prior: calibration of this unit or of its type; its columns are the model
     ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
         calibration; if both are 0, the change is estimated from the bags
-    mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2]; None: estimated
+    mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2], or None to estimate it
     gravity_sd: standard deviation of `gravity` [m/s^2]
-    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], as in a data sheet;
-        None: 100 ug/g^2 and 10 ug/g^3 if positions are not at 1 g, else no nonlinear terms
-    serial: serial of the unit; None: the serial of the sources
+    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], as in a data sheet, or
+        None for 100 ug/g^2 and 10 ug/g^3 if positions are not at 1 g, else no nonlinear terms
+    serial: serial of the unit, or None for the serial of the sources
     input: unit of the samples
-    full_scale: magnitude of a saturated sample; None: 32767 for counts, and for m/s^2 the smallest
-        usual range that contains the data
-    offset: code at zero force, such as 32768; None: estimated from the bags
-    reference_temperature: T_ref [degC]; Golovach's paper uses 20
-    detector: thermometer and detector settings; None: estimated from the bags
-    min_rest_s: length of the shortest rest [s]; None: chosen, see `reduction`
+    full_scale: magnitude of a saturated sample, or None for 32767 counts or, in m/s^2, the
+        smallest usual range that contains the data
+    offset: code at zero force, such as 32768, or None to estimate it from the bags
+    reference_temperature: T_ref [degC], 20 in Golovach's paper
+    detector: thermometer and detector settings, or None to estimate them from the bags
+    min_rest_s: length of the shortest rest [s], or None for a length that `reduction` chooses
     still_sd: largest scatter of the samples at rest [m/s^2]
     allow: names of refusals that the user overrides, see `data_checks`
     """
@@ -103,8 +103,7 @@ class FitOptions:
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        # The range of gravity on land, with a margin; a value outside this range is a typing
-        # error.
+        # The range of gravity on land, with a margin; a value outside the range is a typing error.
         low, high = 9.76, 9.84
         if not low <= self.gravity <= high:
             raise FitError(
@@ -157,7 +156,7 @@ class FitOptions:
 
     @property
     def saturated_at(self) -> float | None:
-        """Magnitude of a saturated sample; None if it has to be chosen from the data."""
+        """Magnitude of a saturated sample, or None if it has to be chosen from the data."""
         return self.full_scale or (COUNTS_FULL_SCALE if self.input == 'counts' else None)
 
 
@@ -196,8 +195,8 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     """
     Return the gravity of the WGS 84 ellipsoid (Somigliana) at a height above it.
 
-    Real gravity differs from the result by up to 30 mGal (30 ug) in mountains. ValueError for a
-    latitude outside -90..90 deg or a height outside -1000..10000 m.
+    Real gravity differs from the result by up to 30 mGal (30 ug) in mountains. Raises ValueError
+    for a latitude outside -90..90 deg or a height outside -1000..10000 m.
     """
     if not -90.0 <= latitude_deg <= 90.0:
         raise ValueError(f'`latitude_deg` must be within -90..90, got {latitude_deg}')

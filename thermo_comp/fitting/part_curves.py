@@ -5,8 +5,8 @@ Owns the curves over the temperatures of parts: a curve is a sum of columns with
 
 The temperature of the part of an axis is ``x = t - m``, t being that of the board and m the lag of
 the part. By the binomial theorem x^p is a sum of the columns t^p, t^(p-1) m, ..., m^p, which the
-bank of columns has. If all bags repeat the same warm-up, t and m are functions of each other, and
-separate weights of the columns would not describe the part.
+bank of columns has. If all bags repeat the same warm-up, the board temperature t and the lag m are
+functions of each other, and separate weights of the columns would not describe the part.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class PartCurves(NamedTuple):
 
     def kelvins(self, values: Floats) -> Floats:
         """Return the temperature change that corresponds to the RMS of each curve [K]."""
-        # The largest slope of x^p is p |x|^(p - 1).
+        # The largest slope of x^p is p |x|^(p - 1) at the largest |x|.
         most = np.repeat(np.abs(values[:, ::ORDER]).max(axis=0, initial=0.0), ORDER)
         steepest = self.power * most ** (self.power - 1)
         rms = np.sqrt(np.mean(values**2, axis=0))

@@ -4,13 +4,13 @@
 Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
-temperature of one part of the unit. Here t is the board temperature T less the reference
-temperature, and m = T - L(T + v G) is the difference between T and the temperature of the part,
-L being the lag operator. The part lags a temperature between board and case: T plus the share v of
-the gradient G, the case temperature less T. The lag has one stage or, for a part that is heated
-through another part, two stages in series. Without a case thermometer, the temperature that the
-part lags may lead that of the board. The time constants, v and the lead minimise the RMS residual
-of a spline of the bias and a cubic of the scale factor, over x.
+temperature of one part of the unit. The board temperature T less the reference temperature is t,
+and m = T - L(T + v G) is T less the temperature of the part, L being the lag operator, G the
+gradient and v its share. The part lags the temperature T + v G, which is between board and case.
+The lag has one stage or, for a part that is heated through another part, two stages in series.
+Without a case thermometer, the temperature that the part lags may lead that of the board. The time
+constants, the share v and the lead minimise the RMS residual of a spline of the bias and a cubic
+of the scale factor, over the temperature x of the part.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class _Shape(NamedTuple):
 
     n_nodes: largest number of nodes of the spline of the bias
     most_noise: ratio of the RMS residual to white noise up to which noise explains the residual
-    has_stress: whether bias and scale also depend on m, by a coefficient that is linear in x: the
-        stress between a part and the board
+    has_stress: whether bias and scale also depend on the lag m of the part, by a coefficient that
+        is linear in the part's temperature x: the stress between a part and the board
     has_gradient: whether the bias also depends on the gradient of the case
     """
 
@@ -180,7 +180,7 @@ class _PartCurves:
         self._measured = self._centred(data.mean[rows] / start.scale)
 
     def lags(self, noise: Floats) -> list[Part] | None:
-        """Return the lag of each axis; None if any lag explains little or is not determined."""
+        """Return the lag of each axis, or None if a lag explains little or is not determined."""
         lags = []
         for axis in range(3):
             lag = self._lag(axis, noise[axis])
@@ -214,7 +214,7 @@ class _PartCurves:
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # A second stage or another share would change the lag too little to help.
+                # A second stage or another share of the gradient would reduce the residual little.
                 return best
             lags = [self._searched(axis, _in_two_stages(single), _Steps(0.2, 0.4))]
             if best.lead_s:
@@ -388,7 +388,7 @@ class _PartCurves:
 
 def _in_two_stages(lag: Part) -> Part:
     """Split a lag of one stage into two stages, as the start of a search."""
-    # The residual has a valley where the sum of both time constants is constant.
+    # The residual has a valley where the sum of the two stages' time constants is constant.
     tau, _, share, lead = lag
     return Part(0.8 * tau + 1.0, 0.2 * tau + 1.0, share, lead)
 
@@ -399,7 +399,7 @@ def _in_order(tau_s: float, second_tau_s: float, sensor_share: float, lead_share
 
     `lead_share`: the lead over `tau_s`
     """
-    # Columns accept ratios of both time constants up to 0.9, after rounding to 0.1 s.
+    # Columns accept ratios of a part's two time constants up to 0.9, after rounding to 0.1 s.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
     return Part(longer, min(shorter, 0.89 * longer), sensor_share, lead_share * tau_s)
 

@@ -40,7 +40,7 @@ from .thermal_ranges import union
 UNITS_NEEDED = 3
 #: Smallest share by which correlations of the curves are reduced, so that a covariance is regular.
 LEAST_SHARE = 0.01
-#: Fields of a column of a one-stage lag of the board alone; shortest time constant of it [s].
+#: Fields of a column of a one-stage lag of the board alone; shortest time constant of a lag [s].
 _ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
 _LEAST_BEHIND_S = 1.0
 
@@ -108,7 +108,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     The constants of a unit are taken as independent of each other and of the curves. With the
     correlations by chance between few units, one position would determine all constants. The
     correlations of the curves are multiplied by 1 - share [1]_. A dynamic curve counts as its
-    difference from the static curve: most units have one curve for both sets, and smaller
+    difference from the static curve, because most units have one curve for both sets, and smaller
     correlations between two equal curves would make them two different curves.
     """
     to_differences = np.eye(deviations.shape[1])
@@ -206,8 +206,8 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return [(shortest, share**column.term.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
-    # The shares are a cubic interpolation over the logarithm of the time constant, by Lagrange's
-    # polynomials.
+    # The shares of four lags of the bank are Lagrange's polynomials over the logarithm of the time
+    # constant.
     first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
     near = FINE_TAUS[first : first + 4]
     result = []

@@ -30,7 +30,7 @@ from .windows import Model, Sets
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """Return the response as columns; FitError if a term acts in one regime only (version 1)."""
+    """Return the response's columns; raises FitError if a term acts in one regime (version 1)."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
@@ -116,7 +116,8 @@ def informative_priors(
             for multiple in (0.3, 1.0)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
-    # Under a narrow prior the noise estimated by the first fit would absorb changes of the unit.
+    # The fit begins with the last, widest candidate: under a narrow prior the noise estimated by
+    # the first fit would absorb changes of the unit.
     tried.append((tried[-1][0], 1.0))
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()

@@ -55,7 +55,7 @@ class StillInterval:
     n_whole: number of windows of full length; a shorter window may follow
     time, count, mean: mean time [s], number and mean of the samples of each window
     sample_sd: median over the cells of the standard deviation of single samples, shape (3,)
-    angular_rate: mean angular rate of each window [rad/s]; None if a part of the bag has no rate
+    angular_rate: mean rate of each window [rad/s], or None if a part of the bag has no rate
     """
 
     start_ns: int
@@ -179,8 +179,7 @@ def reduce_source(
     3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
     is chosen so that the rests determine bias and scale best. Slow samples make cells so long that
     a bias which changes within minutes looks like a motion, and that short rests are lost. Slow
-    samples therefore get shorter cells, of 10 or 5 samples, if shorter cells interrupt or lose
-    fewer rests.
+    samples get cells of only 10 or 5 samples if shorter cells interrupt or lose fewer rests.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -246,7 +245,7 @@ def _reduced(
         n_repeated=cells.n_repeated,
         n_cells=len(cells.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
-        # A bag without cells, that is, without a usable sample, has the windows of the options.
+        # A bag without cells, that is, without a usable sample, has the options' window length.
         window_s=round(per_window * cells.cell_s, 6) or window_s,
         cycle_s=_cycle_s(cells),
         is_integer=cells.is_integer,
@@ -264,8 +263,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # The numbers of samples of two cells may differ by one. Cells with lost samples are left out,
-    # unless most cells have other numbers of samples, as in bursts.
+    # The numbers of samples of two cells may differ by one. A cell that differs by more than one
+    # sample from the median is left out, unless most cells do, as with bursts of samples.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
@@ -355,7 +354,7 @@ def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> lis
     """
     Join rests that are separated by a vibration without motion, if this happens six times or more,
     as with a compressor that cycles. There is no motion if a parabola fits the four cells on
-    either side of the vibration with a mean squared residual below 4 variances.
+    either side of the vibration with a mean squared residual below 4 variances of a cell's mean.
     """
     is_calm = stillness.is_under(cells, still_sd)
     result = ranges[:1]

@@ -37,7 +37,7 @@ class Posterior:
     """
     The Gaussian approximation of the posterior at its mode.
 
-    determined: effective parameters of each unknown (MacKay's gamma), 0 .. 1, shape (n,)
+    determined: effective parameters of each unknown (MacKay's gamma), 0 to 1, shape (n,)
     root: root of the covariance of the unit's unknowns, ``root @ root.T``, (n_unit, n_unit)
     variance: variances of all unknowns, shape (n,)
     square: sum of squares of the whitened residuals of each axis, shape (3,) [(m/s^2)^2]
@@ -289,7 +289,7 @@ class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Return the equations at a state, inactive weights 0; `grams`: None for all windows."""
+        """Return the equations at a state, inactive weights 0, by default with all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).whole if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)
@@ -356,8 +356,8 @@ class Regression(Equations):
 def _damped(normal: Normal, layout: Layout) -> Normal:
     """
     Hold the nonlinear unknowns of normal equations to a millionth of their step, by a factor on
-    their diagonal. With an informative prior, which correlates the unknowns, a larger factor would
-    exceed the range of double precision.
+    their diagonal. With an informative prior, which correlates the unknowns, a factor far above
+    1e6 would exceed the range of double precision.
     """
     local, unit = normal.local.copy(), normal.unit.copy()
     at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]

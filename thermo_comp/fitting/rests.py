@@ -39,8 +39,8 @@ def _is_heated(windows: ThermalWindows) -> Bools:
     """
     Return the positions that show an effect of temperature, shape (n_positions,): a position whose
     temperature changes by more than a tenth of the span of all temperatures, or whose mean is as
-    far from the median. Rests of a tumble in a room, in which the room or the unit warms up by
-    some kelvins, do not count: their short drifts hardly separate bias and scale factor.
+    far from the median. Rests of a tumble do not count, although room or unit warm up by some
+    kelvins, because the short drifts of such rests hardly separate bias and scale factor.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]
@@ -54,9 +54,9 @@ def is_steady(windows: ThermalWindows) -> Bools:
     Return the positions whose temperatures change by less than three sd of the thermometers' noise
     (RMS), shape (n_positions,).
 
-    The noise of the temperature would act as a change without a drift, as if the unit had no
-    thermal response in the attitudes of short rests. At three sd a ninth of the mean square change
-    is noise, and a slope would be a ninth too small.
+    In a steady position the noise of the temperature would act as a change without a drift, as if
+    the unit had no thermal response in the attitudes of short rests. At a change of three sd, a
+    ninth of the mean square change is noise, and a slope would be a ninth too small.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]
@@ -80,8 +80,8 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
     Return the windows with columns that are constant in steady positions, (n_positions,), and with
-    lags that begin settled in settled positions, (n_positions,): initial lag states that fit the
-    noise of a rest would show its drift per kelvin in an attitude that was not heated.
+    lags that begin settled in settled positions, (n_positions,). Initial lag states would fit the
+    noise of a rest, as if an attitude that was not heated showed a drift per kelvin.
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
@@ -95,7 +95,7 @@ def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
 def poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
     """
     Return the number of the pose of each position, -1 for a position without a pose, shape
-    (n_positions,); None if no position has a pose.
+    (n_positions,), or None if no position has a pose.
 
     `up`: attitudes, shape (n_positions, 3). The positions of an attitude are in one pose if the
     unit was returned from another attitude between them, or if there is no other attitude.

@@ -42,7 +42,7 @@ class Trial:
     """
     A model that the selection has fitted.
 
-    groups: its groups of columns; () for a model of constants alone
+    groups: its groups of columns, () for a model of constants alone
     score: its left-out errors
     posterior: its fit
     typical: typical prior sd of its columns, shape (2, m)
@@ -87,8 +87,8 @@ class Fit(NamedTuple):
     """
     The windows of a fit, their regression, and the chosen model.
 
-    typical: typical prior sd of all columns that could have taken part, shape (2, m); None if the
-        model has no choice of columns
+    typical: typical prior sd of all columns that could have taken part, shape (2, m), or None if
+        the model has no choice of columns
     of_means: for bags at constant temperatures: state of the fit to the means of the positions,
         if this fit has a curve and is worse on left-out data than the chosen fit; else None
     """
@@ -123,7 +123,7 @@ class Growth:
         may = candidates.typical.any(axis=0)
         self.forced = tuple(dict.fromkeys(self._names[candidates.forced & may].tolist()))
         names = dict.fromkeys(self._names[may].tolist())
-        #: Groups that may be added.
+        #: Groups of columns that may be added to a model.
         self.free = [group for group in names if group not in self.forced]
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
@@ -149,8 +149,8 @@ class Growth:
         """
         Fit a model with further groups, from the fit of the model without them.
 
-        `most`: largest typical prior sd of the new columns, shape (2, m), see `_typical`; None if
-        `before` has a typical sd of these columns
+        `most`: largest typical prior sd of the new columns, shape (2, m), see `_typical`, or None
+        if `before` has a typical sd of the new columns
         """
         typical = before.typical if most is None else self._typical(before, groups, most)
         posterior = before.posterior
@@ -179,7 +179,7 @@ class Growth:
     def lowest_degree(self, constants: Trial) -> Trial:
         """
         Fit the curve with its first column, and with more columns if they gain more than
-        `CLEAR_GAIN` in log density: many curves explain the norms of the positions.
+        `CLEAR_GAIN` in log density, because many curves explain the norms of the positions.
         """
         prior = constants.posterior.prior
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
@@ -216,7 +216,7 @@ class Growth:
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
         if {*LAGS} & {*absent} and not {*LAGS} & {*chosen.groups}:
-            # Products and powers of lags are tried only with lags, see `hyperparameters`.
+            # Products and powers of lags are tried only in a model with lags (marginality).
             sets = [each for each in sets if {*LAGS} & {*each} or not {*PRODUCTS} & {*each}]
         gains = {groups: inactive.gain(typical, np.isin(self._names, groups)) for groups in sets}
         likely = [groups for groups in sets if gains[groups] > CLEAR_GAIN]
@@ -236,7 +236,7 @@ class Growth:
         state = posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
-            # Attitudes and offsets of the rests in a pose absorb errors of an incomplete model.
+            # Errors of an incomplete model also enter attitudes and offsets of rests in a pose.
             turned = regression.gravity * state.from_pose
             square += float(np.mean(state.offset**2) + np.mean(turned**2))
         slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
@@ -405,11 +405,11 @@ def _with_large_offsets(
     regression: Regression, fitted: Trial, candidates: Candidates
 ) -> list[Trial]:
     """
-    Fit a model again from a large sd of mounting offsets; [] if its offsets are large already.
+    Fit a model again from a large sd of mounting offsets; return [] if its sd is large already.
 
-    The drift of an axis is proportional to the specific force along the axis, as far as the scale
-    factor drifts. Drifts therefore also show the offsets of mountings, if the model describes the
-    drifts completely: nine constants explain the norms of nine positions, but not their drifts.
+    A drift of the scale factor is proportional to the specific force along the axis, so drifts
+    also show the offsets of mountings, if the model describes the drifts completely. Nine
+    constants explain the norms of nine positions, but not their drifts.
     """
     posterior = fitted.posterior
     prior, scale = posterior.prior, posterior.prior.offset_scale

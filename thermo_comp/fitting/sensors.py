@@ -82,8 +82,8 @@ def learn_thermometer(
     if not with_ramps:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
     fastest = max(history.fastest for history in with_ramps)
-    # At the beginning of a ramp the lagged temperature has the second derivative rate / lag. The
-    # second derivative is estimated from the difference of two rates one minute apart.
+    # At the beginning of a ramp the lagged temperature has the second derivative rate / lag, which
+    # is estimated from the difference of two rates one minute apart.
     lags = []
     for history in with_ramps:
         change = np.abs(history.rate[_BINS_PER_SIDE:] - history.rate[:-_BINS_PER_SIDE])
@@ -235,7 +235,7 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
     """
     Return thermometer, stamp and value of each reading in the order of the stamps.
 
-    Readings with equal stamps are in the order of `inputs`.
+    Readings with equal stamps are in the order of the thermometers in `inputs`.
     """
     rows: list[tuple[str, int, float]] = []
     for name in inputs:

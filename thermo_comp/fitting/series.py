@@ -3,9 +3,8 @@
 """
 Owns the base series of the windows, and their products whitened for a noise model.
 
-All terms of the measurement equation (`equations`) are linear combinations of a few base series.
-The products of the whitened base series of each position and section are therefore sufficient for
-the regression.
+All terms of the measurement equation (`equations`) are linear combinations of a few base series,
+so the products of the whitened base series of each position and section are sufficient statistics.
 
 The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
@@ -71,7 +70,7 @@ class Whitener:
         """Whether a search may try a correlation time: from `times_s[0]` to `_longest_s`."""
         if not self.times_s:
             return False
-        # Rounding must not exclude the shortest time.
+        # Rounding must not exclude the shortest correlation time.
         return bool(0.999 * self.times_s[0] < time_s < 1.001 * self._longest_s)
 
     def _innovations(
@@ -218,7 +217,7 @@ class Products:
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Products of each position without some sections; their shape is that of `whole`."""
+        """Products of each position without some sections, (n_positions, n_base, n_base)."""
         result: Floats = self.whole.copy()
         gone = np.flatnonzero(np.isin(self.section, sections))
         position = np.searchsorted(self.first, gone, side='right') - 1
@@ -311,7 +310,7 @@ class Series:
         return np.asarray(np.add.reduceat(values, self._first, axis=0) / count)
 
     def of(self, base: Base) -> Floats:
-        """Return the series of a base, shape (n, n_base)."""
+        """Return the base series in the order of `base`, shape (n, n_base)."""
         at_start = self._starts[:, base.columns[base.moved]]
         return np.hstack((self._ones, self.columns[:, base.columns], at_start, self._others))
 
@@ -331,6 +330,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Apply `at_starts` to products of the base series, (n_positions, n_base, n_base)."""
+        """Convert products of base series, (n_positions, n_base, n_base), to lags of `state`."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

@@ -23,7 +23,7 @@ from .known_force import USUAL_FORCE, ForceOptions, KnownForce, known_force
 
 
 def angular_velocity(block: object) -> Floats | None:
-    """Return the angular rate of a block of Imu messages; None for other blocks."""
+    """Return the angular rate of a block of Imu messages, or None for other blocks."""
     imu = getattr(block, 'imu', None)
     if imu is None or (imu.angular_velocity_covariance[:, 0] == -1.0).any():
         return None
@@ -37,7 +37,7 @@ class FitSource:
     One bag, table, array or simulated run.
 
     blocks: returns, at each call, a new iterable of the blocks in file order
-    force: known |f|; None if |f| is gravity
+    force: known |f|, or None if |f| is gravity
     reader: returns the last reader of the recording, or None for arrays
     """
 
@@ -55,8 +55,8 @@ def fit_sources(
     """
     Make sources of recordings; each recording is opened by this function and again by the fit.
 
-    Raises RecordingError if a recording cannot be read or lacks a topic; FitError if a recording
-    is given twice, or if some recordings have counts and some have Imu messages.
+    Raises RecordingError if a recording cannot be read or lacks a topic, and FitError if a
+    recording is given twice, or if some recordings have counts and some have Imu messages.
     """
     sources: list[FitSource] = []
     kinds: dict[str, str] = {}

@@ -42,10 +42,10 @@ class Tangent:
 
     Most derivatives are one base series times a factor; the other derivatives are one of a few
     combinations of base series. The derivative of axis i in position p by unknown u is ``factor[p,
-    i, u]`` times the series ``place[u]``, in the order base series, combinations. The unknowns of
-    an axis are those of the position: up (2), stretch, offset, tilts; of the bag: initial lag
-    states; of the unit: kappa, bias, weights, nonlinear coefficients, radius, misalignment (3).
-    The last "unknown" is the residual, measured minus predicted.
+    i, u]`` times the series ``place[u]``, in the order base series, combinations. An axis has the
+    unknowns of the position (2 of the attitude, stretch, offset, tilts), then those of the bag
+    (initial lag states), then those of the unit (kappa, bias, weights, nonlinear coefficients,
+    radius, 3 of the misalignment). The last "unknown" is the residual, measured minus predicted.
 
     combined: the combinations, shape (n_positions, 3, n_base, n_combined)
     place: index of the series of each unknown, shape (k + 1,)
@@ -73,8 +73,8 @@ class Tangent:
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)
         scale = slice(bias.stop, bias.stop + self.n_scale)
-        # Sums over the positions of the products, times powers of the factor of the scale's
-        # weights.
+        # Sums over the positions of the products of the base series, times powers of the factor of
+        # the scale's weights.
         powers = np.stack([self.scale**k for k in range(3)])
         sums = np.tensordot(powers.transpose(2, 0, 1), products, 1)
         unit = np.empty((3, n, n))

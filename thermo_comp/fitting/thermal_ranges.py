@@ -49,8 +49,8 @@ def temperature_range(windows: ThermalWindows) -> Range:
 
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
-    Return the first sensor's gradient in soaks and its robust scatter [K]; both from a prior
-    calibration if it has them; None without the sensor or a soak.
+    Return the first sensor's gradient in soaks and its robust scatter [K], from a prior
+    calibration if it has them, or None without the sensor or a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
@@ -73,9 +73,9 @@ def rest_gradient_range(
     """
     Return the range of the first sensor's gradient, less the part of ramps, ``lag_s * rate``.
 
-    The range of a prior calibration, `known`, is included. Without that range the result is None
-    without the sensor, without ramps, which determine the lag, or for a range beyond 100 K, as in
-    bags that are too short for a rate.
+    The range of a prior calibration, `known`, is included. If the prior has no range, the result
+    is None without the sensor, without ramps, which determine the lag, or for a range beyond
+    100 K, as in bags that are too short for a rate.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0
@@ -87,7 +87,7 @@ def rest_gradient_range(
 
 def measured_board_lag(windows: ThermalWindows) -> float:
     """
-    Return the lag of the board behind the case [s], negative if the board leads; NaN without ramps
+    Return the lag of the board behind the case [s], negative if the board leads, NaN without ramps
     or without a case temperature.
     """
     return _slope_of_gradient(windows) if _has_gradients(windows) else np.nan
@@ -106,7 +106,7 @@ def usable_board_lag(windows: ThermalWindows) -> float:
 
 
 def _slope_of_gradient(windows: ThermalWindows) -> float:
-    """Return the slope of the gradient over the rate [s]; NaN at a constant rate."""
+    """Return the slope of the gradient over the rate [s], NaN at a constant rate."""
     rate = windows.rate - np.mean(windows.rate)
     power = float(rate @ rate)
     return float(rate @ windows.gradient) / power if power > 0.0 else np.nan

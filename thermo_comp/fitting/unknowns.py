@@ -55,13 +55,13 @@ class Windows:
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: columns that the scale may have as well as the bias, shape (m,)
     tilt: temperatures with which a support may tilt, divided by their RMS, shape (n, k)
-    forces: known |f| and nonlinear terms; None if |f| is gravity in all positions
-    undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,); None if the fit
-        estimates them
+    forces: known |f| and nonlinear terms, or None if |f| is gravity in all positions
+    undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,), or None if the
+        fit estimates them
     acts_on: axes that each column acts on, shape (m, 3); None for all
-    turn_on: number of the turn-on of each bag, (n_bags,); None: each bag has a turn-on of its own
+    turn_on: number of the turn-on of each bag, (n_bags,), or None if each bag is a turn-on
     pose: number of the pose to which the unit was returned in each position, -1 for none, shape
-        (n_positions,); None without such poses
+        (n_positions,), or None if the unit was not returned
     """
 
     position: Ints
@@ -180,12 +180,12 @@ class Noise(NamedTuple):
 
     @property
     def times_s(self) -> list[float]:
-        """Correlation times of the processes [s]."""
+        """Correlation times of the Gauss-Markov processes [s]."""
         return [self.time_s * 10.0**k for k in range(self.n_times)]
 
     @property
     def variance(self) -> float:
-        """Stationary variance of all processes / white variance of a typical window."""
+        """Variance of all Gauss-Markov processes / white variance of a typical window."""
         return self.ratio * self.n_times
 
     @property
@@ -224,8 +224,8 @@ class Prior:
     offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd [m/s^2]; 0: both
         are constant
     misalignment_scale: value of misalignment_sd before the data are used [rad]
-    unseen_misalignment_sd: sd of the elements of M in the covariance, if the positions do not show
-        M [rad]: `misalignment_sd` is constant and smaller in such a fit; 0 for other fits
+    unseen_misalignment_sd: sd of the elements of M [rad] in the covariance of a fit whose
+        positions do not show M, and whose `misalignment_sd` is constant; 0 for other fits
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
     pose_sd: sd of the attitude of a position about its pose [rad]; the prior of other attitudes is
         flat

@@ -94,7 +94,7 @@ class Model:
     The model of a fit: curves and columns, and the settings of the thermal state.
 
     name: name of the model in the provenance
-    parts: the lag of the part of each axis; None if the lags are not known
+    parts: the lag of the part of each axis, or None if the lags are not known
     sensors: thermometers other than the board's; the first is the case's
     """
 
@@ -151,7 +151,7 @@ class ThermalWindows:
     temperature, rate: of the board [degC, K/s], shape (n,); weight: of the dynamic set, shape (n,)
     gradient: T_case - T_board [K], shape (n,)
     raw: columns of the response without powers of t and ranges, shape (n, k)
-    angular_rate: mean angular rate [rad/s], shape (n, 3); (n, 0) if a bag has none
+    angular_rate: mean angular rate [rad/s], shape (n, 3), or (n, 0) if a bag has none
     typical_count: number of samples of a typical window
     rests: bag and interval of each position
     tracks: thermal states of each bag
@@ -191,8 +191,9 @@ class _Rows(NamedTuple):
 
     thermal: board temperature [degC], its rate [K/s], weight of the dynamic set, gradient [K], and
         the columns of the response without powers of t, as in `ThermalWindows`, shape (n, 4 + k)
-    columns, start: as in `Windows`; `start` has the k columns of the response, shape (n, k)
-    angular_rate: [rad/s], shape (n, 3) or (n, 0)
+    columns: values of the columns, as in `Windows`
+    start: derivatives of the k columns of the response, as in `Windows`, shape (n, k)
+    angular_rate: mean angular rate [rad/s], shape (n, 3) or (n, 0)
     """
 
     time: Floats
@@ -319,8 +320,8 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # The scale has no hysteresis, no bends and no level of the dynamic set: Fc = 1 at the
-    # reference temperature in both regimes.
+    # The scale has no hysteresis, no bends and no level of the dynamic set, because the relative
+    # scale is 1 at the reference temperature in both regimes.
     in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(curves.axis)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))

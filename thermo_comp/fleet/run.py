@@ -216,7 +216,7 @@ def render_fleet(
 
 
 class Results:
-    """The folder of results, created if missing; ThermoCompError if that fails."""
+    """The folder of results, created if missing; ThermoCompError if the creation fails."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

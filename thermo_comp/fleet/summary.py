@@ -131,7 +131,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
 
 
 def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
-    """Measure the spread of a quantity over calibrated units; None if no units determine it."""
+    """Measure the spread of a quantity over units; None if no unit determines the quantity."""
     columns = [name for name in (quantity.name, quantity.sd) if name]
     known = [row for row in rows if all(row[name] is not None for name in columns)]
     values = np.array([row[quantity.name] for row in known], np.float64)

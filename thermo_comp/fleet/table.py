@@ -275,7 +275,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read a table of an earlier run; missing columns are empty. ThermoCompError if no table."""
+    """Read an earlier run's table; missing columns are empty. ThermoCompError for other files."""
     from pyarrow import ArrowException, parquet
 
     try:

@@ -37,7 +37,7 @@ Bags = dict[str, list[StoredFile]]
 
 @dataclass(frozen=True)
 class FoundUnit:
-    """The bags of one thermal test; `name`: its folder, or serial; `lot`: top folder, or ''."""
+    """The bags of one thermal test; `name`: folder or serial; `lot`: top folder, or ''."""
 
     name: str
     lot: str

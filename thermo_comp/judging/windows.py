@@ -42,9 +42,9 @@ class Windows:
     """
     Windows at rest of all bags, in order; arrays of n rows.
 
-    A window lasts exactly `window_s` from `start_ns`; `time` is its middle since the bag's first
-    sample [s]; `count` and `mean` are the number and the mean of its raw samples. A position is a
-    still interval, numbered through all bags. `rate` is the rate of the board temperature [K/s].
+    A window lasts exactly `window_s` from `start_ns`; `time`: from the bag's first sample to the
+    window's middle [s]; `count`, `mean`: number and mean of the window's raw samples. A position
+    is a still interval, numbered through all bags. `rate`: rate of the board temperature [K/s].
     `is_dynamic`: the dynamic set has more than half the weight; `is_inside`: the window is
     entirely inside the calibrated ranges; `is_swapped`: the board temperature leads that of the
     case. `raw` is the specific force by the constants at the reference temperature, `force` by the

@@ -4,8 +4,8 @@
 Owns the correction of whole arrays at once, bit-identical to that of single samples.
 
 The compensator takes the temperature readings one by one, as for single samples. The segments
-between the readings are collected, evaluated together and applied to all samples with the same
-arithmetic.
+between the readings are collected, evaluated together and applied to all samples with the
+arithmetic of single samples.
 """
 
 from dataclasses import dataclass, fields
@@ -124,8 +124,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # A full queue applies its oldest readings, as in the node, but once a sample has been
-            # processed only readings up to the stamp of the next sample.
+            # As in the node, a full queue applies its oldest readings; after the first sample only
+            # readings up to the stamp of the next sample are applied.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

@@ -175,7 +175,7 @@ class GravityCheck:
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Take a force [m/s^2], its covariance xx .. zz, and the noise part of their trace."""
+        """Take a force [m/s^2], its covariance (xx to zz), and the trace of the noise's part."""
         self._watch_step(stamp_ns, force, covariance, noise)
         if (
             not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
@@ -195,8 +195,8 @@ class GravityCheck:
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
         """
-        Refute the calibration if |f| steps from a rest out of the tolerance and stays there for
-        `STEP_NS`; a step refutes sooner than windows do.
+        Refute the calibration if |f| steps from its value at rest to a value out of the tolerance
+        and keeps the new value for `STEP_NS`; a step refutes sooner than means of windows do.
         """
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):

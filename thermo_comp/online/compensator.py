@@ -260,7 +260,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take the flags since the last call: (stamp of deciding reading [ns], is dynamic)."""
+        """Take the regime flags since the last call: stamp of deciding reading [ns], dynamic."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
@@ -295,7 +295,7 @@ class Compensator:
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Continue with another model or settings; if `self` is a copy, the original is kept."""
+        """Use another model or settings; the original of a copied `self` stays as it is."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
         self.config, self.thermal = config, copy(self.thermal)

@@ -117,7 +117,7 @@ class ThermalSide:
         self._slow = _NO_STATE
         self._slow_evaluated = _NO_STATE
         self._slow_rows: Floats = np.empty(0)
-        #: End and thermal state of the last segment: the next segment begins at both if no reading
+        #: End and thermal state of the last segment: the start of the next segment if no reading
         #: is applied in between.
         self._last_end: tuple[int, int, tuple[float, ...]] | None = None
 
@@ -133,7 +133,7 @@ class ThermalSide:
         return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Continue with another model or configuration; if `self` is a copy, keep the original."""
+        """Use another model or configuration; the original of a copied `self` stays as it is."""
         old, self.queue = self.tracker, copy(self.queue)
         self._use(model, config)
         self.queue.keep(lambda entry: entry[2] in self.inputs)

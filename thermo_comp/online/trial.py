@@ -24,10 +24,10 @@ _STEP_NS: Final = 1_000_000_000
 
 def tried(calibration: Calibration, path: str | Path | None = None) -> None:
     """
-    Apply a calibration to a few samples; CalibrationError if any of these samples fails.
+    Apply a calibration to a few samples; CalibrationError if the test of any sample fails.
 
-    The samples are near zero and near +- full scale, at the edges of the temperature ranges and
-    far beyond these ranges; each result must be finite, with a positive definite covariance.
+    The test samples are near zero and near +- full scale, at the edges of the temperature ranges
+    and far beyond these ranges; each result must be finite, with a positive definite covariance.
     """
     try:
         is_sound = all(map(is_sound_sample, _samples(Model(calibration))))

@@ -282,7 +282,7 @@ def _restamp(messages: Messages, stamp_ns: Ints) -> None:
 
 
 def unstamped(stamp_ns: int) -> str:
-    """Describe samples with one stamp."""
+    """Describe samples that all have the same stamp."""
     return f'all its samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
 
 

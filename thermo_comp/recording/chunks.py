@@ -158,7 +158,7 @@ def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
 
 
 def _indexed(data: Bytes, index: memoryview) -> Messages | None:
-    """Find the messages by the index; None if they do not fill the chunk exactly."""
+    """Find the messages by the index; None if the messages do not fill the chunk exactly."""
     columns: list[Ints] = []
     begin = 0
     while begin + _INDEX_HEAD.size <= len(index):
@@ -167,7 +167,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
         is_sound = opcode == Opcode.MESSAGE_INDEX and content == length + 6
         if not is_sound or length % _INDEX_ROW_BYTES or begin + length > len(index):
             return None
-        # An offset above 2^63 becomes negative, and is refused below.
+        # An offset above 2^63 becomes negative; `is_inside` refuses negative offsets.
         columns.append(np.frombuffer(index, '<i8', length // 8, begin)[1::2])
         begin += length
     at = np.sort(np.concatenate(columns), kind='stable') if columns else np.empty(0, np.int64)
@@ -247,7 +247,7 @@ def expand(packed: Path, target: Path) -> str | None:
 def inflate(
     compression: str, packed: Any, limit: int, step: int = _STEP_BYTES, *, is_torn: bool = False
 ) -> Bytes:
-    """Decompress bytes, or the readable part of a torn piece; DamagedError beyond the limit."""
+    """Decompress bytes, or the readable part of a torn piece; DamagedError above `limit` bytes."""
     if not compression:
         return np.asarray(packed)
     pieces: list[bytes] = []
@@ -266,7 +266,7 @@ def inflate_ros1_chunk(packed: bytes) -> bytes:
 
 
 def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[bytes]:
-    """Decompress bytes, or with zstd a file, by `step` bytes; DamagedError beyond the limit."""
+    """Decompress bytes, or with zstd a file, by `step` bytes; DamagedError above `limit` bytes."""
     n_left = limit
     for piece in iter(partial(_reader(compression, source), step), b''):
         n_left -= len(piece)

@@ -82,7 +82,7 @@ def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A number in the messages of a type, by its path; RecordingError if there is none."""
+    """A number in the messages of a type, by its path; RecordingError for a path to no number."""
 
     kind: str
     path: str

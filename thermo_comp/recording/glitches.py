@@ -10,8 +10,8 @@ from ..typing import Bools, Floats
 
 # Distance of a glitch from its neighbours, in sd of the noise; noise alone does not reach it.
 _SDS = 25.0
-# Smallest distance, relative to the norm of the samples: a converter that carries its remainder
-# flips by one count in single samples.
+# Smallest distance of a glitch from its neighbours, relative to the norm of the samples: single
+# samples of a converter that carries its remainder flip by one count.
 _LEAST = 0.02
 # Smallest number of samples that determine the noise.
 _FEWEST = 30
@@ -27,7 +27,7 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
         return result
     is_far = np.zeros(samples.shape, dtype=bool)
     is_moving = np.zeros(len(samples), dtype=bool)
-    # About 2000 samples are sufficient for the noise and the norm.
+    # About 2000 samples are sufficient to estimate the noise and the norm.
     every = slice(None, None, max(len(samples) // 2000, 1))
     least = _LEAST * float(np.median(np.linalg.norm(samples[every], axis=1)))
     for x, step, far in zip(samples.T, quantum.tolist(), is_far.T, strict=True):

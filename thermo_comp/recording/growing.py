@@ -4,7 +4,7 @@
 Owns live recording: new messages of a bag that another program writes, and numbered bags.
 
 Each pass reads the growing bag from its beginning, so the pauses grow with the duration of a pass.
-The messages are written to a folder of bags, `01.mcap`, ... with the node's topic names. The end
+New messages are written to a folder of bags, `01.mcap`, ... with the node's topic names. The end
 of a position is recognised with a delay, so the newest messages are held back.
 """
 
@@ -97,7 +97,7 @@ def leftovers(folder: Path) -> dict[Path, int]:
 def finish(path: Path, number: int) -> Path | None:
     """
     Turn an unfinished bag into a bag with `number`, or the next free number, and delete the
-    unfinished bag; None if it has no message. RecordingError if nothing can be read.
+    unfinished bag; None for a bag without messages. RecordingError for an unreadable bag.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

@@ -256,7 +256,7 @@ def inspect_recording(path: str | Path, topics: Topics | None = None) -> Recordi
 
 
 def _described(path: Path) -> _Description:
-    """Find the files of a bag; RecordingError if it is not a bag."""
+    """Find the files of a bag; RecordingError if the path is not a bag."""
     if not path.exists():
         raise RecordingError('no such file or directory', path)
     if path.is_dir():
@@ -297,7 +297,7 @@ class _Description:
 
 
 def _read_metadata(directory: Path) -> _Description | None:
-    """Read a bag's metadata.yaml; None if missing or empty, as after a killed recorder."""
+    """Read a bag's metadata.yaml; None without content, as after a killed recorder."""
     path = directory / 'metadata.yaml'
     try:
         text = read_bounded(path, _MAX_BYTES)

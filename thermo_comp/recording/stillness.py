@@ -37,7 +37,7 @@ _LEVEL_S = 120.0
 _ROTATION_S = 10.0
 # Size of a step that ends a rest, in robust sd of all steps; noise alone does not reach it.
 _STEP_SDS = 8.0
-# Number of steps whose median is the drift, and the largest drift [g/s].
+# Number of steps between cells whose median is the drift, and the largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
 # Number of samples searched for a quantum, and smallest number of changes that prove a quantum
 # by being whole multiples of it.
@@ -163,7 +163,7 @@ class CellAccumulator:
     def finish(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
-        self._sums = [sums]  # the joined array, for the next call
+        self._sums = [sums]  # join only once
         index, count = sums[:, 0].astype(np.int64), sums[:, 1]
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
@@ -261,7 +261,7 @@ def _quantum_of(samples: Floats) -> Floats:
         changes = np.sort(changes[changes > 0.0])
         if not len(changes):
             continue
-        # Changes by the same multiple of the step differ by rounding only.
+        # Changes by the same multiple of the quantum differ by rounding only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         # All changes must be whole multiples of the smallest change.
         steps = changes / changes[0]

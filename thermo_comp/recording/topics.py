@@ -69,12 +69,12 @@ class Part:
         return begin, inf if self.end is None else origin + round(self.end * 1e9)
 
     def __str__(self) -> str:
-        """Return the part as a suffix of a bag's name."""
+        """Return the limits of the part as a suffix of a bag's name, like ``[10:60]``."""
         begin, end = ('' if limit is None else f'{limit:.12g}' for limit in (self.begin, self.end))
         return '' if self == WHOLE else f'[{begin}:{end}]'
 
 
-WHOLE = Part()  # all of a bag
+WHOLE = Part()  # a whole bag
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +83,9 @@ class Topics:
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
     namespace. If no topic has a usual name, imu/data_raw is used, or else the bag's only topic of
-    the type, preferably an Imu. Further thermometers are named, or found as ``temperature/<name>``
-    in the board's namespace. A thermometer may be a field of any message, ``TOPIC:FIELD``, as for
-    ``ros2 topic echo --field``.
+    an input's type, preferably an Imu. Further thermometers are named, or found as
+    ``temperature/<name>`` in the board's namespace. A thermometer may be a field of any message,
+    ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
     counts: str = COUNTS.name

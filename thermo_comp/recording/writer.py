@@ -238,7 +238,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
 
 def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
-    """Check a column of nanoseconds: `n` integers, none negative; otherwise ValueError."""
+    """Check a column of nanoseconds; ValueError unless the column is `n` integers, none < 0."""
     times = np.atleast_1d(values if np.size(values) else np.empty(0, np.int64))
     if times.dtype.kind not in 'iu' or times.ndim != 1:
         raise ValueError(f'`{name}` must be one row of integers, got {times.dtype}')

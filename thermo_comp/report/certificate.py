@@ -217,7 +217,7 @@ def _four_digits(value: Floats) -> Floats:
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
-    """Return the relative uncertainty of scale due to gravity; NaN if it is not stated."""
+    """Return the scale's relative uncertainty by gravity; NaN if gravity's sd is not stated."""
     sd = unclaimed_gravity_sd(evidence, info)
     if sd is None or evidence.calibration is None:
         return np.nan

@@ -56,10 +56,10 @@ class Evidence:
     """
     The content of a report; missing parts are None or empty.
 
-    `windows`: windows at rest of all bags; `judgement`: their judgement; `steps`: residuals of
-    each model step; `left_out`: by `Windows.position` the RMS of ``|f| - g`` of a fit to the
-    other positions [m/s^2]; `findings`: reservations about calibration or bags; `checks`: passed
-    checks; `gravity_sd`: uncertainty of gravity included in the covariance [m/s^2].
+    `windows`: windows at rest of all bags; `judgement`: judgement of `windows`; `steps`: residuals
+    after each step of the model; `left_out`: by `Windows.position` the RMS of ``|f| - g`` of a fit
+    to the other positions [m/s^2]; `findings`: reservations about calibration or bags; `checks`:
+    passed checks; `gravity_sd`: uncertainty of gravity included in the covariance [m/s^2].
     """
 
     serial: str
@@ -146,7 +146,7 @@ class Evidence:
 
     @cached_property
     def least_known(self) -> LeastKnown | None:
-        """The attitude with the largest uncertainty; None if the calibration states none."""
+        """The attitude with the largest uncertainty; None without a calibration."""
         if self.calibration is None:
             return None
         return least_known(self.calibration, np.array([rest.up for rest in self.positions]))
@@ -194,7 +194,7 @@ class Evidence:
 
 
 def given(value: _T | None) -> _T:
-    """Return a value that a figure needs; ValueError if it is None."""
+    """Return a value that a figure needs; ValueError if the value is None."""
     if value is None:
         raise ValueError('`evidence` lacks the data of this figure')
     return value

@@ -29,7 +29,7 @@ _MOST = 24
 
 
 def draw_temperatures(evidence: Evidence) -> Figure:
-    """Draw the readings of both sensors (the paper's Fig. 3)."""
+    """Draw the readings of case and board thermometer (the paper's Fig. 3)."""
     figure, (axes,), shown, unit = _panels(evidence, [2.5])
     for label, readings, line in (
         ('T case', shown.bag.case, style.CASE_LINE),

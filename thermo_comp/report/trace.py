@@ -33,7 +33,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """A bag since `start_ns`: rates [K/s] and the leader's acceleration, NaN where not known."""
+    """A bag since `start_ns`: rates [K/s], leading sensor's acceleration [K/s^2] or NaN."""
 
     index: int
     bag: ReducedBag
@@ -62,7 +62,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 def widest(bags: Sequence[ReducedBag]) -> int:
     """Choose the bag to show: the widest in temperature, then the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
-    # Spans within 5 %, and lengths within a minute, count as equal; take the first of equals.
+    # Spans within 5 % and lengths within a minute count as equal; of equal bags take the first.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
     return max(candidates, key=lambda i: (round((bags[i].end_ns - bags[i].start_ns) / 60e9), -i))
 
@@ -80,7 +80,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
-    # If several states have the same time, the last applies; equal consecutive states are joined.
+    # The last of several regimes at one time applies; equal consecutive regimes are joined.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),
         **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),

@@ -68,7 +68,7 @@ class SampleConverter:
     def convert(
         self, data: bytes, process: Process, correct_rate: CorrectRate | None = None
     ) -> bytes | None:
-        """Compensate a sample; None if it is unreadable or `process` dropped it."""
+        """Compensate a sample; None for a sample that is unreadable or that `process` drops."""
         try:
             encapsulation, sec, nanosec, name, x, y, z = self._unpack(data)
             is_known = name == self._name and encapsulation == _ENCAPSULATION
@@ -120,7 +120,7 @@ class SampleConverter:
 
 
 def read_temperature(data: bytes) -> tuple[int, float] | None:
-    """Read stamp [ns] and temperature of a serialized Temperature; None if it is malformed."""
+    """Read stamp [ns] and temperature of a serialized Temperature; None for malformed bytes."""
     # rclpy's deserialization would cost as much as several samples: its code is not in the cache
     # of a node that sleeps between samples.
     data, start = _plain(data, 16, Temperature)

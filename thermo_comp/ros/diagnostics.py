@@ -36,7 +36,7 @@ IDLE_S = 5.0  # silence of the samples after which readings apply [s]; Fast DDS 
 AHEAD_S = 5.0
 #: Delay of the next sample, in cycles and in s, beyond both of which the samples have stopped.
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
-#: Largest error of |f| at rest, in its standard deviations.
+#: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
 
 _ERROR, _WARN = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]

@@ -26,7 +26,7 @@ _STEP = re.compile(r'([A-Za-z]\w*)|\[([0-9]{1,6})\]|\.')
 
 
 def message_class(kind: str) -> Any:
-    """Import the class of a type; ImportError, AttributeError or ValueError if it has none."""
+    """Import the class of a type; ImportError, AttributeError or ValueError without a class."""
     package, _, name = kind.partition('/msg/')
     return getattr(import_module(f'{package}.msg'), name)
 
@@ -71,7 +71,7 @@ class LiveField:
         return float(message)
 
     def read(self, data: bytes) -> tuple[int, float] | None:
-        """Read stamp [ns] (`NO_STAMP_NS` without a header) and number; None without a number."""
+        """Read stamp [ns] (`NO_STAMP_NS` without a header) and number; None if unreadable."""
         try:
             message = deserialize_message(data, self.kind)
             header = getattr(message, 'header', None)
@@ -93,7 +93,7 @@ class LiveField:
 
 
 def live_field(node: Node, topic: str) -> LiveField | None:
-    """Return the field of ``TOPIC[:FIELD]``; None for a Temperature, and without a publisher."""
+    """Return the field of ``TOPIC[:FIELD]``; None for a Temperature or without publisher."""
     name, path = split_field(topic)
     name = node.resolve_topic_name(name)
     offers = node.get_publishers_info_by_topic(name)

@@ -4,7 +4,7 @@
 Owns the node `thermo_comp`: samples and temperatures in, specific force, flag and diagnostics out.
 
 The output equals that of the offline replay of the same messages bit for bit. Parameters are
-checked when they are set, and applied between two wake-ups.
+checked when they are set, and applied between two wake-ups of the node's loop.
 """
 
 import gc
@@ -58,7 +58,7 @@ _NOT_OURS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterE
 
 
 class CompensationNode:
-    """The node around a `Compensator`; ThermoCompError if it cannot start."""
+    """The node around a `Compensator`; ThermoCompError if the node cannot start."""
 
     def __init__(self, context: rclpy.context.Context | None = None) -> None:
         self.node = rclpy.create_node(NODE_NAME, context=context)
@@ -149,7 +149,7 @@ class CompensationNode:
             if new:
                 self._print_calibration(before.loaded.calibration.unit.serial)
             self._loop.call_soon(partial(self._relay.release, before.samples))
-            # A failure before this line restores the previous calibration.
+            # `return` is inside `try`: any failure restores the previous calibration.
             return result  # noqa: TRY300
         except BaseException:
             self._run_with(before)

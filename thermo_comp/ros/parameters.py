@@ -154,7 +154,7 @@ def declare(node: Node) -> NodeConfig:
 
 
 def named_topics(text: str) -> dict[str, str]:
-    """Read the parameter `topics`: topics by input; ParameterError if it is malformed."""
+    """Read the parameter `topics`: topics by input; ParameterError for a malformed text."""
     try:
         names = dict(map(parse_name, text.split(','))) if '=' in text else {}
         names = read_names(text) if text and not names else names

@@ -4,7 +4,7 @@
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
 Messages do not identify their publisher. A topic with more than one publisher is ignored, as is
-the first batch after one of two publishers has left, which may be its (`waitloop.Sources`).
+the first batch after a publisher has left, which may hold its messages (`waitloop.Sources`).
 """
 
 from bisect import bisect_left, bisect_right
@@ -196,7 +196,7 @@ class Relay:
         compensator = self.running.compensator
         last_ns = compensator.now_ns
         if last_ns is not None:
-            # The clock advanced by at most `silence_ns` since the stamp of the last sample.
+            # Use readings stamped at most `silence_ns` after the last sample.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:

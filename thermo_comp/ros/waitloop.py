@@ -8,9 +8,9 @@ While samples flow, the loop waits only for samples, and each wake-up empties th
 and ordinary subscriptions are polled. Timers, clients and middleware events are not served by this
 loop.
 
-Beyond the documented API: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
+Undocumented parts of rclpy in use: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message`, `get_publisher_count`, `service_take_request` and `publish_raw` of handles, and the
-node's `_parameter_overrides`; `test/test_waitloop.py` fails when any of them changes.
+node's `_parameter_overrides`, all of them tested by `test/test_waitloop.py`.
 """
 
 import time
@@ -121,7 +121,7 @@ class RawSubscription:
         self.interval_ns = 0
 
     def drain_single_source(self) -> tuple[list[bytes], list[int], int]:
-        """Take the waiting messages surely from one publisher, and count the other messages."""
+        """Take waiting messages that are surely from one publisher; count the other messages."""
         messages, received_ns, numbers = self.drain()
         if not messages:
             return messages, received_ns, 0
@@ -146,7 +146,7 @@ class RawSubscription:
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
         before, self._sequence = self._sequence, numbers[-1]
         if before is not None and self._sequence is not None:
-            # Another publisher can have a smaller sequence number.
+            # A smaller sequence number is that of another publisher: no loss.
             self.n_lost += max(0, self._sequence - before - len(messages))
         return messages, received_ns, numbers
 
@@ -203,7 +203,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call a function periodically [s] instead of the last function; cheaper than a timer."""
+        """Call a function every `period_s`, instead of any earlier one; cheaper than a timer."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback
@@ -231,7 +231,7 @@ class WaitLoop:
         others |= {service: partial(self._take_request, service) for service in node.services}
         waking = next((subscription for subscription in self._raw if subscription.wakes), None)
         rest_ns = 0
-        # With reliable samples a wake-up costs less than a short sleep: make no pause.
+        # With reliable QoS a wake-up costs less than a short sleep: make no pause.
         if waking and waking.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             rest_ns = self._rest_ns
         crowd_ns = rest_ns * 3 // 4

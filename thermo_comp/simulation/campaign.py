@@ -33,7 +33,7 @@ _PROGRAMS = {
     # positions.
     'long': '20 30min, 35@0.5 60min, 5@1 60min, 25@0.3 40min, 10@0.7 45min, 33@0.9 40min, '
     '15@0.35 40min, 20@0.5 19.92063492063492min',
-    # No ramp of this program (start, end and rate) occurs in a program for a fit.
+    # No ramp of 'held-out' (start, end and rate) occurs in a program for a fit.
     'held-out': '12 40min, 31@0.35 45min, 17@0.9 30min, 26@0.6 50min, 7@0.7 60min, 22@0.25 40min',
     'slow': '20 60min, 35@0.1 60min, 5@0.2 60min, 20@0.15 60min',
     'fast': '20 45min, 35@3 75min, 5@2 90min, 25@1.5 75min, 10@3 60min',
@@ -181,7 +181,7 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # The attitudes are random and have no vertical axis, unlike those of all other plans.
+        # 'held-out' has random attitudes without a vertical axis, unlike all other plans.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name in ('centrifuge', 'rate-table'):

@@ -11,8 +11,8 @@ series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighte
 two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
 The temperature that a part lags may lead the board thermometer by a time theta: the thermometer
-itself lags the board, or the part also exchanges heat with a case that has no thermometer. The
-part then responds to the readings by ``(1 + theta s) / (1 + tau s)``, so that
+itself lags the board, or the part also exchanges heat with a case that has no thermometer. With
+a lead theta the part responds to the readings by ``(1 + theta s) / (1 + tau s)``, so that
 ``m = (1 - theta / tau) m_tau``, and for two stages
 ``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``.
 
@@ -125,7 +125,7 @@ class Play(_Play, Quantity):
 
     @property
     def lag(self) -> Lag | None:
-        """The lag that the play follows; None if it follows the board."""
+        """The lag that the play follows; None if the play follows the board."""
         return Lag(BOARD_INPUT, self.tau_s, *self[2:]) if self.tau_s else None
 
     @property

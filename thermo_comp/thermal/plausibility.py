@@ -69,7 +69,7 @@ class Fault(Enum):
     #: A reading that changed faster than any part of a unit can: it is not used.
     STEP = 'jumped'
     #: A difference from the case that neither a ramp nor the unit's heat explains: a thermometer
-    #: may be loose. The readings are used, with a larger variance.
+    #: may be loose. Readings with this fault are used, with a larger variance.
     LOOSE = 'apart'
 
 

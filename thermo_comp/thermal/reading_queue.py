@@ -36,7 +36,7 @@ class ReadingQueue:
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> int:
-        """Add a reading; return the number of refused ones: this, or those of another clock."""
+        """Add a reading; return the number of readings refused: full queue, or another clock."""
         n_before = len(self._entries)
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:

@@ -26,8 +26,8 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state, in lags of the leading sensor
-# Margin for "the rate is below a limit", in sd of the rate. Half a sd is sufficient: in a soak
-# most of the rate's variance is an allowance for a ramp that may begin at any time.
+# Margin for "the rate is below a limit", in sd of the rate. A margin of half a sd suffices: in a
+# soak most of the rate's variance is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
 OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
 FIRST_READINGS: Final = 20  # number of readings that correct a declared noise that is too small
@@ -162,9 +162,9 @@ class _Watch:
         self._relaxed = settings.relaxed_rate_k_min / 60.0
         self._memory_s = 0.25 * sensor.lag_s
         self._stale_ns = round(0.5e9 * sensor.lag_s)
-        # An unchanged reading proves a low rate after the longer of two times: that in which the
-        # relaxed rate crosses a cell, and that for which a reversal in the smallest ramp stays in
-        # a cell.
+        # An unchanged reading proves a low rate after the longer of two times: the time in which
+        # the relaxed rate crosses a cell, and the time for which the temperature stays in a cell
+        # while the smallest ramp reverses.
         quantum = sensor.quantum_c
         bend = settings.smallest_ramp_k_min / 60.0 / sensor.lag_s
         self._still_ns = round(
@@ -192,7 +192,7 @@ class _Watch:
         stamp = self._stamp_ns
         self._stamp_ns = stamp_ns
         if stamp is None or sd > relaxed:
-            self._mean = rate  # the rate is too uncertain to enter the mean
+            self._mean = rate  # the rate is too uncertain to enter the mean rate
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)

@@ -3,7 +3,7 @@
 """
 Owns the settings of thermometers, detector and tracker.
 
-Calibrations hold these settings, and the workers of a fleet receive them.
+Calibrations hold settings of thermometers and detector; workers of a fleet receive all settings.
 """
 
 from dataclasses import dataclass, field

@@ -298,7 +298,7 @@ class Thermometer:
 
 
 def mix(state: State, other: State, share: float) -> State:
-    """Mix a state with a share of another; the covariance contains the states' difference."""
+    """Mix a state with a share of another state; the covariance contains their difference."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a

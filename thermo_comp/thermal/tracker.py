@@ -3,9 +3,9 @@
 """
 Owns the tracker of a unit's thermal state: thermometers, regime, memory, dynamic weight.
 
-The compensator, the fit and the report all run this class, so a regressor means the same when it
-is fitted and when it is applied. The class is causal and reads no clock: each reading has a
-stamp, and the thermal state is requested for a stamp.
+The compensator, the fit and the report all run `ThermalTracker`, so a regressor means the same
+when it is fitted and when it is applied. `ThermalTracker` is causal and reads no clock: each
+reading has a stamp, and the thermal state is requested for a stamp.
 """
 
 from copy import copy
@@ -48,7 +48,7 @@ class ThermalTracker:
         self.board = Thermometer(detector.board)
         beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
         self.thermometers = {BOARD_INPUT: self.board, **beside}
-        #: The leading sensor is the first sensor beside the board.
+        #: The leading sensor: the first thermometer other than the board's.
         self.case = beside[self.spec.sensors[0]]
         self.checks = {
             BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
@@ -178,7 +178,7 @@ class ThermalTracker:
         if before_ns is not None and (is_new or has_restarted):
             is_gap = has_restarted and (stamp_ns - before_ns) * 1e-9 > sensor.settings.lag_s
             if has_restarted and not is_gap and n_before < 2 * RESTART_READINGS:
-                # The few readings before the restart were wrong, not those after it.
+                # The few readings before the restart were wrong: begin at the present reading.
                 self._begin_again(name, sensor)
                 sensor.update(stamp_ns, celsius)
                 self.updated_ns = max(self.updated_ns or stamp_ns, stamp_ns)

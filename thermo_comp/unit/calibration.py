@@ -6,8 +6,8 @@ Owns the Calibration value of one unit, validated as a whole.
 The immutable dataclasses mirror the file key by key; a node replaces a calibration by assignment.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
-(0..1), and phi_j the columns of the thermal response (`columns`), common to both sets (Eq. (6) to
-(9) of the paper; the paper has no thermal response)::
+(0..1), and phi_j the columns of the thermal response (`columns`), common to both sets (equations
+6 to 9 of the paper, which has no thermal response)::
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
@@ -344,7 +344,7 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
 
 
 def rate_triad(calibration: Calibration) -> Calibration:
-    """Return the gyroscope of a calibration as a triad; ValueError without a gyroscope."""
+    """Return the gyroscope of a calibration as a triad; raises ValueError without a gyroscope."""
     gyroscope = calibration.gyroscope
     if gyroscope is None:
         raise ValueError('`calibration` must have a gyroscope')

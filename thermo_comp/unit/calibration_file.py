@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the calibration file: YAML to a validated Calibration and back.
+Owns the calibration file, from YAML to a validated Calibration and back.
 
 Any bytes give a Calibration or a CalibrationError that names file and key: size, nesting and YAML
 features are limited before anything is built (no aliases, tags or duplicate keys).
@@ -49,7 +49,7 @@ def load_calibration(path: str | Path) -> Calibration:
 
 
 def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibration:
-    """Build a Calibration from the bytes of a calibration file; raises as `load_calibration`."""
+    """Build a Calibration from the bytes of a file; raises CalibrationError if it is not valid."""
     try:
         data = load_plain_yaml(content.decode('utf-8'))
     except UnicodeDecodeError as error:
@@ -90,7 +90,7 @@ def _rename(data: dict[str, Any]) -> None:
 
 def dump_calibration(calibration: Calibration) -> str:
     """
-    Write a Calibration as YAML text; CalibrationError if reading the text gives another value.
+    Write a Calibration as YAML; raises CalibrationError if reading the text gives another value.
     """
     text: str = yaml.dump(
         plain(calibration),

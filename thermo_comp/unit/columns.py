@@ -14,7 +14,7 @@ Each group of the bank has the columns of the kind with the same name, except th
 *product* has the kind board, and *gradient_x_temperature* the kinds gradient and gradient_lag,
 times a power of temperature, for coefficients that change with temperature. *square* also has the
 kind cube, and *gradient_even* the kinds size and square. *part* has the kinds board, square and
-cube: their sum with a curve over the board temperature is a curve over the temperature of a part.
+cube, whose sum with a curve over the board temperature is a curve over a part's temperature.
 *gradient_even_about_rest* has the columns of *gradient_even* as functions of the gradient less its
 value at rest.
 
@@ -257,7 +257,7 @@ def _family(
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """Return the memory that a tracker needs for columns; ValueError if a sensor is missing."""
+    """Return the memory a tracker needs for columns; raises ValueError if a sensor is missing."""
     sources: set[Quantity] = set()
     for column in columns:
         sources.add(column.source)
@@ -284,7 +284,7 @@ def _root(order: int, x: float) -> float:
 
 class ColumnTable:
     """
-    Evaluates columns at thermal states (width, n), each state alone; results: (n_columns, n).
+    Evaluates columns at thermal states (width, n), each state alone, with results (n_columns, n).
     """
 
     def __init__(
@@ -347,7 +347,7 @@ class ColumnTable:
         return np.asarray((numbers - self._centres) / self._widths)
 
     def held(self, raw: Floats) -> Floats:
-        """Limit the values of `raw` to the columns' ranges."""
+        """Limit the values u of the columns to the columns' ranges."""
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:

@@ -106,7 +106,7 @@ class Correction:
         self.misalignment: tuple[float, ...] = (M[1][0], M[2][0], M[2][1])
         self._covariance = CovarianceMap(self.misalignment)
         self.beyond = beyond_force(calibration)
-        #: The nonlinearity over specific force; None if the calibration has none.
+        #: The nonlinearity over specific force, or None if the calibration has none.
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
@@ -134,7 +134,7 @@ class Correction:
 
     def _blended(self, sets: Floats, weight: Floats, phi: Floats) -> Floats:
         result = self._weigh(phi, (1.0 - weight) * sets[0] + weight * sets[1])
-        # Eq. (8) of the paper: scale factor at the board temperature.
+        # Equation 8 of the paper gives the scale factor at the board temperature.
         result[3:] *= self.K
         return result
 
@@ -199,9 +199,9 @@ class Correction:
         ends.
 
         `slow` is the slow part of the error's covariance, shape (n_slow, n), see
-        `SlowUncertainty.at`. Returns by axis bias and its change over the segment (1 s), scale and
-        its change, then the coefficients of the covariance with the noise of a message, see
-        `covariance.covariance_at`: (52,) or (52, n). With a nonlinearity `slow` has 15 more rows
+        `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
+        segment (1 s), scale and its change, then the coefficients of the covariance with the noise
+        of a message, see `covariance.covariance_at`. With a nonlinearity `slow` has 15 more rows
         and the result 21 more, see `ForceCorrection.rows`.
         """
         ends = np.array((start, end), dtype=np.float64)
@@ -264,7 +264,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # The variance of lags contains the effect of ramps of any rate.
+            # Without lags a rate beyond the range counts; the variance of lags covers any rate.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])

@@ -3,18 +3,18 @@
 """
 Owns the covariance of a corrected sample as polynomials in the forces of the three axes.
 
-x, y, z are the specific forces along the axes, before the misalignment. A sample has nine errors
-u: a constant error and a scale error of each axis, and the errors of the three elements of the
-misalignment M. To first order the error of the corrected force is ::
+x, y, z are the specific forces along the axes, before the misalignment. The nine elements of u are
+errors: a constant error and a scale error of each axis, and the errors of the three elements of
+the misalignment M. To first order the error e of the corrected force is ::
 
     e_x = u0 + x u1
     e_y = yx (u0 + x u1) + u2 + y u3 + x u6
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
-so that each element of the covariance of e is a polynomial of second degree in x, y, z. The
-coefficients of the polynomials are sums over the elements of the covariance of u, which are called
-rows here: first a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then one
-row for each pair in `BETWEEN`.
+Each element of the covariance of e is a polynomial of second degree in x, y, z, and its
+coefficients are sums over the elements of the covariance of u. In an array the rows of the
+covariance of u are a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then
+one row for each pair in `BETWEEN`.
 """
 
 from collections.abc import Sequence
@@ -38,18 +38,18 @@ BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
 N_ROWS: Final = len(_PAIRS)
 _FIRST, _SECOND = np.array(BETWEEN).T
 _OF_M: Final = [BETWEEN.index((u, u)) for u in (6, 7, 8)]
-#: Products of two of (1, x, y, z), by their numbers, in the elements xx, xy, xz, yy, yz, zz.
+#: Pairs of indices in (1, x, y, z) of the products in each of the elements xx, xy, xz, yy, yz, zz.
 _TERMS: Final = [
     [(i, j) for i, j in combinations_with_replacement(range(4), 2) if i < first and j < second]
     for first, second in combinations_with_replacement((2, 3, 4), 2)
 ]
-#: Number of coefficients of all elements, and the places of the constants of xx, yy, zz.
+#: Number of coefficients of all six elements, and the places of the constants of xx, yy, zz.
 N_COEFFICIENTS: Final = sum(map(len, _TERMS))
 CONSTANTS: Final = tuple(sum(map(len, _TERMS[:element])) for element in (0, 3, 5))
 
 
 class CovarianceMap:
-    """Linear map from the rows of the covariance of u to the coefficients of xx .. zz."""
+    """Linear map from the rows of the covariance of u to the coefficients of xx, xy, ..., zz."""
 
     def __init__(self, misalignment: Sequence[float]) -> None:
         yx, zx, zy = misalignment
@@ -77,7 +77,7 @@ def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
         sums[place] = products + np.tril(products, -1).T
     u, w = np.array([*_OF_AXES, *BETWEEN]).T
     factors = sums[:, u, w]
-    # The row b of an axis is twice the covariance of its two errors.
+    # The row b of an axis is twice the covariance of its constant error and its scale error.
     factors[:, 1:9:3] /= 2.0
     # In each sum few rows have a factor other than 0: keep the places and factors of these rows.
     n = int((factors != 0.0).sum(axis=1).max())

@@ -5,8 +5,8 @@ Owns a function of temperature: polynomial, cubic spline or exponential, normali
 
 A single ``t = T_board - T_ref`` [K] gives the same bits as an array: the code uses only ``+ - *
 /`` in a fixed order, and `math.exp` number by number. Each function is linear in its free
-coefficients, so `basis` gives the regressors of the fit and of the parameter covariance (Eq. (9)
-and (10) of the paper).
+coefficients, so `basis` gives the regressors of the fit and of the parameter covariance (equations
+9 and 10 of the paper).
 """
 
 from __future__ import annotations

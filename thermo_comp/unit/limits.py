@@ -5,7 +5,7 @@ Owns the limits of a calibration's bias and scale over its temperatures, relativ
 
 A bias is within the converter's range, so the sum of level and curve is at most twice the full
 scale. The largest value of a column, and the uncertainty, stay within a million times the limit of
-a bias: far beyond any instrument, and without overflow.
+a bias, which is far beyond any instrument and does not overflow.
 """
 
 from __future__ import annotations

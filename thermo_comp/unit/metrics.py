@@ -13,7 +13,7 @@ from ..typing import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class ResidualStatistics:
-    """Statistics of the finite residuals; NaN if no residual is finite."""
+    """Statistics of the finite residuals, NaN if no residual is finite."""
 
     n: int
     mean: float

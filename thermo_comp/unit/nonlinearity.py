@@ -32,7 +32,7 @@ Kind = Literal['square', 'odd_square', 'cube']
 #: The nonlinear terms in the order of a calibration file, and the power of 1/g in the unit of each
 #: coefficient.
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
-#: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 .. 60 ug/g^2.
+#: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 to 60 ug/g^2.
 K2_SD = 1e-4
 #: Largest |f| / gravity of a rest that counts as at 1 g.
 AT_REST = 1.01
@@ -144,7 +144,7 @@ def corrected_nonlinear(
     bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
     k2x, kqx, k3x, k2y, kqy, k3y, k2z, kqz, k3z = line[_NONLINEAR : _NONLINEAR + 9]
     yx, zx, zy = misalignment
-    # Eq. (7) of the paper is solved for the input of each axis, then the nonlinearity.
+    # Equation 7 of the paper is solved for the input of each axis, then the nonlinearity.
     x = linearised((x - (bx + bx1 * dt)) / (sx + sx1 * dt), k2x, kqx, k3x)
     y = linearised((y - (by + by1 * dt)) / (sy + sy1 * dt), k2y, kqy, k3y)
     z = linearised((z - (bz + bz1 * dt)) / (sz + sz1 * dt), k2z, kqz, k3z)

@@ -117,7 +117,7 @@ class ParameterLayout(NamedTuple):
     """
     The order of a calibration's parameters in its posterior: axis by axis the bias [input units],
     then the scale [relative]; axis by axis from `nonlinear` on the nonlinear coefficients, then
-    the changes of these per kelvin; M[1][0], M[2][0], M[2][1] from `misalignment` on.
+    the changes of these per kelvin; from `misalignment` on M[1][0], M[2][0], M[2][1].
     """
 
     bias: list[Block]
@@ -134,7 +134,7 @@ class ParameterLayout(NamedTuple):
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """Find the smallest factor of a covariance matrix; ValueError if it is not a covariance."""
+    """Find the smallest factor of a matrix; raises ValueError if the matrix is no covariance."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')

@@ -66,8 +66,8 @@ class SlowUncertainty:
         (width, n), each state alone, with the remaining shares of the lags' initial states,
         (n_lags, n), and with `ThermalMemory.start_rate` of each state, (n,), which is 0 if it is
         not given. Returns `Correction.n_slow` rows: a, b, c of each axis' error variance
-        ``v(x) = a + b x + c x^2`` [m^2/s^4], then the rows between axes and misalignment; with a
-        nonlinearity then its part of the coefficients of x^2 to x^6 of each axis' variance.
+        ``v(x) = a + b x + c x^2`` [m^2/s^4], then the rows between axes and misalignment, then the
+        part of a nonlinearity in the coefficients of x^2 to x^6 of each axis' variance.
         """
         cuts = range(_CHUNK, states.shape[1], _CHUNK)
         rates = np.abs(states[RATE])
@@ -137,8 +137,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Return the variance of the bias by the parameters at thermal states (n, width), and the
-        variance of the bias less its mean by `mean_of`, shapes (n, 3) [m^2/s^4].
+        Return the variance of the bias by the parameters at thermal states (n, width), and that of
+        the difference of the bias from its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)

@@ -41,7 +41,7 @@ Vector = tuple[float, float, float]
 
 
 def build(hint: type[Value], data: Any, key: str = '') -> Value:
-    """Build a value of a type hint; SchemaError with the key if the plain values do not fit."""
+    """Build a value of a type hint; raises SchemaError with the key if the values do not fit."""
     result: Value = _build(hint, data, key)
     return result
 
@@ -183,7 +183,7 @@ def _joined(key: str, name: str) -> str:
 
 
 def _shown_name(name: str) -> str:
-    # An invalid name may be any text of any length.
+    # An invalid name may be any text: unprintable text is shown by `repr`, long text is cut.
     shown = name if name.isprintable() and len(name) < _LONGEST_NAME else repr(name)
     return shown[:_LONGEST_NAME]
 

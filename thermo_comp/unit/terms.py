@@ -58,7 +58,7 @@ class Term(ABC):
     width_key: ClassVar[str] = ''
     #: Keys of a column that must be greater than 0.
     positive: ClassVar[_Names] = ()
-    #: Range of all values of a column of the kind; None: the range of the values in the bags.
+    #: Range of all values of a column of the kind, or None for the range in the bags.
     bounds: ClassVar[tuple[float, float] | None] = None
     is_temperature: ClassVar[bool] = False
     #: Whether the fit estimates weights for the scale as well as for the bias.
