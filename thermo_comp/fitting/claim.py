@@ -92,32 +92,27 @@ def claim_of(
     # A stated offset sd is that of a mounting or a turn-on: beside the independent offsets of m
     # mountings the covariance contains the offset of a single turn-on with 1 - 1 / m of the
     # variance. Offsets of several turn-ons are unknowns of the regression.
-    is_shared = n_turn_ons < n_mountings
-    shared_variance = chosen.prior.turn_on_sd**2 if regression.has_turn_ons else 0.0
-    if is_shared and not regression.has_turn_ons:
-        shared_variance = offset_sd**2 * (1.0 - 1.0 / n_mountings)
-    of_turn_ons = np.zeros_like(covariance)
+    is_single = n_turn_ons == 1 < n_mountings
+    turn_on_variance = offset_sd**2 * (1.0 - 1.0 / n_mountings)
     if prior.offset_scale > 0.0:
-        kind = 'mounting' if is_shared else 'both'
+        kind = 'mounting' if is_single or regression.windows.has_turn_ons else 'both'
         tried = _offsets_tried(prior.offset_scale, known_offset_sd, kind)
         covariance, offset_sd = _over_mountings(regression, posterior, *tried)
-        kind = 'both' if regression.has_turn_ons else 'turn-on'
-        tried = _offsets_tried(prior.offset_scale, known_offset_sd, kind)
+        turn_on_variance = 0.0
         if regression.has_turn_ons:
-            mixture, turn_on_sd = _over_turn_ons(regression, posterior, *tried)
-            of_turn_ons = _excess(mixture, posterior.covariance)
-            shared_variance = turn_on_sd**2
-        elif is_shared and regression.gravity:
+            tried = _offsets_tried(prior.offset_scale, known_offset_sd, 'both')
+            mixture, turn_on_variance = _over_turn_ons(regression, posterior, *tried)
+            covariance = covariance + _excess(mixture, posterior.covariance)
+        elif is_single and regression.gravity:
             # The norms of a single turn-on do not show how well turn-ons repeat.
-            weight = np.exp(tried[1])
-            shared_variance = float(weight @ tried[0] ** 2 / weight.sum())
-        offset_sd = float(np.sqrt(offset_sd**2 + shared_variance))
-    covariance = covariance + of_turn_ons
+            values, log_density = _offsets_tried(prior.offset_scale, known_offset_sd, 'turn-on')
+            turn_on_variance = float(np.average(values**2, weights=np.exp(log_density)))
+        offset_sd = float(np.sqrt(offset_sd**2 + turn_on_variance))
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
     if lacks_effects:
         covariance = covariance + _excess(jackknife_covariance(regression, posterior), covariance)
-    if shared_variance and not regression.has_turn_ons:
-        covariance = covariance + shared_variance * _of_turn_on(regression, posterior)
+    if is_single and turn_on_variance:
+        covariance = covariance + turn_on_variance * _of_turn_on(regression, posterior)
     if candidates is not None:
         # The covariance with unseen columns is computed at the mode's mounting sd, and lacks the
         # variance that mixtures, jackknife and turn-ons add to the covariance of the mode.
@@ -286,7 +281,10 @@ def _over_mountings(
 def _over_turn_ons(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
-    """Return covariance and sd of the mixture of fits over the sd of turn-ons."""
+    """
+    Return the covariance of the mixture of fits over the sd of turn-ons, and the mean variance of
+    a turn-on; arguments as in `_over_mountings`.
+    """
     fits = [
         regression.solve(
             posterior.state, replace(posterior.prior, turn_on_sd=float(sd)), n_steps=1
@@ -295,7 +293,7 @@ def _over_turn_ons(
     ]
     evidence = np.array([fit.log_evidence for fit in fits])
     covariance, weight = _mixture(posterior, fits, evidence + log_density)
-    return covariance, float(np.sqrt(weight @ tried**2))
+    return covariance, float(weight @ tried**2)
 
 
 def _mixture(

@@ -148,8 +148,11 @@ class Windows:
 
     @cached_property
     def has_turn_ons(self) -> bool:
-        """Whether there are several turn-ons, and one of them has several mountings."""
-        return 1 < self.n_turn_ons <= int(self.mounting[-1])
+        """
+        Whether there are several turn-ons, with at least two mountings each on average. Fewer
+        mountings do not show which part of their offsets a turn-on shares.
+        """
+        return 1 < self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
 
     @property
     def inner(self) -> Ints:
