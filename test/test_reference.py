@@ -21,7 +21,7 @@ def test_json_schema_agrees_with_the_dataclasses():
     schema = make_reference.json_schema(Drawing)
     assert schema['required'] == ['name']
     assert schema['additionalProperties'] is False
-    assert schema['description'] == 'A value of every kind.'
+    assert schema['description'] == 'A dataclass with a field of every kind of type hint.'
     assert schema['properties']['name'] == {'type': 'string', 'minLength': 2, 'maxLength': 20}
     assert schema['properties']['shapes'] == {
         'type': 'array',
