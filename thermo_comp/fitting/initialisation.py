@@ -106,7 +106,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
-    if n_directions >= POSITIONS_NEEDED:
+    if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
+        # Offsets of turn-ons are unknowns of their own, which misalignments need not explain.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
