@@ -82,36 +82,18 @@ def claim_of(
     # All rests of a mounting share an offset, but the regression has an offset for each rest. The
     # mean of k offsets with k times the variance has the variance of a single offset.
     mounting = regression.windows.mounting
-    n_mountings, n_turn_ons = int(mounting[-1]) + 1, regression.windows.n_turn_ons
-    n_rests = len(mounting) / n_mountings
+    n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
     if prior.unseen_misalignment_sd:
         prior = replace(prior, misalignment_sd=prior.unseen_misalignment_sd)
     posterior = regression.solve(chosen.state, prior, n_steps=0)
-    layout, covariance, offset_sd = posterior.layout, posterior.covariance, chosen.prior.offset_sd
-    # A stated offset sd is that of a mounting or a turn-on: beside the independent offsets of m
-    # mountings the covariance contains the offset of a single turn-on with 1 - 1 / m of the
-    # variance. Offsets of several turn-ons are unknowns of the regression.
-    is_single = n_turn_ons == 1 < n_mountings
-    turn_on_variance = offset_sd**2 * (1.0 - 1.0 / n_mountings)
-    if prior.offset_scale > 0.0:
-        kind = 'mounting' if is_single or regression.windows.has_turn_ons else 'both'
-        tried = _offsets_tried(prior.offset_scale, known_offset_sd, kind)
-        covariance, offset_sd = _over_mountings(regression, posterior, *tried)
-        turn_on_variance = 0.0
-        if regression.has_turn_ons:
-            tried = _offsets_tried(prior.offset_scale, known_offset_sd, 'both')
-            mixture, turn_on_variance = _over_turn_ons(regression, posterior, *tried)
-            covariance = covariance + _excess(mixture, posterior.covariance)
-        elif is_single and regression.gravity:
-            # The norms of a single turn-on do not show how well turn-ons repeat.
-            values, log_density = _offsets_tried(prior.offset_scale, known_offset_sd, 'turn-on')
-            turn_on_variance = float(np.average(values**2, weights=np.exp(log_density)))
-        offset_sd = float(np.sqrt(offset_sd**2 + turn_on_variance))
+    layout, offset_sd = posterior.layout, chosen.prior.offset_sd
+    offsets = _over_offsets(regression, posterior, offset_sd, known_offset_sd)
+    covariance, offset_sd, turn_on_variance = offsets
     covariance = covariance + _excess_over_priors(regression, posterior, informative)
     if lacks_effects:
         covariance = covariance + _excess(jackknife_covariance(regression, posterior), covariance)
-    if is_single and turn_on_variance:
+    if turn_on_variance:
         covariance = covariance + turn_on_variance * _of_turn_on(regression, posterior)
     if candidates is not None:
         # The covariance with unseen columns is computed at the mode's mounting sd, and lacks the
@@ -125,6 +107,40 @@ def claim_of(
         along[layout.kappa] = posterior.state.kappa * gravity_sd / regression.gravity
         covariance = covariance + np.outer(along, along)
     return Claim(layout, covariance, offset_sd)
+
+
+def _over_offsets(
+    regression: Regression, posterior: Posterior, offset_sd: float, known_sd: float
+) -> tuple[Floats, float, float]:
+    """
+    Return the covariance of the unit's unknowns by the mixtures over the sd of the offsets of
+    mountings and turn-ons, the sd of the offset of a new mounting after a new turn-on [m/s^2], and
+    the variance of the offset of a single turn-on, which is no unknown of the regression.
+
+    `offset_sd`: sd of the offset of a mounting [m/s^2]; `known_sd`: sd by a prior calibration
+    """
+    windows, scale = regression.windows, posterior.prior.offset_scale
+    n_mountings = int(windows.mounting[-1]) + 1
+    is_single = windows.n_turn_ons == 1 < n_mountings
+    if scale <= 0.0:
+        # A stated offset sd is that of a mounting or a turn-on: beside the independent offsets of
+        # m mountings a single turn-on has 1 - 1 / m of the variance.
+        variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
+        return posterior.covariance, offset_sd, variance
+    kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
+    tried = _offsets_tried(scale, known_sd, kind)
+    covariance, offset_sd = _over_mountings(regression, posterior, *tried)
+    if regression.has_turn_ons:
+        tried = _offsets_tried(scale, known_sd, 'both')
+        mixture, variance = _over_turn_ons(regression, posterior, *tried)
+        covariance = covariance + _excess(mixture, posterior.covariance)
+        return covariance, float(np.hypot(offset_sd, variance**0.5)), 0.0
+    if not (is_single and regression.gravity):
+        return covariance, offset_sd, 0.0
+    # The norms of a single turn-on do not show how well turn-ons repeat.
+    values, log_density = _offsets_tried(scale, known_sd, 'turn-on')
+    variance = float(np.average(values**2, weights=np.exp(log_density)))
+    return covariance, float(np.hypot(offset_sd, variance**0.5)), variance
 
 
 def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Floats]:

@@ -22,7 +22,6 @@ from ..text import valid_serial
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
 from ..unit.gravity import STANDARD_GRAVITY
-from ..unit.nonlinearity import NonlinearTerm
 from . import data_checks, raw_checks
 from .alternatives import model_of, regressed, windows_of
 from .assembly import build_calibration
@@ -228,10 +227,8 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     findings += judge_missing(windows)
     progress(0.7)
     fit = regressed(windows, Problem(bags, options, start, up, progress))
-    terms: tuple[NonlinearTerm, ...] = ()
-    if known is None:
-        selected, terms = choose(fit.regression, fit.selected, options)
-        fit = fit._replace(selected=selected)
+    selected, terms = choose(fit.regression, fit.selected, options)
+    fit = fit._replace(selected=selected)
     claim = claim_of(
         *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known)),
         informative=fit.selected.informative,

@@ -35,10 +35,6 @@ from .windows import CURVE, PART, ThermalWindows
 #: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
 #: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
-#: Factor of the prior sd of the scale factor's slopes with two to eight attitudes: in few
-#: attitudes a tilt of the support explains a drift that the scale factor of a nearly level axis
-#: explains only by a slope of several hundred ppm/K.
-OF_FEW_ATTITUDES = 0.5
 
 
 @dataclass(frozen=True)
@@ -283,9 +279,11 @@ def _candidates(
 
 def _steepest(n_directions: int) -> Floats:
     """Return the largest prior sd of slopes of bias and scale by the number of attitudes, (2,)."""
-    # In one attitude the slope of the scale factor keeps its full prior sd.
+    # In two to eight attitudes the prior sd of the scale factor's slope is halved, because a tilt
+    # of the support explains a drift that the scale factor of a nearly level axis explains only by
+    # a slope of several hundred ppm/K.
     is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
-    return STEEPEST * (1.0, OF_FEW_ATTITUDES if is_few else 1.0)
+    return STEEPEST * (1.0, 0.5 if is_few else 1.0)
 
 
 def _typical_slopes(steepness: float, steepest: Floats, options: FitOptions) -> Floats:

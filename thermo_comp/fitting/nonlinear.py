@@ -204,9 +204,12 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """Choose the nonlinear terms, and the terms whose coefficient depends on temperature."""
+    """
+    Choose the nonlinear terms, and the terms whose coefficient depends on temperature; with a
+    prior calibration the fit keeps the terms of the prior.
+    """
     forces = regression.forces
-    if forces is None:
+    if forces is None or options.prior is not None:
         return selected, ()
     k, sd = len(forces.kinds), prior_sd(forces.kinds, options)
     fits = _TermFits(regression, selected, sd)

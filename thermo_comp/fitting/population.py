@@ -38,11 +38,8 @@ from .thermal_ranges import union
 
 #: Smallest number of units of a population: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
-#: Smallest share by which correlations of the curves are reduced, so that a covariance is regular.
-LEAST_SHARE = 0.01
-#: Fields of a column of a one-stage lag of the board alone; shortest time constant of a lag [s].
+#: Fields of a column of a one-stage lag of the board alone.
 _ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
-_LEAST_BEHIND_S = 1.0
 
 
 def population(calibrations: Sequence[Calibration]) -> Calibration:
@@ -130,7 +127,8 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     others = ~np.eye(len(curves), dtype=bool)
     share = np.sum(variance, where=others) / max(np.sum(correlation**2, where=others), 1e-300)
     is_pair = (kind == 0) & ~np.eye(len(kind), dtype=bool)
-    scatter[is_pair] *= 1.0 - np.clip(share, LEAST_SHARE, 1.0)
+    # Correlations are reduced by 1 % at least, so that the covariance is regular.
+    scatter[is_pair] *= 1.0 - np.clip(share, 0.01, 1.0)
     # `to_curves`, the inverse of `to_differences`, adds the static curve to the differences.
     to_curves = 2.0 * np.eye(len(kind)) - to_differences
     return np.asarray(to_curves @ scatter @ to_curves.T)
@@ -177,7 +175,8 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE
     if not is_line and any(column.part[1:]):
-        behind_s = max(tau + second - column.lead_s, _LEAST_BEHIND_S)
+        # The time constant of the single lag is at least 1 s.
+        behind_s = max(tau + second - column.lead_s, 1.0)
         return _on_common_lags(replace(column, tau_s=behind_s, **_ALONE))
     summands: list[tuple[Column, float]] = []
     if column.sensor_share:

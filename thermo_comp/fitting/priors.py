@@ -124,18 +124,24 @@ def informative_priors(
     used = range(len(calibration.response))
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
     mean = as_vector(state, layout)[: layout.n_unit]
-    result = []
-    for variances, share in tried:
-        diagonal = np.diag(variances)
-        floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
-        sd = np.sqrt(floor)
-        scaled, correlation = to_file / sd[:, None], variances / np.outer(sd, sd)
-        # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
-        # QR factor of the covariance's factor, instead of a product, keeps the precision of nearly
-        # equal parameters.
-        widened = correlation + (1e-6 + share) * np.eye(len(sd))
-        whitened = solve_triangular(np.linalg.cholesky(widened), scaled, lower=True)
-        root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))
-        root = root * np.sign(np.diag(root))[:, None]
-        result.append(InformativePrior(mean, root))
-    return result
+    return [InformativePrior(mean, _root(*candidate, to_file)) for candidate in tried]
+
+
+def _root(covariance: Floats, share: float, to_file: Floats) -> Floats:
+    """
+    Return the upper triangular root of the inverse covariance of the unit's unknowns.
+
+    `covariance`: of the parameters of the file, to which an uncorrelated part of `share` times
+    each variance is added; `to_file`: derivatives of the parameters of the file by the unknowns
+    """
+    diagonal = np.diag(covariance)
+    floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
+    sd = np.sqrt(floor)
+    # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
+    # QR factor of the covariance's factor, instead of a product, keeps the precision of nearly
+    # equal parameters.
+    widened = covariance / np.outer(sd, sd) + (1e-6 + share) * np.eye(len(sd))
+    scaled = to_file / sd[:, None]
+    whitened = solve_triangular(np.linalg.cholesky(widened), scaled, lower=True)
+    root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))
+    return root * np.sign(np.diag(root))[:, None]

@@ -30,8 +30,6 @@ from .regression import Posterior, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalWindows
 
-#: Group of the heat flow, whose columns are gradients of sensors.
-GRADIENT = 'gradient'
 #: Large sd of mounting offsets relative to the prior's scale: turn-ons of tactical triads repeat
 #: within 0.3 to 1 mg by data sheets, which is 10 to 20 times the scale of the prior.
 LARGE_OFFSETS = 10.0
@@ -316,8 +314,8 @@ def _grown(
     chosen, trials = first, []
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND])]
-        if GRADIENT in growth.free and not _best(chosen, trials).is_complete:
-            trials.append(growth.extended(parts, (GRADIENT,)))
+        if 'gradient' in growth.free and not _best(chosen, trials).is_complete:
+            trials.append(growth.extended(parts, ('gradient',)))
         chosen = _best(chosen, trials)
     if growth.regression.windows.acts_on is not None and not chosen.is_complete:
         tried = growth.with_bends(first, PART_SUMS)
