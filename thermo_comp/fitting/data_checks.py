@@ -342,7 +342,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    if options.prior is not None and overall.fitted.rms > 1.5 * alone:
+    # The bias offset of a new turn-on, 2 sd at most, does not contradict the prior.
+    if options.prior is not None and overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow):
         yield advice(
             'prior',
             f'the bags contradict the prior: |f| - g is {ug_text(overall.fitted.rms)} RMS with '

@@ -41,7 +41,7 @@ from .initialisation import Problem, initial_triad
 from .missing_readings import judge_missing
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
-from .priors import constants_of
+from .priors import constants_of, offset_sd_of
 from .reduction import ReducedBag, reduce_source
 from .selection import Fit
 from .sensors import without_copies
@@ -229,8 +229,9 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     fit = regressed(windows, Problem(bags, options, start, up, progress))
     selected, terms = choose(fit.regression, fit.selected, options)
     fit = fit._replace(selected=selected)
+    offset_sd = 0.0 if known is None else offset_sd_of(known)
     claim = claim_of(
-        *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, _offset_sd(known)),
+        *(fit.regression, fit.posterior, fit.typical, options.gravity_sd, offset_sd),
         informative=fit.selected.informative,
         of_means=fit.of_means,
         lacks_effects=fit.selected.lacks_effects,
@@ -271,12 +272,6 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
         bags=tuple(bags),
         rates=rates,
     )
-
-
-def _offset_sd(known: Calibration | None) -> float:
-    """Return the sd of the offset of a turn-on by a prior calibration [m/s^2]; 0 without one."""
-    axes = [axis for part in known.regime_sets() for axis in part.axes()] if known else []
-    return min((axis.residual_sd_m_s2 for axis in axes), default=0.0)
 
 
 def _judged(

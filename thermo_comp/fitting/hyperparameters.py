@@ -92,8 +92,12 @@ def _updated(
     changes = [float(np.abs(np.log(np.where(is_informed, new / safe, 1.0))).max(initial=0.0))]
     offset_sd, change = _offset_sd(posterior, prior.offset_sd, posterior.layout.offset)
     changes.append(change)
-    turn_on_sd, change = _offset_sd(posterior, prior.turn_on_sd, posterior.layout.turn_on)
-    changes.append(change)
+    turn_on_sd = prior.turn_on_sd
+    if prior.informative is None:
+        # A prior calibration states the sd of turn-ons, which the few turn-ons of its update do
+        # not determine beside the ageing of the bias.
+        turn_on_sd, change = _offset_sd(posterior, turn_on_sd, posterior.layout.turn_on)
+        changes.append(change)
     tilt_sd, change = _tilt_sd(posterior, float(regression.windows.kelvins[0]))
     changes.append(change)
     pose_sd, change = _pose_sd(posterior)

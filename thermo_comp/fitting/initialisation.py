@@ -25,7 +25,7 @@ from .initial_triad import (
 from .left_out import is_better
 from .nonlinear import starting_sd, with_terms
 from .options import FitOptions
-from .priors import informative_priors, with_calibration
+from .priors import informative_priors, offset_sd_of, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit, fit_all, select
@@ -99,6 +99,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         # the unit is returned, a tilt looks like an error of the next attitude. In the paper's
         # model, 'golovach', tilts would absorb errors of its two sets.
         data = replace(data, tilt=data.tilt[:, :0])
+    data = replace(data, has_prior=known is not None)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
@@ -111,6 +112,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         state = with_terms(with_calibration(known, regression, state), known)
         *others, widest = informative_priors(known, regression, state, windows.model, options)
         prior = replace(prior, column_sd=data.parts.astype(np.float64), informative=widest)
+        if prior.offset_scale and offset_sd_of(known):
+            prior = replace(prior, turn_on_sd=offset_sd_of(known))
         fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
         return Fit(windows, regression, fit_all(regression, state, prior, fixed, others))
     if options.model == 'golovach':

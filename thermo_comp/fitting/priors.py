@@ -65,6 +65,12 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
     )
 
 
+def offset_sd_of(calibration: Calibration) -> float:
+    """Return the sd of the bias offset of a mounting or turn-on by a calibration [m/s^2]."""
+    axes = [axis for part in calibration.regime_sets() for axis in part.axes()]
+    return min(axis.residual_sd_m_s2 for axis in axes)
+
+
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
     """Set bias and weights of a state to those of a calibration with the nominal scale."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)

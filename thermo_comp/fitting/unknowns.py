@@ -62,6 +62,7 @@ class Windows:
     turn_on: number of the turn-on of each bag, (n_bags,), or None if each bag is a turn-on
     pose: number of the pose to which the unit was returned in each position, -1 for none, shape
         (n_positions,), or None if the unit was not returned
+    has_prior: whether a prior calibration states the unit's parameters
     """
 
     position: Ints
@@ -83,6 +84,7 @@ class Windows:
     acts_on: Bools | None = None
     turn_on: Ints | None = None
     pose: Ints | None = None
+    has_prior: bool = False
 
     @property
     def n_positions(self) -> int:
@@ -149,10 +151,12 @@ class Windows:
     @cached_property
     def has_turn_ons(self) -> bool:
         """
-        Whether there are several turn-ons, with at least two mountings each on average. Fewer
-        mountings do not show which part of their offsets a turn-on shares.
+        Whether there are several turn-ons, or a prior calibration, and at least two mountings in
+        each turn-on on average. Fewer mountings do not show which part of their offsets a turn-on
+        shares; the offset of a single turn-on is part of the bias, unless a prior states the bias.
         """
-        return 1 < self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
+        least = 1 if self.has_prior else 2
+        return least <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
 
     @property
     def inner(self) -> Ints:
