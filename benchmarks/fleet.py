@@ -272,7 +272,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
 
 
 def paper(found: Measured) -> None:
-    """Estimate a hundred workers: tasks as measured, sent one by one by one scheduler."""
+    """Estimate 100 and 1000 workers, to which one scheduler sends the measured tasks singly."""
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
     print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')

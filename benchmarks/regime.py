@@ -172,7 +172,7 @@ def scene_table(matrix: Matrix, lag: float) -> Rows:
 
 
 def draw_ramp(seed: int, folder: Path) -> None:
-    """Draw one ramp and the flag."""
+    """Draw the temperatures of one ramp, and the regime flag."""
     scene = Scene(0.5, 900.0, 0.01, 0.0, 1.0)
     rng = rng_of(seed, 11, scene)
     t = np.arange(-2700.0, 10800.0)

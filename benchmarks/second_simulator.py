@@ -172,7 +172,7 @@ def states_of(unit: SimpleNamespace, air_c: Floats) -> tuple[Floats, Floats, Flo
         flow = case - board
         carries = 1.0
         if unit.gas:
-            # A gas conducts better at higher temperature and larger differences.
+            # A gas conducts better at higher temperatures and larger temperature differences.
             warm = 0.5 + 0.5 * (1.0 + 0.006 * (board - REFERENCE_C))
             carries = warm * (0.7 + 0.3 * (np.abs(flow) / 3.0) ** 0.25)
         case = case + STEP_S * (air - case + 0.3 * heat - 0.1 * flow) / unit.case_s

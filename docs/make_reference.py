@@ -117,9 +117,10 @@ parameters.
 
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has
 no ROS QoS setting. With the default of Fast DDS, 0 s, each sample for a reliable subscriber wakes a thread of the
-middleware about four times, which takes a quarter of the node's CPU time. With 20 ms a lost sample is sent again up to 20
-ms later than with 0 s. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or `DEFAULT_FASTRTPS_PROFILES.xml` in the
-working directory) replaces the profile of the node; repeat `nackSupressionDuration` in the user's profile.
+middleware about four times, which takes a quarter of the node's CPU time. With `nackSupressionDuration` = 20 ms a lost
+sample is sent again up to 20 ms later than with 0 s. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
+`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces the profile of the node; repeat `nackSupressionDuration`
+in the user's profile.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
 current thermal state. If the input has no angular rate or no orientation, the first element of its covariance is -1 (REP

@@ -14,7 +14,7 @@ def of_part(truth, node):
 
 
 def ideal_regime(run, threshold_k_min=0.02):
-    """Return for each time of the thermal grid whether the board changes by `threshold_k_min`."""
+    """Whether the board's rate exceeds `threshold_k_min`, at each time of the thermal grid."""
     truth = run.truth
     rate = np.gradient(of_part(truth, truth.unit.board.node), truth.grid_s)
     return np.asarray(np.abs(rate) * 60.0 > threshold_k_min)

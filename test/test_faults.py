@@ -25,7 +25,7 @@ from thermo_comp.ros.diagnostics import findings_of
 from thermo_comp.ros.reader import LoadedCalibration
 from thermo_comp.unit.calibration_file import save_calibration
 
-#: Largest error of a published force that does not count as wrong, in its published sd.
+#: Largest error / published sd of a published force that does not count as wrong.
 SIGMAS = 5.0
 #: Largest difference of a recovered output to the undisturbed output [m/s^2]: 1 ug.
 RECOVERED = 9.80665e-6

@@ -31,8 +31,9 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 def ratios_to_sd(seed, effect_sd):
     """
-    Return the errors of the weights divided by the fit's sd, and divided by the claimed sd. An
-    effect that the model lacks changes the biases by section, equally in all positions.
+    Return the errors of the weights divided by the fit's sd, and divided by the claimed sd. In
+    each section of the program an effect that the model lacks changes the biases of all positions
+    equally.
     """
     truth, rng = Truth(), np.random.default_rng(seed)
     windows, up = table_of(truth, 12, rng, n_windows=24)

@@ -189,7 +189,7 @@ def test_the_rate_of_false_alarms_is_that_of_the_setting():
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
 def test_threshold_is_that_of_the_filters_noise(dt):
     # Expected threshold: filter gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. Terms of second order in `pace` of `_tune` are up to 4 %.
+    # response, alarms by Rice's formula. `_tune` omits terms of second order in `pace`, up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):

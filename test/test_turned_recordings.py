@@ -70,8 +70,8 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
-    # Products without the lag leave more than the effect of the lag, of which the fit with the
-    # lag must correct at least three quarters.
+    # The fit must correct at least three quarters of the effect of the lag; a fit with products of
+    # the lag, but without the lag, errs by more than this effect.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 

@@ -82,8 +82,8 @@ def test_beyond_1_g_the_covariance_has_an_unknown_square():
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
 def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fault):
     # WHY: the bias follows a part that lags the board by 10 min, so a lasting error of the board
-    # temperature changes the bias, but a sudden error does not. The claimed sd contained only
-    # sudden errors of the board temperature.
+    # temperature changes the bias, but a sudden error does not. The claimed sd lacked the effect
+    # of lasting errors of the board temperature.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))

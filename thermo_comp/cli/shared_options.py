@@ -135,7 +135,7 @@ def names(
     ),
     topics: Path | None = option('File of topics, a line INPUT: TOPIC for each.', metavar='YAML'),
 ) -> dict[str, str]:
-    """Collect the topics of `--topic` and, for inputs not named there, of the file."""
+    """Collect the topics of `--topic` and, for inputs not named there, of the topics file."""
     from ..recording.topics import parse_name, read_names
 
     named = {} if topics is None else read_names(topics)

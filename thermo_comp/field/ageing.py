@@ -415,7 +415,7 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     gravity = []
     for change in model.changes:
         columns = change.columns(rows)
-        if change.kind == 'gravity':  # the file has no parameter for gravity
+        if change.kind == 'gravity':  # the calibration file has no parameter for a jump of gravity
             gain = change.sd**2 * solve_triangular(lower, columns[:, 0], lower=True)
             variance = max(float(change.sd**2 - gain @ gain), 0.0)
             gravity.append((change, float(gain @ innovations), float(np.sqrt(variance))))

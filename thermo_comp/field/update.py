@@ -168,7 +168,7 @@ def update(
 
 
 def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
-    """Add the residuals of left-out rests, and a note, to the origin of a calibration."""
+    """Add the residuals of left-out rests, and a note, to the provenance of a calibration."""
     largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time.max()), 'D')
     residuals = ResidualSummary(
         f'left-out {judged.over}', judged.n, judged.before, judged.after, largest

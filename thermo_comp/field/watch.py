@@ -168,7 +168,7 @@ def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     Return the first index of the window that ends on each day, and the window's robust RMS.
 
     A window has the days with rests in the week up to a day, and at least two days with rests. The
-    largest ratio of a window, perhaps of a disturbed day, is replaced by the second largest.
+    largest daily RMS of a window, perhaps of a disturbed day, is replaced by the second largest.
     """
     n = np.arange(len(day))
     first = np.minimum(

@@ -5,9 +5,9 @@ Owns the detection of jumps: steps in the reading of a sensor at rest.
 
 The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
-a jump distorts the whole curve. Two criteria distinguish a jump from a rotation of the unit: the
-noise of the samples beside a jump is normal; and a jump changes the norm of the reading, which is
-almost constant in a rotation, or the gyroscope, if there is one, measures no rotation.
+a jump distorts the whole curve. Two criteria distinguish a jump from a rotation of the unit. The
+samples beside a jump scatter no more than at rest. A jump changes the norm of the reading, which
+is almost constant in a rotation, or a gyroscope measures no rotation during the jump.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
 hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares

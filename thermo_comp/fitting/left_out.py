@@ -78,9 +78,9 @@ class Folds:
         error, over the folds that both models have, or None without common folds.
 
         There are two estimates: the mean over folds of their log ratios, robust to a few large
-        folds, and the log ratio of the sums with its jackknife error, robust to small folds. If
-        both estimates of the log ratio have the same sign, the more significant estimate is
-        returned, else 0.
+        folds, and the log ratio of the sums with its jackknife error, robust to small folds. The
+        more significant of the two estimates of the log ratio is returned, or 0 if their signs
+        differ.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())

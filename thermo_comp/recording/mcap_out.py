@@ -85,7 +85,7 @@ class McapOutput:
         self._tail: list[Messages] = []
         self._at = 0
         self._stream = path.open('xb', buffering=0)
-        self.close = self._stream.close  # closes the file unfinished
+        self.close = self._stream.close  # closes the file without its summary
         self._put(MAGIC)
         self._put_record(records.Header('ros2', f'thermo_comp {__version__}'))
         if metadata:

@@ -44,8 +44,8 @@ class PartHistory:
 @dataclass(frozen=True, kw_only=True)
 class Effect(ABC):
     """
-    The base class of the causes of thermal errors. The bias of each axis changes by ``bias * first
-    + bias_curvature * second``, the scale likewise.
+    The base class of the causes of thermal errors. Two signals, `first` and `second`, change the
+    bias of each axis by ``bias * first + bias_curvature * second``, the scale likewise.
 
     Bias changes in ug and scale changes in ppm per unit of the first and the second signal.
     """

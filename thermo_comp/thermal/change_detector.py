@@ -98,7 +98,7 @@ class ChangeDetector:
         """Begin a soak with the rate as its baseline, with an error of at least `least_error`."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
-        self._edge = nan  # an edge crossed before the soak would give the rate of the ramp
+        self._edge = nan  # a cell edge crossed before the soak would give the ramp's rate
 
     def is_following(self, stamp_ns: int) -> bool:
         """Whether `rate` includes the reading with a given stamp."""

@@ -93,7 +93,7 @@ class LagBank:
             self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return ``u - L`` [K] and the variance `extra` of each lag at a stamp, u = `value`."""
+        """Return ``u - L`` [K], u = `value`, and the variance `extra` of each lag at a stamp."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra

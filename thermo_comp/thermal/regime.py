@@ -3,7 +3,7 @@
 """
 Owns the causal decision between static and dynamic regime; the only clock is the readings' stamps.
 
-The dynamic state *opens* when the rate of the leading sensor has left the baseline of the soak
+The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
 rate of any sensor is clearly that of a ramp. The dynamic state is *held* while any sensor's rate,
 now or predicted half a lag ahead, may exceed the relaxed rate: during the ramp, where the second
@@ -192,7 +192,7 @@ class _Watch:
         stamp = self._stamp_ns
         self._stamp_ns = stamp_ns
         if stamp is None or sd > relaxed:
-            self._mean = rate  # the rate is too uncertain to enter the mean rate
+            self._mean = rate  # restart the mean while the rate is too uncertain
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)

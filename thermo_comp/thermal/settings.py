@@ -17,7 +17,7 @@ CELL_SIGMAS: Final = (
 # Quantum / noise sd above which noise never moves a reading: 6 sd of the difference of two
 # readings.
 WIDE_CELL_SIGMAS: Final = 8.5
-# Hysteresis of the dynamic state: rate that opens the state / relaxed rate, which ends it.
+# Hysteresis of the dynamic state: rate that begins the state / relaxed rate, which ends it.
 OBVIOUS_SHARE: Final = 1.5
 #: Advised span of the board temperature over all bags of a unit's thermal test [K].
 ADVISED_SPAN_K: Final = 25.0

@@ -58,7 +58,7 @@ class Thermometer:
     start; `n_restarts`: number of starts after a gap or a step; `is_ready`: two readings exist, so
     that a rate is known. `measured` and its variance: the last reading, or for a sensor with cells
     the equivalent Gaussian measurement (infinite variance: no information). `bending`: probability
-    of the bending mode.
+    of the bending mode, in which the acceleration changes.
     """
 
     def __init__(self, settings: ThermometerSettings) -> None:

@@ -7,8 +7,8 @@ A column is ``phi = u t^power (1 | 1 - w | w)``, with u the value of its kind (`
 board temperature from the reference, and w the weight of the dynamic regime. u is held at the
 edges of the column's range, and t at the edges of the calibrated temperatures. Beyond the
 calibrated temperatures the curves continue along their tangents, but the powers of t are constant.
-With power p the tangent of a product would be u p t^(p - 1), and no recording determines how a
-coefficient that changes with temperature continues.
+Along a tangent ``u t^p`` would have the slope ``u p t^(p - 1)``, but no recording determines how a
+coefficient that changes with temperature continues beyond the calibrated temperatures.
 
 Each group of the bank has the columns of the kind with the same name, except these groups:
 *product* has the kind board, and *gradient_x_temperature* the kinds gradient and gradient_lag,

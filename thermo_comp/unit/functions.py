@@ -300,6 +300,6 @@ def in_order(values: Floats, axis: int) -> Floats:
     values = np.ascontiguousarray(values)
     if not values.shape[axis] or math.prod(values.shape[axis + 1 :]) > 1:
         return np.asarray(values.sum(axis=axis))
-    # Along the innermost axis the order of numpy's sum depends on the length.
+    # Along the innermost axis numpy's `sum` adds in an order that depends on the length.
     total: Floats = np.add.accumulate(values, axis=axis).take(-1, axis)
     return total
