@@ -371,8 +371,8 @@ def _norm_evidence(
     regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
-    Return the log evidence of the mean norms of the mountings for each of k values of `offset_sd`,
-    the sd of the offsets of mountings.
+    Return the log evidence of the mean norms of the mountings for k values of the sd of mounting
+    offsets, shape (k,).
 
     `by_drifts`: root of the covariance without the norms, for the thermal weights
     """

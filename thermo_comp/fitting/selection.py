@@ -246,8 +246,8 @@ class Growth:
 def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose by left-out data between fits begun with a small and with a large prior sd of mounting
-    offsets. If neither fit is better, that with the large sd is chosen only if its log density is
-    larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the norms of few positions
+    offsets. If left-out data do not decide, the fit begun with the large sd is chosen only if its
+    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the norms of few positions
     equally well, but only misalignments predict the norm of another position.
     """
     small, large = fits[0], fits[-1]
@@ -327,7 +327,7 @@ def _grown(
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
         # A change of slope of a part is visible only in a model with the lag of this part, not in
         # a model whose products and squares approximate the lag. Further groups are added to a
-        # model with bends if its drift is less than three times that of the chosen model.
+        # model with bends if its left-out error is below three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
             last, tried = growth.added(with_bends[0], progress)
