@@ -247,8 +247,8 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose by left-out data between fits begun with a small and with a large prior sd of mounting
     offsets. If left-out data do not decide, the fit begun with the large sd is chosen only if its
-    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the norms of few positions
-    equally well, but only misalignments predict the norm of another position.
+    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the norms of
+    few positions equally well, but only misalignments predict the norm of another position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
