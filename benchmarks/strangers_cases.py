@@ -26,9 +26,11 @@ from strangers_units import (
     Unit,
     program,
     record,
+    rests_of,
     rng_of,
     signed,
     spread,
+    turned,
 )
 
 #: Programs of the chamber: start [degC], soak [min], then target [degC], rate [K/min], soak [min].
@@ -252,6 +254,28 @@ def mems(number: int) -> Iterator[Study]:
             yield Study(f'{n} at {sd / 1000:g} mg', fit, one_test(held), {'full_scale': 32767.0})
 
 
+def sessions(number: int) -> Iterator[Study]:
+    """
+    Turn a MEMS unit by hand every 8 min in one and in two recordings, each with a turn-on of 0.3
+    mg, fitted jointly or, the second recording, with the first as a prior.
+    """
+    rng, hold_s, rate_hz = rng_of('sessions', number), 480.0, 10.0
+    unit, up = consumer_grade(rng), spread(12, rng)
+    n = int(WARM[-1, 0] * rate_hz)
+    bags = tuple(
+        record(unit, WARM, turned(rng.permutation(up), hold_s, n, rate_hz, rng), rng, name=name,
+               rate_hz=rate_hz, shift=300.0 * rng.standard_normal(3))
+        for name in ('one', 'two')
+    )  # fmt: skip
+    shifts = 300.0 * rng.standard_normal((4, 3))
+    held = one_test(positions(unit, WARM_HELD, spread(4, rng), rng, shifts, rate_hz=rate_hz))
+    one, two = (rests_of(bag, hold_s) for bag in bags)
+    options = {'full_scale': 32767.0}
+    yield Study('one', bags[:1], held, options, baseline_bags=one)
+    yield Study('two', bags, held, options, baseline_bags=one + two)
+    yield Study('update', bags[1:], held, options, prior_of='one')
+
+
 def ageing(number: int) -> Iterator[Study]:
     """Let the bias walk by 12 ug from bag to bag, beside a turn-on of 15 ug."""
     rng = rng_of('ageing', number)
@@ -455,6 +479,7 @@ CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'soaks': (soaks, 6),
     'turn-on': (turn_on, 8),
     'mems': (mems, 8),
+    'sessions': (sessions, 6),
     'ageing': (ageing, 3),
     'kink': (kink, 3),
     'gradient': (gradient, 3),

@@ -126,6 +126,11 @@ LIMITS = {
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
     'mems': _TURN_ON,
+    # One recording does not show how well turn-ons repeat.
+    'sessions one': Limit(high=np.inf),
+    'sessions two': Limit(low=0.7, high=1.4),
+    # An update has the error of the joint fit, within the noise of the sd of turn-ons.
+    'sessions update': Limit(than='two', times=1.05),
     'ageing': Limit(),
     'kink': Limit(norm=12.0),
     'gradient': Limit(norm=12.0),

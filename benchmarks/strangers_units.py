@@ -265,8 +265,8 @@ def record(
         The unit.
     corners : ndarray, shape (n, 2)
         The chamber's program [s, degC].
-    up : ndarray, shape (3,)
-        Direction of the specific force in the unit's frame.
+    up : ndarray, shape (3,) or (n, 3)
+        Direction of the specific force in the unit's frame, of the recording or of each sample.
     rng : Generator
         Random numbers of the chamber and of the noise.
     name : str
@@ -332,6 +332,35 @@ def record(
         value = np.interp(read, grid, node) + unit.reading_sd * rng.standard_normal(len(read))
         temperatures[sensor] = read, np.round(value / unit.reading_step) * unit.reading_step
     return Bag(name, stamps, samples, temperatures, force)
+
+
+def turned(up: Floats, hold_s: float, n: int, rate_hz: float, rng: np.random.Generator) -> Floats:
+    """
+    Return the direction of the specific force of n samples, shape (n, 3): each attitude of `up`
+    in turn for `hold_s`, of which the last 6 s are a turn by hand to the next attitude.
+    """
+    time_s = (np.arange(n) + 0.5) / rate_hz
+    place = (time_s // hold_s).astype(int)
+    share = np.clip((time_s - (place + 1) * hold_s) / 6.0 + 1.0, 0.0, 1.0)[:, None]
+    share = share**2 * (3.0 - 2.0 * share)
+    path = up[place % len(up)] * (1.0 - share) + up[(place + 1) % len(up)] * share
+    path = path + 4e-3 * share * (1.0 - share) * rng.standard_normal((n, 3))
+    return np.asarray(path / np.linalg.norm(path, axis=1)[:, None])
+
+
+def rests_of(bag: Bag, hold_s: float) -> tuple[Bag, ...]:
+    """Cut the rests out of a recording that is turned every `hold_s`, each as a bag."""
+    result = []
+    for begin_s in np.arange(0.0, bag.time_s.max(initial=0.0) - hold_s, hold_s):
+        assert bag.force is not None
+        rows = (bag.time_s > begin_s) & (bag.time_s < begin_s + hold_s - 8.0)
+        temperatures = {
+            name: (time_s[time_s > begin_s - 60.0] - begin_s, celsius[time_s > begin_s - 60.0])
+            for name, (time_s, celsius) in bag.temperatures.items()
+        }
+        rest = bag.time_s[rows] - begin_s, bag.samples[rows], temperatures, bag.force[rows]
+        result.append(Bag(f'{bag.name} at {begin_s:g} s', *rest))
+    return tuple(result)
 
 
 def flicker_noise(n: int, interval_s: float, floor: float, rng: np.random.Generator) -> Floats:
