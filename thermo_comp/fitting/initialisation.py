@@ -300,7 +300,7 @@ def _typical_slopes(steepness: float, steepest: Floats, options: FitOptions) -> 
 def _steepness(
     windows: ThermalWindows, start: ConstantCalibration, options: FitOptions, *, is_at_rest: bool
 ) -> float:
-    """Return the RMS change of the readings per kelvin, as of the bias alone [m/s^2 per K]."""
+    """Return the RMS change of the readings per kelvin, as if the bias alone changed [m/s^2]."""
     data = windows.data
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())

@@ -30,7 +30,10 @@ from .windows import Model, Sets
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """Return the response's columns; raises FitError if a term acts in one regime (version 1)."""
+    """
+    Return the columns of the response; raises FitError if a term acts in one regime alone, as in
+    files of format version 1.
+    """
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
