@@ -35,11 +35,11 @@ from .regression import Posterior, Regression
 from .unknowns import InformativePrior, Prior, State
 from .windows import CURVE, LAGS, PART
 
-#: Largest usual sd of the offsets of mountings within a turn-on, of turn-ons, and of mountings
-#: that each have their own turn-on, relative to `Prior.offset_scale`. By data sheets, turn-ons
-#: of tactical triads repeat within 0.3 to 1 mg, those of MEMS within some mg: 10 to 20 times that
-#: scale. The factors 2 and 5 of turn-ons are a compromise between data sheets and units whose
-#: turn-ons repeat perfectly.
+#: Largest usual sd of the offsets of mountings within a turn-on, of a single turn-on, and of
+#: several turn-ons or of mountings that each have their own turn-on, relative to
+#: `Prior.offset_scale`. By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg,
+#: those of MEMS within some mg: 10 to 20 times that scale. The factors 2 and 5 of turn-ons are a
+#: compromise between data sheets and units whose turn-ons repeat perfectly.
 LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
