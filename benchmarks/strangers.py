@@ -202,10 +202,13 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     }
     # Switch off two checks of the node, because the samples are constant and |f| is 0.
     config = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
-    out = corrected(calibration, Bag('zero', time_s, zero, temperatures), config)
-    # The samples have no noise, so the white noise is subtracted from the claimed variance.
+    bag = Bag('zero', time_s, zero, temperatures)
+    out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    sd = np.sqrt(np.maximum(np.diag(out.claim[-1]) - out.white, 0.0))
+    # The mean over half an hour has little noise of the thermometers, which is in the claim of a
+    # sample: subtract the claim of a calibration with the same parameters without errors.
+    exact = corrected(replace(calibration, posterior=None), bag, config)
+    sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
         vector=float(np.linalg.norm(error)) / UG,
         ratio=rms(error / sd),

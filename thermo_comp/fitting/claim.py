@@ -159,7 +159,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     # within one turn-on repeat better.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
     # The grid of the sd has steps of a third of a decade: the log evidence is smooth over a step.
-    ratio = 10.0 ** np.linspace(-2.5, 2.25, 16)
+    ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     small = np.minimum(np.log(ratio / least), 0.0)
     return scale * ratio, _student(ratio / LARGEST_USUAL[kind]) + small
 

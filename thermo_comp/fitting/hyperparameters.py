@@ -198,8 +198,8 @@ def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, fl
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, sd, slope, bend + 0.1)
-    # Bounds of the offset sd [m/s^2]: 1/1000 of the prior's scale; 5 mg, as of the cheapest MEMS.
-    new = float(np.clip(sd * np.exp(step), 1e-3 * scale, 0.05))
+    # Bounds of the offset sd [m/s^2]: 1e-4 of the prior's scale; 5 mg, as of the cheapest MEMS.
+    new = float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
     return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
 
 
