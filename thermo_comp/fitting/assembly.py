@@ -26,7 +26,7 @@ from ..unit.calibration import (
 from ..unit.columns import Column
 from ..unit.nonlinearity import Kind, Nonlinearity
 from ..unit.posterior import posterior_of
-from ..unit.provenance import Provenance, ResidualSummary, Source
+from ..unit.provenance import Provenance, ResidualSummary
 from .claim import Claim
 from .data_checks import Finding
 from .equations import as_vector
@@ -187,9 +187,7 @@ def _provenance(
         tested=_date_text(tested) if is_date else '',
         tool_version=__version__,
         model=fit.windows.model.name,
-        sources=tuple(
-            Source(bag.source.name, bag.source.sha256 or '', bag.n_samples) for bag in bags
-        ),
+        sources=tuple(source for bag in bags for source in bag.sources),
         residuals=tuple(
             ResidualSummary(
                 section=row.section,

@@ -38,6 +38,7 @@ from .evidence import PositionReport, ResidualRow, position_reports, residual_ro
 from .gyroscope import RateRow, add_gyroscope
 from .initial_triad import within_positions
 from .initialisation import Problem, initial_triad
+from .joining import joined
 from .missing_readings import judge_missing
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
@@ -105,7 +106,7 @@ def fit_bags(
     """Fit a calibration to reduced bags; raises FitError if the bags contradict themselves."""
     # The fit multiplies many small matrices, and threads would only slow these products down.
     with threadpool_limits(1, 'blas'):
-        return _fit_about_offset(bags, options, progress)
+        return _fit_about_offset(joined(bags), options, progress)
 
 
 def _fit_about_offset(

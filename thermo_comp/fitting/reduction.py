@@ -30,6 +30,7 @@ from ..recording.stillness import CellAccumulator, Cells
 from ..thermal.plausibility import CONTINUED_SHARE
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..typing import Bools, Floats, Ints
+from ..unit.provenance import Source
 from .coverage import best_rests, directions, distinct_directions, rough_centre
 from .initial_triad import block_means
 from .sources import FitSource, angular_velocity
@@ -87,6 +88,7 @@ class ReducedBag:
     n_spikes: number of readings of each thermometer that are spikes, see `is_spike`
     n_glitches: number of single samples far from their neighbours, which are left out
     n_repeated: number of dropped samples that have the stamp of the sample before
+    parts: the bags of a recording that consists of several bags, see `joining`
     """
 
     source: FitSource
@@ -111,6 +113,13 @@ class ReducedBag:
     n_spikes: Mapping[str, int] = field(default_factory=dict)
     n_glitches: int = 0
     n_repeated: int = 0
+    parts: tuple[Source, ...] = ()
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """The bags of this recording, as a calibration states them."""
+        name, sha256 = self.source.name, self.source.sha256 or ''
+        return self.parts or (Source(name, sha256, self.n_samples),)
 
     @property
     def board(self) -> Readings:
@@ -231,7 +240,7 @@ def _reduced(
     bag = ReducedBag(
         source=source,
         start_ns=cells.start_ns,
-        end_ns=cells.start_ns + (round(cells.time[-1] * 1e9) if len(cells.time) else 0),
+        end_ns=cells.end_ns,
         intervals=tuple(
             _windows(cells, *edges, size, reading.has_rate)
             for edges, size in zip(ranges, sizes, strict=True)

@@ -59,7 +59,6 @@ class Windows:
     undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,), or None if the
         fit estimates them
     acts_on: axes that each column acts on, shape (m, 3); None for all
-    turn_on: number of the turn-on of each bag, (n_bags,), or None if each bag is a turn-on
     pose: number of the pose to which the unit was returned in each position, -1 for none, shape
         (n_positions,), or None if the unit was not returned
     has_prior: whether a prior calibration states the unit's parameters
@@ -82,7 +81,6 @@ class Windows:
     forces: Forces | None = None
     undisturbed: Floats | None = None
     acts_on: Bools | None = None
-    turn_on: Ints | None = None
     pose: Ints | None = None
     has_prior: bool = False
 
@@ -118,25 +116,19 @@ class Windows:
         """
         Number of the mounting of each position, from 0, shape (n_positions,).
 
-        Successive positions of a turn-on whose readings differ by less than 2 degrees are rests of
-        one mounting, which a knock, a gap or the end of a bag interrupted.
+        Successive positions of a bag whose readings differ by less than 2 degrees are rests of one
+        mounting, which a knock or a gap interrupted.
         """
-        first, turn_on = self.edges[:-1], self.turn_on_of_position
+        first, bag = self.edges[:-1], self.bag_of_position
         means = np.add.reduceat(self.mean, first, axis=0) / np.diff(self.edges)[:, None]
         step, size = np.linalg.norm(np.diff(means, axis=0), axis=1), np.linalg.norm(means, axis=1)
-        is_new = (turn_on[1:] != turn_on[:-1]) | (step >= math.radians(2.0) * size[1:])
+        is_new = (bag[1:] != bag[:-1]) | (step >= math.radians(2.0) * size[1:])
         return np.concatenate(([0], np.cumsum(is_new)))
 
     @property
     def bag_of_position(self) -> Ints:
         """Bag of each position."""
         return self.bag[self.edges[:-1]]
-
-    @property
-    def turn_on_of_position(self) -> Ints:
-        """Turn-on of each position."""
-        bag = self.bag_of_position
-        return bag if self.turn_on is None else self.turn_on[bag]
 
     @property
     def n_poses(self) -> int:
@@ -146,7 +138,7 @@ class Windows:
     @property
     def n_turn_ons(self) -> int:
         """Number of turn-ons."""
-        return len(np.unique(self.turn_on_of_position))
+        return len(np.unique(self.bag))
 
     @cached_property
     def has_turn_ons(self) -> bool:

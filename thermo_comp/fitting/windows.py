@@ -40,8 +40,6 @@ PART_SUMS = ('board', 'product', 'square')
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Smallest number of windows of a short rest: fewer windows do not determine the rest's noise.
 FEWEST_WINDOWS = 20
-#: Longest gap between two bags of one recording [s]; switching a unit off and on takes longer.
-CONTINUED_S = 3.0
 #: Number of sections of equal length into which a position is divided. The bags repeat the
 #: chamber's program, so a section is the same part of the program in all positions.
 N_SECTIONS = 6
@@ -240,7 +238,7 @@ def thermal_windows(
     position, bag_of = np.repeat(np.arange(len(parts)), sizes), np.repeat(numbers, sizes)
     temperature, rate, weight, gradient = rows.thermal[:, :4].T
     return ThermalWindows(
-        *(model, replace(_windows(model, spec, rows, position, bag_of), turn_on=_turn_ons(bags))),
+        *(model, _windows(model, spec, rows, position, bag_of)),
         *(temperature, rate, weight, gradient),
         raw=rows.thermal[:, 4:],
         angular_rate=rows.angular_rate,
@@ -248,20 +246,6 @@ def thermal_windows(
         rests=tuple(rests),
         tracks=tuple(tracks),
     )
-
-
-def _turn_ons(bags: Sequence[ReducedBag]) -> Ints:
-    """
-    Return the number of each bag's turn-on, shape (n_bags,): a bag that begins where another bag
-    ends, as in a split recording, continues the turn-on of that bag.
-    """
-    result = np.arange(len(bags))
-    for number in sorted(range(len(bags)), key=lambda number: bags[number].start_ns):
-        gaps_s = [1e-9 * (bags[number].start_ns - other.end_ns) for other in bags]
-        nearest = int(np.argmin(np.abs(gaps_s)))
-        if nearest != number and abs(gaps_s[nearest]) < CONTINUED_S:
-            result[number] = result[nearest]
-    return result
 
 
 def _rows(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import RecordingError
+from ..fitting.joining import joined
 from ..fitting.known_force import USUAL_FORCE, ForceOptions
 from ..fitting.options import COUNTS_FULL_SCALE
 from ..fitting.reduction import ReducedBag, reduce_source
@@ -83,7 +84,7 @@ def open_bags(
         if 'board' in require and not len(bag.board.value):
             raise RecordingError('no board temperature in it', path=str(path))
         bags.append(bag)
-    return bags
+    return joined(bags)
 
 
 def judge_bags(
@@ -97,7 +98,7 @@ def judge_bags(
     """Judge a calibration on reduced bags; return None if no window was corrected."""
     windows = corrected_windows(bags, calibration, gravity=gravity, window_s=window_s)
     known = {source.sha256 for source in calibration.provenance.sources if source.sha256}
-    is_seen = all(bag.source.sha256 in known for bag in bags)
+    is_seen = all(source.sha256 in known for bag in bags for source in bag.sources)
     return judge(windows, calibration, tolerance, is_seen=is_seen) if len(windows) else None
 
 
@@ -144,8 +145,8 @@ def evaluate(
         judgements[name] = judgement
     judged = set(next(iter(judgements.values())).windows.bag.tolist())
     notes = tuple(
-        f'{path}: no window of {window_s:g} s at rest was corrected: not judged'
-        for number, path in enumerate(paths)
+        f'{bag.info.path}: no window of {window_s:g} s at rest was corrected: not judged'
+        for number, bag in enumerate(bags)
         if number not in judged
     )
     return Evaluation(tuple(bags), judgements, notes)

@@ -217,7 +217,9 @@ def _table(
             n = rest.n_whole // per * per
             rows = np.zeros(n, kind)
             rows['bag'], rows['position'] = number, n_positions
-            begin_s = rest.begin_s + bag.window_s * np.arange(n)
+            # In a recording of several bags the grid of the windows shifts where a bag ends.
+            number_of = np.rint((rest.time[:n] - rest.begin_s) / bag.window_s - 0.5)
+            begin_s = rest.begin_s + bag.window_s * number_of
             rows['start_ns'] = bag.start_ns + np.rint(begin_s * 1e9).astype(np.int64)
             rows['count'], rows['time'] = rest.count[:n], rest.time[:n]
             rows['mean'] = rest.mean[:n]

@@ -55,7 +55,8 @@ _STUCK = 0.3  # ratio of noise to quantum below which a sensor mostly repeats on
 class Cells:
     """
     Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
-    `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
+    `start_ns` and `end_ns` are the stamps of the first and last sample; `time` is the mean since
+    `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
     `is_glitch`. `n_repeated` counts the samples with the stamp of the sample before. `quantum` is
     the samples' step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in
@@ -65,6 +66,7 @@ class Cells:
     """
 
     start_ns: int
+    end_ns: int
     cell_s: float
     n_dropped: int
     n_saturated: int
@@ -175,8 +177,8 @@ class CellAccumulator:
         )
         cell_s = self._cell_ns * 1e-9
         return Cells(
-            *(self._start_ns, cell_s, self._n_dropped, self._n_saturated, self._n_glitches),
-            self._n_repeated,
+            *(self._start_ns, self._last_ns or self._start_ns, cell_s),
+            *(self._n_dropped, self._n_saturated, self._n_glitches, self._n_repeated),
             *(self._is_integer, self._quantum, self._middle),
             *(sums[:, 2] / count + index * cell_s, count.astype(np.int64), index),
             *(mean[:, :3] + self._shift, variance[:, :3], sums[:, -3:] / pairs),

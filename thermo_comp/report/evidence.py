@@ -84,7 +84,8 @@ class Evidence:
     def is_seen(self) -> bool:
         """Whether the calibration was fitted on a bag of this evidence."""
         known = {source.sha256 for source in self.sources if source.sha256}
-        return bool(self.steps) or any(bag.source.sha256 in known for bag in self.bags)
+        shown = {source.sha256 for bag in self.bags for source in bag.sources}
+        return bool(self.steps) or not known.isdisjoint(shown)
 
     @property
     def is_simulated(self) -> bool:

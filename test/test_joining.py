@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of a split recording: the fit and the judge take them as the whole recording."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import ArrayBlock
+
+import thermo_comp
+from thermo_comp.fitting import FitSource
+from thermo_comp.fitting.joining import joined
+from thermo_comp.fitting.known_force import KnownForce, parse_sections
+from thermo_comp.fitting.reduction import reduce_source
+from thermo_comp.fitting.sources import digest
+from thermo_comp.judging.evaluation import evaluate
+from thermo_comp.recording.topics import Topics
+from thermo_comp.recording.writer import BagWriter
+from thermo_comp.unit.gravity import MICRO_G
+
+ROOT = Path(__file__).resolve().parent.parent
+START_NS = 1_700_000_000_123_456_789
+RATE_HZ = 100
+LEVEL = np.array([10.0, -3000.0, 50.0])  # counts
+DRIFT = np.array([1.0, 0.0, 0.5]) / 30.0  # counts per second
+NOISE = 0.3  # white noise of a sample [counts]
+
+
+def recorded(rng, seconds):
+    """Record a rest in which the bias drifts by `DRIFT`, with two thermometers."""
+    time_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    accel = LEVEL + np.outer(time_s, DRIFT)
+    accel += NOISE * rng.standard_normal(accel.shape)
+    read_s = np.arange(0.0, seconds, 0.9)
+    celsius = 20.0 + read_s / 60.0
+    stamps = [START_NS + np.round(1e9 * seconds).astype(np.int64) for seconds in (time_s, read_s)]
+    return ArrayBlock(stamps[0], accel, stamps[1], celsius, stamps[1], celsius + 1.0)
+
+
+def cut(whole, edges_s, pause_s=0.0):
+    """Cut a block at times [s]; each part begins `pause_s` later than the previous part ended."""
+    edges = [START_NS, *(START_NS + round(1e9 * edge) for edge in edges_s), 2 * START_NS]
+    parts = []
+    for number, (begin, end) in enumerate(pairwise(edges)):
+        accel, board = (
+            (stamps >= begin) & (stamps < end)
+            for stamps in (whole.accel_stamp_ns, whole.board_stamp_ns)
+        )
+        later = round(1e9 * number * pause_s)
+        parts.append(
+            ArrayBlock(
+                whole.accel_stamp_ns[accel] + later, whole.accel[accel],
+                whole.board_stamp_ns[board] + later, whole.board[board],
+                whole.case_stamp_ns[board] + later, whole.case[board],
+            )
+        )  # fmt: skip
+    return parts
+
+
+def reduced(blocks, **keys):
+    return [
+        reduce_source(FitSource(f'part{k}', lambda b=block: [b], **keys), full_scale=32767.0)
+        for k, block in enumerate(blocks)
+    ]
+
+
+@pytest.mark.parametrize('edges_s', [(200.0,), (123.4, 250.7, 377.0)])
+def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
+    whole = recorded(rng, 600.0)
+    (bag,) = reduced([whole])
+    (rest,) = bag.intervals
+    # The order in which the parts are given does not matter.
+    (again,) = joined(reduced(cut(whole, edges_s))[::-1])
+    (continued,) = again.intervals
+    assert (again.start_ns, again.end_ns) == (bag.start_ns, bag.end_ns)
+    assert again.n_samples == bag.n_samples
+    assert sorted(source.name for source in again.sources) == [
+        f'part{k}' for k in range(len(edges_s) + 1)
+    ]
+    for name in ('board', 'case'):
+        np.testing.assert_array_equal(getattr(again, name).stamp_ns, getattr(bag, name).stamp_ns)
+        np.testing.assert_array_equal(getattr(again, name).value, getattr(bag, name).value)
+    # At the end of each part less than a window of 10 s is lost, and one window has few samples.
+    n_lost = rest.count.sum() - continued.count.sum()
+    assert 0.0 <= n_lost <= 10.0 * RATE_HZ * len(edges_s)
+    assert np.all(np.diff(continued.time) > 0.0)
+    # Each window is on the line of the drift, within five sd of its own noise.
+    line = LEVEL + np.outer(continued.time, DRIFT)
+    sd = NOISE / np.sqrt(continued.count)[:, None]
+    assert np.abs((continued.mean - line) / sd).max() < 5.0
+    np.testing.assert_allclose(continued.sample_sd, NOISE, rtol=0.05)
+
+
+def test_a_unit_that_was_moved_between_two_parts_has_two_rests(rng):
+    whole = recorded(rng, 600.0)
+    before, after = cut(whole, (300.0,))
+    moved = replace(after, accel=after.accel + np.array([0.0, 1.0, 0.0]))
+    (bag,) = joined(reduced([before, moved]))
+    first, second = bag.intervals
+    assert first.time[-1] < 300.0 < second.time[0]
+
+
+def test_other_recordings_are_not_joined(rng):
+    whole = recorded(rng, 400.0)
+    assert len(joined(reduced(cut(whole, (200.0,), pause_s=1.0)))) == 1
+    # Within 60 s a unit may have been switched off and on.
+    assert len(joined(reduced(cut(whole, (200.0,), pause_s=60.0)))) == 2
+    known = KnownForce('part', parse_sections('0 400 2.0'))
+    assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
+    before, after = cut(whole, (200.0,))
+    assert len(joined(reduced([before], serial='a') + reduced([after], serial='b'))) == 2
+
+
+@pytest.fixture(scope='module')
+def tests():
+    """Two of the sample bags, and each of them cut into parts of half an hour."""
+    columns = [thermo_comp.read(ROOT / f'bags/fit/0{number}.mcap') for number in (1, 5)]
+    parts = []
+    for whole in columns:
+        slots = (np.concatenate((whole.time_s, [0.0])) // 1800.0).astype(int)
+        for slot in np.unique(slots[:-1]):
+            use = slots[:-1] == slot
+            readings = {}
+            for name, (time_s, celsius) in whole.temperatures.items():
+                inside = time_s // 1800.0 == slot
+                readings[name] = time_s[inside], celsius[inside]
+            parts.append(
+                replace(
+                    whole, time_s=whole.time_s[use], counts=whole.counts[use],
+                    temperatures=readings, name=f'{whole.name}-{slot}',
+                )
+            )  # fmt: skip
+    return columns, parts
+
+
+def test_a_split_recording_gives_the_calibration_of_the_whole_recording(tests):
+    # WHY: each part had its own turn-on, rests and initial lag states. Eighteen recordings of 9 h,
+    # split hourly, took 30 times as long to fit, and the claimed sd was 6 times as large.
+    columns, parts = tests
+    whole, split = (thermo_comp.fit(bags, gravity=9.80665) for bags in tests)
+    assert len(split.provenance.sources) == len(parts)
+    for bag in columns:
+        forces = [
+            unit.correct(bag.time_s, bag.counts, **bag.temperatures).specific_force
+            for unit in (whole, split)
+        ]
+        difference = forces[1] - forces[0]
+        # Half a minute is lost at the end of each part: the drifts differ by less than the noise
+        # of a mean over a minute, 1.2 ug.
+        assert np.nanstd(difference, axis=0).max() < 1.2 * MICRO_G
+
+
+def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng):
+    paths, topics = [], Topics()
+    for number, part in enumerate(cut(recorded(rng, 900.0), (450.0,))):
+        paths.append(tmp_path / f'part{number}.mcap')
+        with BagWriter(paths[-1], metadata={'serial': 'U1'}) as writer:
+            writer.write_temperature(topics.board, part.board_stamp_ns, part.board)
+            writer.write_temperature(topics.case, part.case_stamp_ns, part.case)
+            writer.write_counts(topics.counts, part.accel_stamp_ns, part.accel)
+    calibration = thermo_comp.fit(paths, gravity=9.80665)
+    assert [source.sha256 for source in calibration.provenance.sources] == list(map(digest, paths))
+    result = evaluate(paths, [('unit', calibration)])
+    (bag,) = result.bags
+    assert bag.source.name == 'part0.mcap .. part1.mcap'
+    # 900 s hold 15 windows of 60 s, of which two may be lost around the end of the first part.
+    assert len(result.judgements['unit'].windows) >= 13

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the joining of bags that are successive parts of one recording, which a recorder split.
+
+The unit stays switched on from one part to the next, so the parts share a turn-on, the lags
+continue, and a rest in which a part ends continues in the next part.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..recording.blocks import Block
+from .reduction import Readings, ReducedBag, StillInterval
+from .sources import FitSource
+
+#: Longest gap between two parts of one recording [s]; switching a unit off and on takes longer.
+CONTINUED_S = 3.0
+#: Number of windows before and after the end of a part that are compared with the step between.
+_N_COMPARED = 20
+#: Largest relative difference of the intervals between samples, or of the windows, of two parts.
+_SAME_INTERVAL = 0.01
+
+
+def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
+    """Join each bag that begins where another bag ends with that bag; keep the order."""
+    recordings: list[list[ReducedBag]] = []
+    for bag in sorted(bags, key=lambda bag: bag.start_ns):
+        for recording in recordings:
+            if _continues(recording[-1], bag):
+                recording.append(bag)
+                break
+        else:
+            recordings.append([bag])
+    number = {id(bag): k for k, bag in enumerate(bags)}
+    recordings.sort(key=lambda recording: min(number[id(bag)] for bag in recording))
+    return [_whole(parts) if len(parts) > 1 else parts[0] for parts in recordings]
+
+
+def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
+    """Whether a bag is the next part of a recording."""
+    gap_s = 1e-9 * (bag.start_ns - part.end_ns)
+    is_alike = _is_alike(part.cycle_s, bag.cycle_s)
+    # Sections of known |f| are stated from the start of their own bag.
+    is_at_1g = bag.source.force is None and part.source.force is None
+    is_of_unit = bag.source.serial == part.source.serial
+    is_next = abs(gap_s) < max(CONTINUED_S, 2.0 * bag.cycle_s)
+    return bool(is_next and is_alike and is_at_1g and is_of_unit)
+
+
+def _is_alike(before_s: float, after_s: float) -> bool:
+    return abs(after_s - before_s) < _SAME_INTERVAL * before_s
+
+
+def _whole(parts: Sequence[ReducedBag]) -> ReducedBag:
+    """Return the recording of successive parts."""
+    first, last = parts[0], parts[-1]
+    sources = [part.source for part in parts]
+
+    def blocks() -> Iterator[Block]:
+        for source in sources:
+            yield from source.blocks()
+
+    def total(name: str) -> int:
+        return sum(getattr(part, name) for part in parts)
+
+    source = FitSource(
+        f'{sources[0].name} .. {sources[-1].name}',
+        blocks,
+        serial=next((source.serial for source in sources if source.serial), None),
+        reader=sources[-1].reader,
+    )
+    rates = {part.angular_rate for part in parts}
+    torn = [part.info.truncated for part in parts if part.info.truncated]
+    return replace(
+        first,
+        source=source,
+        parts=tuple(source for part in parts for source in part.sources),
+        end_ns=last.end_ns,
+        intervals=_intervals(parts),
+        temperatures={
+            name: _readings([part.temperatures.get(name, Readings()) for part in parts])
+            for name in dict.fromkeys(name for part in parts for name in part.temperatures)
+        },
+        n_samples=total('n_samples'),
+        n_dropped=total('n_dropped'),
+        n_saturated=total('n_saturated'),
+        n_cells=total('n_cells'),
+        n_still_cells=total('n_still_cells'),
+        n_glitches=total('n_glitches'),
+        n_repeated=total('n_repeated'),
+        n_spikes=sum((Counter(part.n_spikes) for part in parts), Counter()),
+        is_integer=all(part.is_integer for part in parts),
+        middle=max(part.middle for part in parts),
+        max_abs=max(part.max_abs for part in parts),
+        angular_rate=rates.pop() if len(rates) == 1 else 'part',
+        info=replace(first.info, end_ns=last.info.end_ns, truncated='; '.join(torn) or None),
+    )
+
+
+def _readings(parts: Sequence[Readings]) -> Readings:
+    """Concatenate the readings of a thermometer; keep readings with rising stamps."""
+    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
+    value = np.concatenate([part.value for part in parts])
+    newest = np.maximum.accumulate(stamp_ns)
+    use = np.diff(newest, prepend=newest[:1] - 1) > 0
+    return Readings(stamp_ns[use], value[use])
+
+
+def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
+    """Return the rests of all parts, with times since the start of the first part."""
+    result: list[StillInterval] = []
+    for part in parts:
+        shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
+        is_alike = _is_alike(parts[0].window_s, part.window_s)
+        for number, rest in enumerate(part.intervals):
+            # Windows of a part that is so short that its windows are shorter are not whole.
+            n_whole = rest.n_whole if is_alike else 0
+            moved = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
+            is_first = bool(result) and number == 0
+            if is_first and _is_one_rest(result[-1], moved, part.window_s):
+                result[-1] = _continued(result[-1], moved)
+            else:
+                result.append(moved)
+    return tuple(result)
+
+
+def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
+    """
+    Whether a rest continues in the next part: at most three windows are missing, and the step
+    between the parts is at most five RMS of the steps from window to window, or, where most steps
+    are 0 by rounding, at most twice the largest of these steps.
+    """
+    gap_s = 1e-9 * (after.start_ns - before.end_ns)
+    means = before.mean[: before.n_whole][-_N_COMPARED:], after.mean[:_N_COMPARED]
+    steps = np.concatenate([np.diff(mean, axis=0) for mean in means])
+    if gap_s > 3.0 * window_s or not before.n_whole or len(steps) < _N_COMPARED // 2:
+        return False
+    usual = np.maximum(5.0 * np.sqrt(np.mean(steps**2, axis=0)), 2.0 * np.abs(steps).max(axis=0))
+    return bool(np.all(np.abs(means[1][0] - means[0][-1]) <= usual))
+
+
+def _continued(before: StillInterval, after: StillInterval) -> StillInterval:
+    """Join two parts of a rest; a last window of less than full length before the end is lost."""
+    is_whole = after.n_whole > 0 and len(before.time) <= before.n_whole + 1
+    use = slice(before.n_whole if is_whole else None)
+    rates = before.angular_rate, after.angular_rate
+    n = before.count[use].sum(), after.count.sum()
+    return replace(
+        before,
+        end_ns=after.end_ns,
+        n_whole=before.n_whole + after.n_whole * is_whole,
+        time=np.concatenate((before.time[use], after.time)),
+        count=np.concatenate((before.count[use], after.count)),
+        mean=np.concatenate((before.mean[use], after.mean)),
+        sample_sd=np.average([before.sample_sd, after.sample_sd], axis=0, weights=n),
+        angular_rate=None
+        if rates[0] is None or rates[1] is None
+        else np.concatenate((rates[0][use], rates[1])),
+    )
