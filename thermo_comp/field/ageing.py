@@ -261,7 +261,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centre of the priors; the turn-on sd is the fit's residual sd, or 1 Hz noise."""
+    """Return the centre of the priors, from the fit's residual sd or else the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -306,7 +306,7 @@ def learn(
 
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
-    """Choose the most probable change; None if no change has enough evidence."""
+    """Choose the most probable change, or None if no change has enough evidence."""
     best: dict[str, Change] = {}
     for change in candidates:
         if change.log_bayes_factor > _gain(best.get(change.kind)):
@@ -399,8 +399,8 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     """
     Condition the parameters of the calibration on the rests.
 
-    Derivatives of the file's parameters: `to_file` by the six levels, (n_parameters, 6); `bend` by
-    the bias slope of each axis, (n_parameters, 3). `ahead`: days of use after the last rest.
+    `to_file`, `bend`: derivatives of the file's parameters by the six levels, (n_parameters, 6),
+    and by the bias slope of each axis, (n_parameters, 3). `ahead`: days of use after the last rest
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

@@ -46,7 +46,7 @@ class Moved:
     bias: change of the bias at the temperature of the rests [m/s^2]
     scale: relative change of the scale
     curve: change of the bias curve over the temperatures of the rests [m/s^2]
-    reading: change by bias plus scale at the mean force of the rests [m/s^2]
+    reading: change of the reading by bias plus scale at the mean force of the rests [m/s^2]
     claimed_sd: sd of the reading that the old calibration claims [m/s^2]
     present_sd: sd of the reading with the old calibration at the last rest, with ageing [m/s^2]
     """
@@ -71,8 +71,8 @@ class Judged:
     Score of an update on left-out rests.
 
     over, n: kind of the folds, days or starts, and their number
-    before, after: RMS of ``|f| - g`` over each fold with the calibration, and with an update from
-        the earlier folds [m/s^2]
+    before, after: RMS of ``|f| - g`` over all folds with the calibration, and with an update from
+        the folds before each fold [m/s^2]
     gain, gain_sd: mean over the folds of the difference of the mean squares, and its standard
         error [m^2/s^4]
     """

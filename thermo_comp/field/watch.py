@@ -61,7 +61,7 @@ class Watch:
     days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
     week: rows of the days with rests in the last week
     recent: RMS over the last week divided by the limit, robust against one disturbed day
-    left: first day from which the unit stays outside its claim; None for a unit within its claim
+    left: first day from which the unit stays outside its claim, None for a unit within its claim
     back: first day after an earlier time outside the claim, for a unit within its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years
@@ -151,8 +151,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # For a unit within its claim, a last week above the limit ends with two days within the
-        # limit, so a day follows the last day outside.
+        # If the last week of a unit within its claim is above the limit, the last two days are
+        # within the limit, so a day follows the last day outside.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -242,7 +242,7 @@ def passage(
     The random walk begins at N(mean, covariance), (k,) and (k, k), and grows by `walk` (k, m)
     times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of the
     walk's variance. The time is 0 if the norm exceeds the bound at the beginning, else at least
-    0.01.
+    0.01 days.
     """
     rng = np.random.default_rng(1)
     # Directions with less than a thousandth of the largest error are left out.

@@ -5,9 +5,9 @@ Owns the exclusion of bags of another environment, and the error that is publish
 
 In still air the board temperature follows the case temperature by another law than in a chamber
 with a fan. The bias of a part without a thermometer depends on the environment, and no set of
-coefficients describes two environments. A bag of still air would increase the error in a chamber
-with a fan. The fit excludes a bag of another environment and publishes the error of its correction
-as a lack of fit.
+coefficients describes two environments. A fit that includes a bag of still air has a larger error
+in a chamber with a fan. The fit excludes a bag of another environment and publishes the error of
+its correction as a lack of fit.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def with_excluded_error(
 ) -> tuple[Calibration, Finding]:
     """
     Add the error of the correction of excluded bags to the lack of fit of both regimes; `others`
-    names the bags or the prior that these bags contradict.
+    names the bags or the prior that the excluded bags contradict.
     """
     windows = thermal_windows(bags, prior_model(calibration))
     regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)

@@ -104,7 +104,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Offsets of turn-ons are unknowns of their own, which misalignments need not explain.
+        # If turn-on offsets are unknowns, no misalignment explains them: no smaller sd is needed.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
@@ -234,9 +234,9 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
     # Bounds of the prior's scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer
-    # MEMS; the tail of the Student prior allows for more. The lower bound is smaller for almost no
-    # noise, because an offset 1e6 times as large as the noise cannot be estimated in double
-    # precision.
+    # MEMS; the tail of the Student prior allows for more. For almost no noise the lower bound of
+    # the prior's scale is below 30 ug, because an offset 1e6 times as large as the noise cannot be
+    # estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 

@@ -99,14 +99,14 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
 
 def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     """
-    Return the covariance of units from their distances to the mean / sqrt(n - 1), (n, p); `K`:
-    scale factors of the axes.
+    Return the covariance of n units from `deviations`, their distances to the mean / sqrt(n - 1),
+    shape (n, p); `K`: scale factors of the axes.
 
     The constants of a unit are taken as independent of each other and of the curves. With the
     correlations by chance between few units, one position would determine all constants. The
-    correlations of the curves are multiplied by 1 - share [1]_. A dynamic curve counts as its
-    difference from the static curve, because most units have one curve for both sets, and smaller
-    correlations between two equal curves would make them two different curves.
+    correlations of the curves are reduced by a share estimated from their scatter [1]_. A dynamic
+    curve counts as its difference from the static curve, because most units have one curve for
+    both sets, and smaller correlations between two equal curves would make the curves different.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):

@@ -45,8 +45,8 @@ class Whitener:
         lengths = np.diff(np.r_[starts, len(position)])
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
-        #: Window number of each step of each position; 0 for steps beyond the position's end.
         self._is_there = step < lengths
+        #: Window number of each step of each position; 0 for steps beyond the position's end.
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
         since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])

@@ -40,7 +40,7 @@ class Windows:
     """
     The data of a fit: windows sorted by position and time, with every column of the table.
 
-    position, bag: numbers from 0; a position lies in one bag, shape (n,)
+    position, bag: position and bag of each window, from 0; a position lies in one bag, shape (n,)
     section: number of the program section, from 0, rising with time in each bag, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: number of samples divided by that of a typical window, shape (n,)
