@@ -143,7 +143,7 @@ def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
 
 
 def _number(value: float) -> float:
-    # The limit 1e12 is far above any sample.
+    # A magnitude of 1e12 or more is damage: it is far above any sample.
     if not abs(value) < 1e12:
         raise ValueError(value)
     return float(value)

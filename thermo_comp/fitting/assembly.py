@@ -174,7 +174,7 @@ def _provenance(
     residuals: Sequence[ResidualRow],
     findings: Sequence[Finding],
 ) -> Provenance:
-    # The provenance states the left-out RMS of ``|f| - g`` only if all positions have one.
+    # A left-out RMS of ``|f| - g`` is stated only if the norm of each position was left out.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)

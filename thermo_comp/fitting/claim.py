@@ -7,7 +7,7 @@ do not determine, and by the effects that the model lacks.
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. The weight of a fit in the mixture is its
 evidence, limited by the evidence of the positions' norms, times a half-Student prior of the offset
-sd. The sd of gravity is added as an error of the same ratio in the scale factors of all axes.
+sd. The covariance includes the sd of gravity, as an error of the same ratio in all scale factors.
 `jackknife` adds the variance due to effects that the model lacks.
 
 References
@@ -38,8 +38,8 @@ from .windows import CURVE, LAGS, PART
 #: Largest usual sd of the offsets of mountings within a turn-on, of a single turn-on, and of
 #: several turn-ons or of mountings that each have their own turn-on, relative to
 #: `Prior.offset_scale`. By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg,
-#: those of MEMS within some mg: 10 to 20 times `Prior.offset_scale`. The limits of turn-ons, 2 and
-#: 5, are a compromise between data sheets and units whose turn-ons repeat perfectly.
+#: those of MEMS within some mg: 10 to 20 times `Prior.offset_scale`. The largest usual sd of
+#: turn-ons is a compromise between data sheets and units whose turn-ons repeat perfectly.
 LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
@@ -267,8 +267,8 @@ def _over_mountings(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
     """
-    Return covariance and offset sd of the mixture of fits over the mounting's sd, given values of
-    the sd and their log prior density, (k,).
+    Return covariance and offset sd of the mixture of fits over the sd of mounting offsets, given
+    values of this sd and their log prior density, (k,).
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)

@@ -108,7 +108,8 @@ class Reduced:
     of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
         from the prior mean, shape (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
-    positions: the blocks of the positions, with cross blocks for the bag, then for the unit
+    positions: the blocks of the positions, with cross blocks for the unknowns of the bag, then for
+        the unknowns of the unit
     shares: contributions of the positions to the blocks of the bags with their cross blocks and
         gradients, shape (n_positions, r, r + n + 1); and to the diagonals before the elimination
         of the positions, shape (n_positions, r)

@@ -104,7 +104,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # If turn-on offsets are unknowns, no misalignment explains them: no smaller sd is needed.
+        # Misalignments would explain turn-on offsets that are no unknowns: reduce their prior sd.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
@@ -275,7 +275,7 @@ def _candidates(
         np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, steepest)
     )
     if not windows.was_measured:
-        # Without a thermometer the slope is unknown: its full prior sd enters the covariance.
+        # Without a thermometer the slope over temperature is unknown: its full prior sd is kept.
         typical[:, 0] = largest[:, 0] = STEEPEST
         forced[0] = fixed[:, 0] = True
     return Candidates(typical, largest, forced, fixed)

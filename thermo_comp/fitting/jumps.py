@@ -138,7 +138,7 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # Differences of neighbouring samples contain no drift.
+    # The noise by differences of neighbouring samples does not depend on the drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))

@@ -125,7 +125,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         largest = float(np.sqrt((square / noise**2).max()))
         if largest < least:
             x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-            # Curves alone extrapolate badly to left-out sections: accept 10 times the noise there.
+            # Curves alone extrapolate badly to left-out sections: drifts of 10 sd are accepted.
             most_drift = 10.0 if is_explained and not shape.has_stress else 2.0
             accepted = Parts((x, y, z), factors, most_drift * float(noise.mean()))
             least = largest
@@ -214,7 +214,7 @@ class _PartCurves:
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # No second stage or share of the gradient would meet the limits of `find_parts`.
+                # No second stage or other share of the gradient meets the limits of `find_parts`.
                 return best
             lags = [self._searched(axis, _in_two_stages(single), _Steps(0.2, 0.4))]
             if best.lead_s:

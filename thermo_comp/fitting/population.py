@@ -38,7 +38,7 @@ from .thermal_ranges import union
 
 #: Smallest number of units of a population: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
-#: Fields of a column of a one-stage lag of the board alone.
+#: Fields of a column whose lag has one stage, no share of the gradient and no lead.
 _ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
 
 
@@ -175,7 +175,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE
     if not is_line and any(column.part[1:]):
-        # The time constant of the single lag is at least 1 s.
+        # A power of a sum of lags becomes that of one lag, whose time constant is 1 s or more.
         behind_s = max(tau + second - column.lead_s, 1.0)
         return _on_common_lags(replace(column, tau_s=behind_s, **_ALONE))
     summands: list[tuple[Column, float]] = []

@@ -263,8 +263,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # The numbers of samples of two cells may differ by one. The mean number leaves out cells that
-    # differ by more than one sample from the median, unless most cells do, as with bursts.
+    # The numbers of samples of two cells may differ by one. Cells whose number is more than one
+    # off the median take no part in the mean number, unless most cells do so, as with bursts.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:

@@ -167,7 +167,7 @@ class Base:
     (`Windows.tilt`); the measured values of the three axes less their mean in the position.
 
     columns: the active columns; moved: places in `columns` of the columns with a lag
-    lag: number of the lag of each moved column
+    lag: number of the lag of each column in `moved`
     at_start, t, tilts, measured: places of the derivatives by the initial lag states, of t for the
         nonlinear terms, shape (1,) or (0,), of a support's temperatures, of the measured values
     """
@@ -315,7 +315,7 @@ class Series:
         return np.hstack((self._ones, self.columns[:, base.columns], at_start, self._others))
 
     def starts(self, state: State, base: Base) -> Floats:
-        """Return the initial state of the lag of each moved column, (n_positions, n_moved) [K]."""
+        """Return the initial state of the lag of each column with a lag, (n_positions, m) [K]."""
         return np.asarray((state.start @ self.start_root.T)[self.bag_of_position][:, base.lag])
 
     def at_starts(self, rows: Floats, state: State, base: Base) -> Floats:
