@@ -31,7 +31,7 @@ from ..unit.gravity import MICRO_G
 from .series import Series
 
 #: Centres of the priors, relative to the turn-on offset: random walk per root day of bias, and of
-#: scale times g; scatter of a rest. Prior sd of the logarithm of each sd: a factor of 5.
+#: scale times g; scatter of a rest. Prior sd of the logarithm of an sd of `Ageing`: a factor of 5.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Centre of the prior of the sd of the lag states at a start, relative to the calibration's
 #: assumption: units in thermal equilibrium before their start have smaller lags.
@@ -162,7 +162,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # Older starts of the node have little information about the present state.
+    # The oldest starts are left out: they have little information about the present state.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 

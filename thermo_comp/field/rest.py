@@ -78,7 +78,7 @@ def encode(record: Start | Rest) -> bytes:
 
 
 def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
-    """Leave out the last fields that have their default values."""
+    """Return the fields of a lag or play, without the last fields that have default values."""
     values, defaults = tuple(quantity), [*type(quantity)._field_defaults.values()]
     while defaults and values[-1] == defaults.pop():
         values = values[:-1]

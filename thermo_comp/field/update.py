@@ -234,7 +234,7 @@ def _axis_changes(
         ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
         is_determined = bool(ratio <= 0.6**2)
         determined[bias.static : scale.end] = is_determined
-        # Without the update, the shift is an error of the old calibration.
+        # Without the update, the estimated shift is an error of the old calibration.
         error = posterior[3, 3] + float(rows[3] @ solution.shift) ** 2
         residual = calibration.static.axes()[axis].residual_sd_m_s2
         scatter = float(np.hypot(ageing.turn_on, ageing.rest))
@@ -308,7 +308,7 @@ def refuse_another_unit(result: Update) -> None:
 
 
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
-    """Add a shift to a calibration's parameters; K is multiplied by 1 + shift of scale level."""
+    """Add a shift to a calibration's parameters; 1 + the shift of a scale's level multiplies K."""
     layout = parameter_layout(calibration)
     of_scale = np.array([shift[block.static] for block in layout.scale])
     K = np.array([axis.scale_factor for axis in calibration.axes])

@@ -192,7 +192,7 @@ def _forecasts(
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS
     recent = used.at(is_recent | (used.start > used.start[-1] - _LEAST_STARTS))
     share = recent.n_windows / recent.n_windows.sum()
-    # The norm of the errors `root @ (parameters, levels)` is the RMS over the rests.
+    # The norm of `root @ (errors of parameters, of levels)` is the RMS of |f| - g over the rests.
     joined = np.hstack((recent.by_parameter, recent.by_level)) * np.sqrt(share)[:, np.newaxis]
     root = np.linalg.qr(joined, mode='r')
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
@@ -207,7 +207,7 @@ def _forecasts(
     )
     limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
     bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
-    # Delta method for the logarithm of the variance by which the error grows.
+    # Sd of the logarithm of the variance by which the error grows per day, by the delta method.
     slope = 2.0 * np.array([bias, scale]) / (bias + scale)
     of_walks = updated.model.log_covariance(ageing)[:2, :2]
     rate_sd = float(np.sqrt(slope @ of_walks @ slope))

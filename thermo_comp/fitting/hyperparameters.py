@@ -110,8 +110,8 @@ def _updated(
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
         new_sd = float(np.sqrt(square / (share * gamma + 1.0)))
-        # Limit the sd to 0.03 rad: larger misalignments, as of three single sensors on a printed
-        # bracket, would explain the norms of six faces, to second order.
+        # Limit the misalignment sd to 0.03 rad: larger misalignments, as of single sensors on a
+        # printed bracket, would explain the norms of six faces, to second order.
         misalignment_sd = min(new_sd, 0.03)
     start_share = prior.start_share
     if layout.start.size:

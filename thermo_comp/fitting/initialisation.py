@@ -182,8 +182,8 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     Return the prior with a smaller misalignment sd for a noisy sensor in positions near the six
     faces. Faces hardly determine the misalignment, and misalignments of some degrees would explain
-    other errors of the norms to second order. The published covariance has the misalignment sd of
-    the sensor.
+    other errors of the norms to second order. The published covariance has the misalignment sd
+    before this reduction.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.

@@ -220,7 +220,7 @@ def _reduced(
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        # The norms at rest are used to choose the thresholds only if |f| at rest is gravity.
+        # The norms at rest choose the thresholds of a rest only if |f| at rest is gravity.
         cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)

@@ -182,7 +182,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Lay out the series, given the lag of every column, -1 for none."""
+        """Assign places to the series, given the number of the lag of each column, -1 for none."""
         moved = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(moved), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -330,6 +330,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert products of base series, (n_positions, n_base, n_base), to lags of `state`."""
+        """Convert products of base series as `at_starts` does, (n_positions, n_base, n_base)."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

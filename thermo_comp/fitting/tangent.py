@@ -48,7 +48,7 @@ class Tangent:
     coefficients, radius, 3 of the misalignment, 2 of each pose). The last "unknown" is the
     residual, measured minus predicted.
 
-    combined: the combinations, shape (n_positions, 3, n_base, n_combined)
+    combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
     place: index of the series of each unknown, shape (k + 1,)
     factor: factor of the series of each unknown, shape (n_positions, 3, k + 1)
     n_local: number of unknowns of position and bag

@@ -178,7 +178,7 @@ class Noise(NamedTuple):
     ratio: stationary variance of each process / white variance of a typical window; 0 without
         slow noise
     time_s: the shortest correlation time [s]
-    n_times: number of processes
+    n_times: number of Gauss-Markov processes
     """
 
     ratio: float = 0.0
