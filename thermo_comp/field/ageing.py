@@ -30,8 +30,9 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import Series
 
-#: Centres of the priors, relative to the turn-on offset: random walk per root day of bias, and of
-#: scale times g; scatter of a rest. Prior sd of the logarithm of an sd of `Ageing`: a factor of 5.
+#: Centres of the priors of sd, relative to that of the turn-on offset: random walk per root day of
+#: bias and of scale times g; scatter of a rest. Prior sd of the logarithm of each sd in `Ageing`:
+#: a factor of 5.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Centre of the prior of the sd of the lag states at a start, relative to the calibration's
 #: assumption: units in thermal equilibrium before their start have smaller lags.

@@ -241,8 +241,7 @@ def passage(
 
     The random walk begins at N(mean, covariance), (k,) and (k, k), and grows by `walk` (k, m)
     times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of the
-    walk's variance. The time is 0 if the norm exceeds the bound at the beginning, else at least
-    0.01 days.
+    walk's variance. The time is 0 if the norm begins above the bound, else at least 0.01 days.
     """
     rng = np.random.default_rng(1)
     # Directions with less than a thousandth of the largest error are left out.

@@ -149,7 +149,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     density per step of the logarithm.
 
     `scale`: scale of the fit's prior of offsets, 3 times the noise in 1 Hz; `known_sd`: offset sd
-    by a prior calibration, 0 for none; `kind`: what has the offsets, a key of `LARGEST_USUAL`
+    by a prior calibration, 0 for none; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
     """
     if known_sd:
         # Twelve positions determine the sd of their mounting offsets to a factor of 1.5.

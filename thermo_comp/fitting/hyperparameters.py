@@ -35,7 +35,7 @@ from .regression import Posterior, Regression
 from .unknowns import POSE_SD, Noise, Prior, State, Windows
 from .windows import LAGS, PRODUCTS
 
-#: Degrees of freedom of the half-Student prior of the mounting's standard deviation; 4 as in [2]_.
+#: Degrees of freedom of the half-Student prior of the sd of mounting offsets; 4 as in [2]_.
 STUDENT_NU = 4.0
 #: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
 #: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).

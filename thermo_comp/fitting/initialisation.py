@@ -104,7 +104,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Misalignments would explain turn-on offsets that are no unknowns: reduce their prior sd.
+        # Misalignments would explain turn-on offsets that are no unknowns: reduce the sd of M.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
@@ -182,8 +182,8 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     Return the prior with a smaller misalignment sd for a noisy sensor in positions near the six
     faces. Faces hardly determine the misalignment, and misalignments of some degrees would explain
-    other errors of the norms to second order. The published covariance has the misalignment sd
-    before this reduction.
+    other errors of the norms to second order. The published covariance keeps the misalignment sd
+    of the given prior.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
@@ -268,8 +268,8 @@ def _candidates(
         fixed[1] = parts[1] & np.isin(groups, (CURVE, PART))
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
-        # All columns of both sets of the paper are kept. Ten times the largest prior sd of a slope
-        # is a flat prior.
+        # All columns of both sets of Golovach's paper are kept. Ten times the largest prior sd of
+        # a slope is a flat prior.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (
         np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, steepest)

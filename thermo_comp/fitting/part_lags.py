@@ -125,7 +125,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         largest = float(np.sqrt((square / noise**2).max()))
         if largest < least:
             x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-            # Curves alone extrapolate badly to left-out sections: drifts of 10 sd are accepted.
+            # Curves alone extrapolate badly to left-out sections: drifts of 10 sd are allowed.
             most_drift = 10.0 if is_explained and not shape.has_stress else 2.0
             accepted = Parts((x, y, z), factors, most_drift * float(noise.mean()))
             least = largest

@@ -103,10 +103,10 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     shape (n, p); `K`: scale factors of the axes.
 
     The constants of a unit are taken as independent of each other and of the curves. With the
-    correlations by chance between few units, one position would determine all constants. The
-    correlations of the curves are reduced by a share estimated from their scatter [1]_. A dynamic
-    curve counts as its difference from the static curve, because most units have one curve for
-    both sets, and smaller correlations between two equal curves would make the curves different.
+    correlations by chance between few units, one position would determine all constants of a unit.
+    The correlations of the curves are reduced by a share estimated from their scatter [1]_. A
+    dynamic curve counts as its difference from the static curve, because most units have one curve
+    for both sets, and smaller correlations between equal curves would make the curves different.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):

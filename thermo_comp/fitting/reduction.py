@@ -263,8 +263,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # The numbers of samples of two cells may differ by one. Cells whose number is more than one
-    # off the median take no part in the mean number, unless most cells do so, as with bursts.
+    # The numbers of samples of two cells may differ by one. Cells whose number of samples is not
+    # within 1 of the median are left out, unless most cells are, as with bursts of samples.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
