@@ -96,8 +96,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         data = replace(data, pose=rests.poses_of(windows, problem.up))
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
         # In one attitude a tilt of the support looks like a drift of the unit; in a pose to which
-        # the unit is returned, a tilt looks like an error of the next attitude. In the paper's
-        # model, 'golovach', tilts would absorb errors of its two sets.
+        # the unit is returned, a tilt looks like an error of the next attitude. In Golovach's
+        # model tilts would absorb errors of the two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     data = replace(data, has_prior=known is not None)
     regression = Regression(data, options.gravity, start.scale)

@@ -4,8 +4,8 @@
 Owns the known |f| of positions that are not at 1 g, and the choice of the nonlinear terms.
 
 A nonlinear term that the data determine is removed if it lowers the log evidence, or if it does
-not improve the left-out norms. A term that the data do not determine stays near its prior, with
-the prior sd.
+not improve the left-out norms. A nonlinear term that the data do not determine stays near its
+prior, with the prior sd.
 """
 
 from __future__ import annotations

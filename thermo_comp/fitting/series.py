@@ -231,7 +231,7 @@ class Series:
 
     windows: the data
     nominal_scale: nominal scale factors [input units per m/s^2], shape (3,)
-    t: temperature for the nonlinear terms, shape (n, 1) or (n, 0)
+    t: board temperature less the reference for nonlinear terms [K], shape (n, 1) or (n, 0)
     """
 
     def __init__(self, windows: Windows, nominal_scale: Floats, t: Floats) -> None:

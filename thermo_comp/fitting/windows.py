@@ -277,7 +277,7 @@ def _rows(
     """
     Average the used windows of a rest to windows of 60 s, or shorter windows in a short rest.
 
-    `states`: thermal states of the windows, (width, n); `begin_s`: start of the lags' grid [s]
+    `states`: thermal states, (width, n); `begin_s`: start of the lags, since the first sample [s]
     """
     time, count = interval.time[use], interval.count[use]
     window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
