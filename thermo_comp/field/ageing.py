@@ -30,8 +30,9 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import Series
 
-#: Centres of the priors, relative to the turn-on offset: random walk per root day of bias, and of
-#: scale times g; scatter of a rest. Prior sd of the logarithm of each sd: a factor of 5.
+#: Centres of the priors of sd, relative to that of the turn-on offset: random walk per root day of
+#: bias and of scale times g; scatter of a rest. Prior sd of the logarithm of each sd in `Ageing`:
+#: a factor of 5.
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Centre of the prior of the sd of the lag states at a start, relative to the calibration's
 #: assumption: units in thermal equilibrium before their start have smaller lags.
@@ -162,7 +163,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # Older starts of the node have little information about the present state.
+    # The oldest starts are left out: they have little information about the present state.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 
@@ -261,7 +262,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centre of the priors; the turn-on sd is the fit's residual sd, or 1 Hz noise."""
+    """Return the centre of the priors, from the fit's residual sd or else the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -306,7 +307,7 @@ def learn(
 
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
-    """Choose the most probable change; None if no change has enough evidence."""
+    """Choose the most probable change, or None if no change has enough evidence."""
     best: dict[str, Change] = {}
     for change in candidates:
         if change.log_bayes_factor > _gain(best.get(change.kind)):
@@ -399,8 +400,8 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     """
     Condition the parameters of the calibration on the rests.
 
-    Derivatives of the file's parameters: `to_file` by the six levels, (n_parameters, 6); `bend` by
-    the bias slope of each axis, (n_parameters, 3). `ahead`: days of use after the last rest.
+    `to_file`, `bend`: derivatives of the file's parameters by the six levels, (n_parameters, 6),
+    and by the bias slope of each axis, (n_parameters, 3). `ahead`: days of use after the last rest
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

@@ -3,12 +3,12 @@
 """
 Owns the detection of rests in a stream of samples: windows of 10 s without motion.
 
-Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds that
-hold five samples: one second at 5 Hz or more. A cell is still if its standard deviation is that of
-the noise and its mean agrees with the means of the cell before and of the window's first cell (as
-in `online.checks.GravityCheck`). Still cells in a row form a window once they span 10 s. In a
-long rest all windows of the first ten minutes are kept, then one window per minute up to an hour,
-then one window per five minutes.
+Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds with
+at least five samples, which is one second at 5 Hz or more. A cell is still if its standard
+deviation is that of the noise and its mean agrees with the means of the cell before and of the
+window's first cell (as in `online.checks.GravityCheck`). Still cells in a row form a window once
+they span 10 s. In a long rest all windows of the first ten minutes are kept, then one window per
+minute up to an hour, then one window per five minutes.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,8 @@ from ..online.checks import LARGEST_CHANGE, SCATTER_FACTOR, SMALLEST_WINDOW
 from ..typing import Floats, Stamps
 from .rest import Rest
 
-SECONDS = 10  # shortest length of a window of a rest [s]
+#: Shortest length of a window of a rest [s].
+SECONDS = 10
 #: Largest step from one second with samples to the next within a window [s]: at 1 Hz, jitter of
 #: the stamps leaves some seconds without a sample.
 _LARGEST_STEP = 2
@@ -31,10 +32,7 @@ _SPACING = ((360, 30), (60, 6), (0, 1))
 
 @dataclass
 class _Cell:
-    """
-    Sums over the seconds `begin` to `last`; subtracting the first sample, `origin`, keeps them
-    small.
-    """
+    """Sums, over the seconds `begin` to `last`, of the samples less the first one, `origin`."""
 
     begin: int
     last: int
@@ -49,7 +47,7 @@ class _Cell:
 
 
 #: A function that returns the thermal state and the remaining shares of the unknown initial lag
-#: states; None before the first temperature reading.
+#: states, or None before the first temperature reading.
 StateNow = Callable[[], tuple[Sequence[float], Sequence[float]] | None]
 
 

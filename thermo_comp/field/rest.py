@@ -4,9 +4,9 @@
 Owns the record of a rest, one line of text with a checksum, and the thinning of rest logs.
 
 A rest log is a folder of files, one per day (UTC). Each line is a CRC-32 in hexadecimal, a blank,
-and JSON: an object describes a start of the node, a list is a window at rest since that start.
-Lines with a wrong checksum are skipped: a killed process, a power failure or a full disk damages
-only the line that is being written.
+and JSON. A JSON object describes a start of the node, a JSON list a window at rest since the last
+start. Lines with a wrong checksum are skipped, because a killed process, a power failure or a full
+disk damages only the line that is being written.
 """
 
 import json
@@ -30,7 +30,7 @@ class Start:
     """
     A start of the node, or a later change of calibration with the `start_ns` of the node's start.
 
-    `start_ns` identifies a start and is not a date: many computers set their clock only later.
+    `start_ns` identifies a start and is no date: many computers set their clock after the start.
     """
 
     start_ns: int
@@ -78,7 +78,7 @@ def encode(record: Start | Rest) -> bytes:
 
 
 def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
-    """Leave out the last fields that have their default values."""
+    """Return the fields of a lag or play, without the last fields that have default values."""
     values, defaults = tuple(quantity), [*type(quantity)._field_defaults.values()]
     while defaults and values[-1] == defaults.pop():
         values = values[:-1]
@@ -143,7 +143,7 @@ def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
 
 
 def _number(value: float) -> float:
-    # The limit 1e12 is far above any sample.
+    # A magnitude of 1e12 or more is damage: it is far above any sample.
     if not abs(value) < 1e12:
         raise ValueError(value)
     return float(value)
@@ -184,8 +184,8 @@ def rests_of(
     """
     Decode several files into rests without duplicates, in order of the starts and of the stamps.
 
-    Starts are in order of the stamp of their last rest: `start_ns`, and the first stamps, may have
-    been taken before the computer's clock was set.
+    Starts are in order of the stamp of their last rest, because `start_ns` and the first stamps
+    may have been taken before the computer's clock was set.
     """
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
     n_damaged = 0

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns rests as measurements of a calibration: ``|f| - g`` and its derivatives by every parameter.
+Owns rests as measurements of a calibration, by ``|f| - g`` and its derivatives by every parameter.
 
 A rest at an unknown attitude measures one number, |f|. With x the axes' forces before the matrix
 M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
-i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order ``|f| - g = H (true
-- calibrated parameters) + noise``.
+i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order ``|f| - g`` is the
+matrix H of derivatives times the true less the calibrated parameters, plus noise.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ class Series:
     """
     Rests in order of the starts, (n,) and (n, ...); accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the node's start, from 0 in order; `direction`: v;
-    `force`: x; `gravity`: stated g; `residual`: ``|f| - g``; `by_parameter`: H, (n, n_parameters);
-    `by_level`: derivatives by the bias of each axis and by its scale times g, (n, 6); `noise`:
-    variance of one rest by samples and thermometers; `by_start`: derivatives by the unknown lag
-    states at the start of the node, of unit variance each; `lack`: v times the sd of the lack of
-    fit; `claim`: claimed sd of `residual`.
+    `time`: days since 1970; `start`: number of the node's start, from 0 in order;
+    `direction`, `force`, `by_parameter`: v, x and H of the module's equations; `gravity`: stated
+    g; `residual`: ``|f| - g``; `by_level`: derivatives by the bias of each axis and by its scale
+    times g, (n, 6); `noise`: variance of one rest by samples and thermometers; `by_start`:
+    derivatives by the unknown lag states at the start of the node, of unit variance each;
+    `lack`: sd of the lack of fit of each axis times `direction`; `claim`: claimed sd of `residual`
     """
 
     time: Floats
@@ -197,7 +197,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> Series:
-    """Evaluate rests at logged or given gravity; RecordingError for a lag that is not logged."""
+    """Evaluate rests at logged or given gravity; raises RecordingError if a lag is not logged."""
     correction = Correction(calibration)
     layout, K = Layout(correction.memory), correction.K[:, 0]
     places = {spec: _places(spec, correction.memory) for spec in {s.memory for s, _ in rests}}
@@ -254,9 +254,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """
-    Return the indices in a log's state at which the elements, and the lag shares, of `wanted` are.
-    """
+    """Return the indices of the elements of the state, and of the lags, of `wanted` in a log."""
     try:
         logged, target = Layout(memory).numbers, Layout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)

@@ -46,7 +46,7 @@ class Moved:
     bias: change of the bias at the temperature of the rests [m/s^2]
     scale: relative change of the scale
     curve: change of the bias curve over the temperatures of the rests [m/s^2]
-    reading: change by bias plus scale at the mean force of the rests [m/s^2]
+    reading: change of the reading by bias plus scale at the mean force of the rests [m/s^2]
     claimed_sd: sd of the reading that the old calibration claims [m/s^2]
     present_sd: sd of the reading with the old calibration at the last rest, with ageing [m/s^2]
     """
@@ -71,8 +71,8 @@ class Judged:
     Score of an update on left-out rests.
 
     over, n: kind of the folds, days or starts, and their number
-    before, after: RMS of ``|f| - g`` over each fold with the calibration, and with an update from
-        the earlier folds [m/s^2]
+    before, after: RMS of ``|f| - g`` over all folds with the calibration, and with an update from
+        the folds before each fold [m/s^2]
     gain, gain_sd: mean over the folds of the difference of the mean squares, and its standard
         error [m^2/s^4]
     """
@@ -234,7 +234,7 @@ def _axis_changes(
         ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
         is_determined = bool(ratio <= 0.6**2)
         determined[bias.static : scale.end] = is_determined
-        # Without the update, the shift is an error of the old calibration.
+        # Without the update, the estimated shift is an error of the old calibration.
         error = posterior[3, 3] + float(rows[3] @ solution.shift) ** 2
         residual = calibration.static.axes()[axis].residual_sd_m_s2
         scatter = float(np.hypot(ageing.turn_on, ageing.rest))
@@ -308,7 +308,7 @@ def refuse_another_unit(result: Update) -> None:
 
 
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
-    """Add a shift to a calibration's parameters; K is multiplied by 1 + shift of scale level."""
+    """Add a shift to a calibration's parameters; 1 + the shift of a scale's level multiplies K."""
     layout = parameter_layout(calibration)
     of_scale = np.array([shift[block.static] for block in layout.scale])
     K = np.array([axis.scale_factor for axis in calibration.axes])

@@ -61,7 +61,7 @@ class Watch:
     days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
     week: rows of the days with rests in the last week
     recent: RMS over the last week divided by the limit, robust against one disturbed day
-    left: first day from which the unit stays outside its claim; None for a unit within its claim
+    left: first day from which the unit stays outside its claim, None for a unit within its claim
     back: first day after an earlier time outside the claim, for a unit within its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years
@@ -137,9 +137,9 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week follows a change late. A unit is outside its claim after one day outside if
-    # the ageing model's error at the last rest is outside, too. A unit is within its claim again
-    # after two days within if the ageing model's error is within, too.
+    # The RMS of a week follows a change late. A unit leaves its claim after a day above the limit
+    # if the ageing model's error at the last rest is above the limit, too. A unit is within its
+    # claim again after two days within the limit if the ageing model's error is within, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -151,8 +151,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         left = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # For a unit within its claim, a last week above the limit ends with two days within the
-        # limit, so a day follows the last day outside.
+        # If the last week of a unit within its claim is above the limit, the last two days are
+        # within the limit, so a day follows the last day outside.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -192,7 +192,7 @@ def _forecasts(
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS
     recent = used.at(is_recent | (used.start > used.start[-1] - _LEAST_STARTS))
     share = recent.n_windows / recent.n_windows.sum()
-    # The norm of the errors `root @ (parameters, levels)` is the RMS over the rests.
+    # The norm of `root @ (errors of parameters, of levels)` is the RMS of |f| - g over the rests.
     joined = np.hstack((recent.by_parameter, recent.by_level)) * np.sqrt(share)[:, np.newaxis]
     root = np.linalg.qr(joined, mode='r')
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
@@ -207,7 +207,7 @@ def _forecasts(
     )
     limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
     bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
-    # Delta method for the logarithm of the variance by which the error grows.
+    # Sd of the logarithm of the variance by which the error grows per day, by the delta method.
     slope = 2.0 * np.array([bias, scale]) / (bias + scale)
     of_walks = updated.model.log_covariance(ageing)[:2, :2]
     rate_sd = float(np.sqrt(slope @ of_walks @ slope))
@@ -241,8 +241,7 @@ def passage(
 
     The random walk begins at N(mean, covariance), (k,) and (k, k), and grows by `walk` (k, m)
     times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of the
-    walk's variance. The time is 0 if the norm exceeds the bound at the beginning, else at least
-    0.01.
+    walk's variance. The time is 0 if the norm begins above the bound, else at least 0.01 days.
     """
     rng = np.random.default_rng(1)
     # Directions with less than a thousandth of the largest error are left out.

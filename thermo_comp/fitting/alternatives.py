@@ -97,7 +97,7 @@ def windows_of(
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows with one lag per axis; or with a bank of time constants, if no lags are found,
-    or if their left-out drift exceeds noise and the bank is better on left-out data.
+    or if the lags leave a left-out drift above noise and the bank is better on left-out data.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -116,8 +116,8 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the chosen model has two sets, or another model has, whose left-out error is within one
-    standard error, and whose white noise is below 80 % of the chosen model's on every axis.
+    Whether two sets are in the chosen model, or in a model whose left-out error is within one
+    standard error and whose white noise is below 80 % of that of the chosen model on every axis.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

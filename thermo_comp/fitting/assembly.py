@@ -152,7 +152,7 @@ def _valid_columns(
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
         if k in of_parts and column.term.order % 2:
-            # A part lags as far in cooling as in warming, so odd powers are valid with both signs.
+            # A part lags as far in cooling as in warming: odd powers of its lag have both signs.
             valid = union((valid, (-valid[1], -valid[0])))
         # A column used only in the curves over parts' temperatures gets the group of these curves.
         group = PART if k in weighed and not alone[k] else column.group
@@ -174,7 +174,7 @@ def _provenance(
     residuals: Sequence[ResidualRow],
     findings: Sequence[Finding],
 ) -> Provenance:
-    # The file states ``|f| - g`` of left-out positions only if all positions have a left-out norm.
+    # A left-out RMS of ``|f| - g`` is stated only if the norm of each position was left out.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)

@@ -7,8 +7,8 @@ do not determine, and by the effects that the model lacks.
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. The weight of a fit in the mixture is its
 evidence, limited by the evidence of the positions' norms, times a half-Student prior of the offset
-sd. An error of gravity changes the scale factors of all axes by the same ratio. `jackknife` adds
-the variance due to effects that the model lacks.
+sd. The covariance includes the sd of gravity, as an error of the same ratio in all scale factors.
+`jackknife` adds the variance due to effects that the model lacks.
 
 References
 ----------
@@ -38,8 +38,8 @@ from .windows import CURVE, LAGS, PART
 #: Largest usual sd of the offsets of mountings within a turn-on, of a single turn-on, and of
 #: several turn-ons or of mountings that each have their own turn-on, relative to
 #: `Prior.offset_scale`. By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg,
-#: those of MEMS within some mg: 10 to 20 times that scale. The factors 2 and 5 of turn-ons are a
-#: compromise between data sheets and units whose turn-ons repeat perfectly.
+#: those of MEMS within some mg: 10 to 20 times `Prior.offset_scale`. The largest usual sd of
+#: turn-ons is a compromise between data sheets and units whose turn-ons repeat perfectly.
 LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
@@ -79,8 +79,8 @@ def claim_of(
     `of_means`: see `Fit`; `lacks_effects`: whether noise does not explain the left-out drift, see
     `Selected` and `jackknife`
     """
-    # All rests of a mounting share an offset, but the regression has an offset for each rest. The
-    # mean of k offsets with k times the variance has the variance of a single offset.
+    # All rests of a mounting share an offset, but the regression has an offset for each rest: with
+    # `n_rests` times the variance, the mean offset of a mounting has the variance of one offset.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -117,14 +117,14 @@ def _over_offsets(
     mountings and turn-ons, the sd of the offset of a new mounting after a new turn-on [m/s^2], and
     the variance of the offset of a single turn-on, which is no unknown of the regression.
 
-    `offset_sd`: sd of the offset of a mounting [m/s^2]; `known_sd`: sd by a prior calibration
+    `offset_sd`: sd of a mounting's offset [m/s^2]; `known_sd`: offset sd by a prior calibration
     """
     windows, scale = regression.windows, posterior.prior.offset_scale
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A stated offset sd is that of a mounting or a turn-on: beside the independent offsets of
-        # m mountings a single turn-on has 1 - 1 / m of the variance.
+        # A stated offset sd holds for turn-ons, too: the mean offset of m mountings has 1 / m of
+        # the variance of a single turn-on, and 1 - 1 / m is added.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -148,8 +148,8 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     Return values of the sd of the offsets of mountings or turn-ons [m/s^2], and their log prior
     density per step of the logarithm.
 
-    `scale`: scale of the fit's prior, 3 times the noise in 1 Hz; `known_sd`: the sd by a prior
-    calibration, 0 for none; `kind`: what has the offsets, a key of `LARGEST_USUAL`
+    `scale`: scale of the fit's prior of offsets, 3 times the noise in 1 Hz; `known_sd`: offset sd
+    by a prior calibration, 0 for none; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
     """
     if known_sd:
         # Twelve positions determine the sd of their mounting offsets to a factor of 1.5.
@@ -219,8 +219,8 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
 
     An inactive column is consistent with 0, but the data bound it only to ``1 / sqrt(S)``, S being
     its information given the active columns. A column whose bound exceeds two sd of a window's
-    noise enters the covariance with the bound as sd, and zero weight. The bound of an almost
-    constant column is scaled to the change of temperature.
+    noise enters the covariance with the bound as sd, and zero weight; for this test the bound of
+    an almost constant column is scaled to the change of temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
@@ -236,7 +236,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures lags are errors of the thermometer, which determine no weight.
+        # At constant temperatures lags change by thermometer errors alone: no weight is bounded.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
@@ -267,8 +267,8 @@ def _over_mountings(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
     """
-    Return covariance and offset sd of the mixture of fits over the mounting's sd, given values of
-    the sd and their log prior density, (k,).
+    Return covariance and offset sd of the mixture of fits over the sd of mounting offsets, given
+    values of this sd and their log prior density, (k,).
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
@@ -350,7 +350,7 @@ def _excess_over_priors(
 
 
 def _excess(covariance: Floats, other: Floats) -> Floats:
-    """Return by how much a covariance exceeds another, 0 in directions where it is smaller."""
+    """Return the positive part of ``covariance - other``, its negative eigenvalues set to 0."""
     sd = np.sqrt(np.diag(other))
     values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
@@ -374,7 +374,8 @@ def _norm_evidence(
     Return the log evidence of the mean norms of the mountings for k values of the sd of mounting
     offsets, shape (k,).
 
-    `by_drifts`: root of the covariance without the norms, for the thermal weights
+    `by_drifts`: root of the unit's covariance at the largest offset sd, at which the norms have
+    almost no weight; the rows of the thermal weights are used
     """
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     point, first = regression.at(state, prior), regression.windows.edges[:-1]
@@ -390,7 +391,7 @@ def _norm_evidence(
     weight = rows[:, -1]
     along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
     if prior.informative is None:
-        # The prior of the constants is almost flat, so it is centred on the state.
+        # The prior of the constants is almost flat, so its mean may be set to the state.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((

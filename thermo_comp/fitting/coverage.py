@@ -100,7 +100,7 @@ def distinct_directions(up: Floats) -> Floats:
 
 
 def directions(means: Floats, centre: Floats) -> Floats:
-    """Return unit vectors from a centre to mean readings (n, 3), NaN for one at the centre."""
+    """Return unit vectors from a centre to mean readings (n, 3), NaN at the centre."""
     norms = np.linalg.norm(means - centre, axis=1, keepdims=True)
     return np.asarray((means - centre) / np.where(norms > 0.0, norms, np.nan))
 
@@ -109,9 +109,9 @@ def rough_centre(means: Floats) -> Floats:
     """
     Return the reading at zero force: 0 if the norms agree, else the centre of a fitted sphere.
 
-    With offset binary codes the angles between raw vectors are meaningless. `means`: mean
-    readings, shape (n, 3); with fewer than four readings, or all in a plane, the result is 0.
-    Readings of one pose, which differ by drifts and small rotations, do not count as a sphere.
+    Angles between vectors of offset binary codes are meaningful only about the code at zero force.
+    `means`: mean readings, shape (n, 3); fewer than four, or all in a plane, give 0. Readings of
+    one pose, which differ by drifts and small rotations, do not count as a sphere.
     """
     zero = np.zeros(3)
     if len(means) < 4:
@@ -202,7 +202,7 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the attitude of largest sd of |f|; `up`: positions (n, 3); None without covariance."""
+    """Find the attitude of largest sd of |f|, None without covariance; `up`: attitudes, (n, 3)."""
     if calibration.posterior is None:
         return None
     layout, axes = parameter_layout(calibration), calibration.axes

@@ -73,7 +73,7 @@ def judge_windows(
     """
     Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest.
 
-    Span and ramps are not judged with a prior calibration of the unit, which has both effects.
+    Temperature span and ramps are not judged with a prior of the unit, which states their effects.
     """
     yield _judge_positions(up)
     used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
@@ -219,7 +219,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a further position if the largest sd of |f| is 3 times the positions' median sd."""
+    """Advise a position if the largest sd of |f| is 3 times its median over the positions."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',
@@ -342,7 +342,7 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # The bias offset of a new turn-on, 2 sd at most, does not contradict the prior.
+    # A bias offset of a new turn-on of up to 2 sd (`slow`) does not contradict the prior.
     if options.prior is not None and overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow):
         yield advice(
             'prior',

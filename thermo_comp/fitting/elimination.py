@@ -54,7 +54,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
 
 
 def solved(factor: Floats, right: Floats) -> Floats:
-    """Solve equations, given the lower Cholesky factor of their matrix, without `cho_solve`."""
+    """Solve equations, given the lower Cholesky factor of their matrix; `cho_solve` is slower."""
     return np.asarray(dpotrs(factor.T, right)[0])
 
 
@@ -105,10 +105,11 @@ class Reduced:
     The normal equations of the unit's n unknowns, with all other unknowns eliminated.
 
     layout: places of the unknowns
-    of_bag_prior: precision of the unknowns of bags, and precision times value, (2, n_bags, r)
+    of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
+        from the prior mean, shape (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
-    positions: the blocks of the positions, with their cross blocks for the initial lag states of
-        the bag, then for the unknowns of the unit
+    positions: the blocks of the positions, with cross blocks for the unknowns of the bag, then for
+        the unknowns of the unit
     shares: contributions of the positions to the blocks of the bags with their cross blocks and
         gradients, shape (n_positions, r, r + n + 1); and to the diagonals before the elimination
         of the positions, shape (n_positions, r)
@@ -249,7 +250,7 @@ def _membership(layout: Layout) -> Floats:
 
 
 def _of_unit(normal: Floats, layout: Layout) -> Floats:
-    """Arrange the equations of the unit's unknowns of each axis, shape (3, k, k)."""
+    """Add up the equations of the unit's unknowns, given for each axis, shape (3, k, k)."""
     result = np.zeros((layout.n_unit + 1, layout.n_unit + 1))
     for equations, at in zip(normal, layout.unit, strict=True):
         result[at[:, None], at] += equations
@@ -257,7 +258,7 @@ def _of_unit(normal: Floats, layout: Layout) -> Floats:
 
 
 def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
-    """Eliminate the initial lag states of bags; `among`: positions of each bag, shape (m, n)."""
+    """Eliminate the unknowns of bags; `among`: positions of each bag, shape (m, n)."""
     if not shares[0].size:
         return Blocks(np.zeros((len(among), 0, 0)), np.zeros((len(among), *shares[0].shape[1:])))
     sums, diagonals = (np.tensordot(among, share, 1) for share in shares)

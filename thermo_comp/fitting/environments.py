@@ -4,10 +4,10 @@
 Owns the exclusion of bags of another environment, and the error that is published for them.
 
 In still air the board temperature follows the case temperature by another law than in a chamber
-with a fan. The bias of a part without a thermometer depends on the environment, and no set of
-coefficients describes two environments. A bag of still air would increase the error in a chamber
-with a fan. The fit excludes a bag of another environment and publishes the error of its correction
-as a lack of fit.
+with a fan. The bias of an axis without its own thermometer depends on the environment, and no set
+of coefficients describes two environments. A fit that includes a bag of still air has a larger
+error in a chamber with a fan. The fit excludes a bag of another environment and publishes the
+error of its correction as a lack of fit.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def bags_contradicting_prior(
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
         column_sd=data.parts.astype(np.float64),
-        # Only the drift is compared, because a turn-on or ageing may have changed the level by up
+        # Only the drift is compared, because a turn-on or ageing may have changed the bias by up
         # to 1 mg.
         offset_sd=1e-2,
         sigma=np.maximum(sigma, 1e-9),
@@ -126,7 +126,7 @@ def with_excluded_error(
 ) -> tuple[Calibration, Finding]:
     """
     Add the error of the correction of excluded bags to the lack of fit of both regimes; `others`
-    names the bags or the prior that these bags contradict.
+    names the bags or the prior that the excluded bags contradict.
     """
     windows = thermal_windows(bags, prior_model(calibration))
     regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)

@@ -212,7 +212,7 @@ class Equations(Series):
         self, state: State, layout: Layout, base: Base, scaled: int
     ) -> tuple[Ints, Floats | float]:
         """
-        Return series and factor of the active nonlinear coefficients.
+        Return place and factor of the series of each active nonlinear coefficient, see `Tangent`.
 
         The relative change of the scale factor multiplies the terms at the reference temperature,
         but not the terms' change per kelvin: the product of both changes is negligible.
@@ -228,7 +228,7 @@ class Equations(Series):
     def _by_misalignment(self, state: State) -> Floats:
         """Differentiate the force along each axis by the misalignment, times kappa, (n, 3, 3)."""
         result = np.zeros((len(state.up), 3, 3))
-        # Rows and columns of the elements of the inverse of M.
+        # Rows and columns of the three free elements of the inverse of M.
         rows, columns = [1, 2, 2], [0, 0, 1]
         turned = (self._norm(state) * state.up)[:, columns]
         result[:, rows, [0, 1, 2]] = state.kappa[rows] * turned

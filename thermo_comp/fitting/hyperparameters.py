@@ -35,7 +35,7 @@ from .regression import Posterior, Regression
 from .unknowns import POSE_SD, Noise, Prior, State, Windows
 from .windows import LAGS, PRODUCTS
 
-#: Degrees of freedom of the half-Student prior of the mounting's standard deviation; 4 as in [2]_.
+#: Degrees of freedom of the half-Student prior of the sd of mounting offsets; 4 as in [2]_.
 STUDENT_NU = 4.0
 #: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
 #: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
@@ -110,8 +110,8 @@ def _updated(
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
         new_sd = float(np.sqrt(square / (share * gamma + 1.0)))
-        # Limit the sd to 0.03 rad: larger misalignments, as of three single sensors on a printed
-        # bracket, would explain the norms of six faces, to second order.
+        # Limit the misalignment sd to 0.03 rad: larger misalignments, as of single sensors on a
+        # printed bracket, would explain the norms of six faces, to second order.
         misalignment_sd = min(new_sd, 0.03)
     start_share = prior.start_share
     if layout.start.size:
@@ -176,7 +176,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd to ``power / sd^2 = effective + slope``, from -2 to 2."""
+    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, +-2 at most."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
@@ -240,7 +240,7 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
 def with_slow_noise(
     regression: Regression, posterior: Posterior, candidates: Candidates
 ) -> Posterior:
-    """Estimate the slow noise from the residuals, then by log evidence; settle with this noise."""
+    """Estimate slow noise from the residuals, then by log evidence; fit again with this noise."""
     prior = posterior.prior
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
     estimated = regression.whitener.estimate(residual, regression.weight)
@@ -367,8 +367,8 @@ def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
             usual = sliding_window_view(around, 2 * side + 1, axis=0)
             np.subtract(part, np.median(usual, axis=-1), out=part)
     size = np.abs(size)
-    # The 80 % quantile of |x| is 1.2816 sd of a normal. The median is not used: the window means
-    # of a charge-balancing converter often have few distinct values, with a median deviation of 0.
+    # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| can be 0: the window
+    # means of a charge-balancing converter often have few distinct values.
     usual = np.quantile(size, 0.8, axis=0) / 1.2816
     size = np.minimum(size / np.maximum(usual, 1e-300), 1e3).max(axis=1)
     return np.asarray((3.0 / np.maximum(size, 3.0)) ** 2)

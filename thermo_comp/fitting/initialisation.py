@@ -96,15 +96,15 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         data = replace(data, pose=rests.poses_of(windows, problem.up))
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
         # In one attitude a tilt of the support looks like a drift of the unit; in a pose to which
-        # the unit is returned, a tilt looks like an error of the next attitude. In the paper's
-        # model, 'golovach', tilts would absorb errors of its two sets.
+        # the unit is returned, a tilt looks like an error of the next attitude. In Golovach's
+        # model tilts would absorb errors of the two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     data = replace(data, has_prior=known is not None)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Offsets of turn-ons are unknowns of their own, which misalignments need not explain.
+        # Misalignments would explain turn-on offsets that are no unknowns: reduce the sd of M.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
@@ -182,8 +182,8 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     Return the prior with a smaller misalignment sd for a noisy sensor in positions near the six
     faces. Faces hardly determine the misalignment, and misalignments of some degrees would explain
-    other errors of the norms to second order. The published covariance has the misalignment sd of
-    the sensor.
+    other errors of the norms to second order. The published covariance keeps the misalignment sd
+    of the given prior.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
@@ -234,9 +234,9 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
     # Bounds of the prior's scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer
-    # MEMS; the tail of the Student prior allows for more. The lower bound is smaller for almost no
-    # noise, because an offset 1e6 times as large as the noise cannot be estimated in double
-    # precision.
+    # MEMS; the tail of the Student prior allows for more. For almost no noise the lower bound of
+    # the prior's scale is below 30 ug, because an offset 1e6 times as large as the noise cannot be
+    # estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
 
@@ -268,14 +268,14 @@ def _candidates(
         fixed[1] = parts[1] & np.isin(groups, (CURVE, PART))
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
-        # All columns of both sets of the paper are kept. Ten times the largest prior sd of a slope
-        # is a flat prior.
+        # All columns of both sets of Golovach's paper are kept. Ten times the largest prior sd of
+        # a slope is a flat prior.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (
         np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, steepest)
     )
     if not windows.was_measured:
-        # Without a thermometer the slope is unknown: its full prior sd enters the covariance.
+        # Without a thermometer the slope over temperature is unknown: its full prior sd is kept.
         typical[:, 0] = largest[:, 0] = STEEPEST
         forced[0] = fixed[:, 0] = True
     return Candidates(typical, largest, forced, fixed)

@@ -9,11 +9,11 @@ a jump distorts the whole curve. Two criteria distinguish a jump from a rotation
 samples beside a jump scatter no more than at rest. A jump changes the norm of the reading, which
 is almost constant in a rotation, or a gyroscope measures no rotation during the jump.
 
-If a sensor has a low-pass filter, neighbouring samples have a correlation r, and their slow noise
-hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised least squares
-for first-order noise), so a step within one sample is significant in these differences. A shock
-that decays is also significant, so the mean levels of the quiet samples before and after a jump
-must differ, too.
+If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
+the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
+least squares for first-order noise), so a step within one sample is significant in these
+differences. A shock that decays is also significant, so the mean levels of the quiet samples
+before and after a jump must differ, too.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     directions differ by less than 10 degrees.
     """
     cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
-    # A slow log has long gaps, because rests end at borders of cells, of 30 samples or more.
+    # Slow samples have long gaps: rests end at borders of cells, usually of 30 samples or more.
     longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -138,7 +138,7 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # Differences of neighbouring samples contain no drift.
+    # The noise by differences of neighbouring samples does not depend on the drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))

@@ -130,7 +130,7 @@ def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownFo
     """
     Return the known |f| of a bag, from the user or else from its metadata; None for gravity.
 
-    Raises FitError if the text cannot be parsed, or the topic of the rotation rate has no
+    Raises FitError if the text of |f| cannot be parsed, or the topic of the rotation rate has no
     messages.
     """
     metadata = info.metadata

@@ -23,7 +23,8 @@ class Layout:
     Places of the unknowns in the vector of parameters; the unknowns of the unit come first.
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
-    weights, nonlinear: shapes (2, 3, m) and (3, 2 k); -1 for an inactive unknown
+    weights, nonlinear: places of the weights, shape (2, 3, m), and of the nonlinear coefficients,
+        shape (3, 2 k); -1 for an inactive unknown
     start, turn_on: unknowns of each bag: initial lag states, and the bias offset of its turn-on,
         shapes (n_bags, r) and (n_bags, 3) or (n_bags, 0)
     own: unknowns of each position: up, stretch, offset, tilt, shape (n_positions, k)

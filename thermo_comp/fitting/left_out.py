@@ -169,7 +169,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
         if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
     ]
-    # The RMS error of the left-out halves may rise by a quarter, which is about its scatter.
+    # The RMS error of left-out halves of the program may rise by a quarter, about its scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
         return 0.0
@@ -268,7 +268,7 @@ def _is_determined(by_others: float, by_all: float) -> bool:
 
 
 def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
-    """Whether a fit without a position determines its drift (`rows`); `root`: see `Posterior`."""
+    """Whether a fit without the position of `rows` determines its drift, given its `root`."""
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True

@@ -4,8 +4,8 @@
 Owns the known |f| of positions that are not at 1 g, and the choice of the nonlinear terms.
 
 A nonlinear term that the data determine is removed if it lowers the log evidence, or if it does
-not improve the left-out norms. A term that the data do not determine stays near its prior, with
-the prior sd.
+not improve the left-out norms. A nonlinear term that the data do not determine stays near its
+prior, with the prior sd.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class Forces:
     """
     The known magnitude ``|f|^2 = still^2 + spin^2`` of each position, (n_positions,) [m/s^2].
 
-    kinds: the k nonlinear terms that may take part, in the order of a file; the order of the
-        coefficients is all kinds at the reference temperature, then all kinds per kelvin
+    kinds: the k nonlinear terms that may take part, in the order of a calibration file; the order
+        of the coefficients is all kinds at the reference temperature, then all kinds per kelvin
     t: board temperature of each window less the reference, shape (n,) [K]
     still: |f| without rotation; gravity if the unit rotates
     spin: centripetal acceleration w^2 r at the stated radius; 0 without rotation
@@ -256,7 +256,7 @@ def of_file(
         return None
     known = options.prior.nonlinearity if options.prior else None
     sizes = forces.sizes
-    # The file's range of |f| is 1 % wider at either end than the range of the positions.
+    # The calibrated range of |f| is 1 % wider at either end than the range of the positions.
     low, high = 0.99 * float(sizes.min()), 1.01 * float(sizes.max())
     if known:
         lower, upper = known.force_range_m_s2

@@ -182,7 +182,7 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name in _POLYNOMIALS:
         return Polynomial((0.0, *[1.0] * (1 + _POLYNOMIALS.index(name))))
     if name == 'exponential':
-        # E-folds of 15 K and 30 K: the leakage of semiconductors doubles in about 10 K.
+        # Exponentials that grow by e in 15 K and 30 K: semiconductor leakage doubles in 10 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
     # The spline has four pieces; a knot at the reference temperature replaces knots near it.
     knots = np.linspace(lower, upper, 5)

@@ -4,13 +4,13 @@
 Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
-temperature of one part of the unit. The board temperature T less the reference temperature is t,
-and m = T - L(T + v G) is T less the temperature of the part, L being the lag operator, G the
-gradient and v its share. The part lags the temperature T + v G, which is between board and case.
-The lag has one stage or, for a part that is heated through another part, two stages in series.
-Without a case thermometer, the temperature that the part lags may lead that of the board. The time
-constants, the share v and the lead minimise the RMS residual of a spline of the bias and a cubic
-of the scale factor, over the temperature x of the part.
+temperature of one part of the unit less the reference temperature. The board temperature T less
+the reference temperature is t, and m = T - L(T + v G) is T less the temperature of the part, L
+being the lag operator, G the gradient and v its share. The part lags a temperature between board
+and case, the board's plus the share v of the gradient. The lag has one stage or, for a part that
+is heated through another part, two stages in series. Without a case thermometer, the temperature
+that the part lags may lead that of the board. The time constants, the share v of the gradient and
+the lead minimise the RMS residual of a spline of the bias and a cubic of the scale factor over x.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class _Steps(NamedTuple):
     lead: float = 0.0
 
 
-# Ratio of the RMS residual to white noise below which no other shape is tried.
+# Ratio of the RMS residual to white noise below which no other shape of the curves is tried.
 _EXPLAINED = 1.1
 # Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so noise
 # must explain its residual.
@@ -125,7 +125,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         largest = float(np.sqrt((square / noise**2).max()))
         if largest < least:
             x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-            # Curves alone extrapolate badly to left-out sections: allow them 10 times the noise.
+            # Curves alone extrapolate badly to left-out sections: drifts of 10 sd are allowed.
             most_drift = 10.0 if is_explained and not shape.has_stress else 2.0
             accepted = Parts((x, y, z), factors, most_drift * float(noise.mean()))
             least = largest
@@ -192,7 +192,7 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether a lag may meet the limits of `find_parts`, tested with wider limits."""
+        """Whether a lag reduces the residual to near the limits of `find_parts`."""
         typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -214,7 +214,7 @@ class _PartCurves:
                 along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # A second stage or another share of the gradient would reduce the residual little.
+                # No second stage or other share of the gradient meets the limits of `find_parts`.
                 return best
             lags = [self._searched(axis, _in_two_stages(single), _Steps(0.2, 0.4))]
             if best.lead_s:
@@ -381,7 +381,7 @@ class _PartCurves:
         return self._centred(np.hstack((*bias, of_scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """Subtract the weighted mean over each position; multiply by the weights' roots."""
+        """Subtract from series the weighted mean in each position; multiply by root weights."""
         level = np.add.reduceat(values * self._share, self._first)
         return np.asarray((values - level[self._position]) * self._root_weight)
 

@@ -38,7 +38,7 @@ from .thermal_ranges import union
 
 #: Smallest number of units of a population: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
-#: Fields of a column of a one-stage lag of the board alone.
+#: Fields of a column whose lag has one stage, no share of the gradient and no lead.
 _ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
 
 
@@ -99,14 +99,14 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
 
 def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     """
-    Return the covariance of units from their distances to the mean / sqrt(n - 1), (n, p); `K`:
-    scale factors of the axes.
+    Return the covariance of n units from `deviations`, their distances to the mean / sqrt(n - 1),
+    shape (n, p); `K`: scale factors of the axes.
 
     The constants of a unit are taken as independent of each other and of the curves. With the
-    correlations by chance between few units, one position would determine all constants. The
-    correlations of the curves are multiplied by 1 - share [1]_. A dynamic curve counts as its
-    difference from the static curve, because most units have one curve for both sets, and smaller
-    correlations between two equal curves would make them two different curves.
+    correlations by chance between few units, one position would determine all constants of a unit.
+    The correlations of the curves are reduced by a share estimated from their scatter [1]_. A
+    dynamic curve counts as its difference from the static curve, because most units have one curve
+    for both sets, and smaller correlations between equal curves would make the curves different.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):
@@ -175,7 +175,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE
     if not is_line and any(column.part[1:]):
-        # The time constant of the single lag is at least 1 s.
+        # A power of a sum of lags becomes that of one lag, whose time constant is 1 s or more.
         behind_s = max(tau + second - column.lead_s, 1.0)
         return _on_common_lags(replace(column, tau_s=behind_s, **_ALONE))
     summands: list[tuple[Column, float]] = []

@@ -79,8 +79,7 @@ def with_calibration(calibration: Calibration, regression: Regression, state: St
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
-    # For each axis: the level of the static set, then the other coefficients relative to this
-    # level.
+    # Replace the level of the dynamic set by its difference from the level of the static set.
     both = np.array([[values[block.rows] for block in part] for part in layout[:2]])
     both[..., layout.bias[0].dynamic] -= both[..., 0]
     both[0] /= regression.nominal_scale[:, None]

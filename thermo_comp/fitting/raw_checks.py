@@ -146,7 +146,7 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
         return 'the axis is dead there, leave out a bag with a dead axis'
-    # The limit is below the clipped reading, so that rounding does not exclude the reading.
+    # The advised full scale is just below the clipped reading, which counts as saturated.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
         'the largest reading of the bags, with both signs or on several axes, is the full scale: '

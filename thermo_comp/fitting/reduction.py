@@ -229,7 +229,7 @@ def _reduced(
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        # The norms at rest are used to choose the thresholds only if |f| at rest is gravity.
+        # The norms at rest choose the thresholds of a rest only if |f| at rest is gravity.
         cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
@@ -272,8 +272,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # The numbers of samples of two cells may differ by one. A cell that differs by more than one
-    # sample from the median is left out, unless most cells do, as with bursts of samples.
+    # The numbers of samples of two cells may differ by one. Cells whose number of samples is not
+    # within 1 of the median are left out, unless most cells are, as with bursts of samples.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:

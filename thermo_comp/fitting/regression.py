@@ -243,7 +243,7 @@ class Point:
         unknowns, which enter the equations as products, and the linear unknowns are solved again
         for each fraction.
         """
-        # The energy of this point is computed first, because the regression keeps only the last
+        # The energy before the step is computed first, because the regression keeps only the last
         # linearisation.
         energy, (step, _) = self.energy, self.solution
         result = self.moved(step)

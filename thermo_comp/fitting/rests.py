@@ -39,8 +39,8 @@ def _is_heated(windows: ThermalWindows) -> Bools:
     """
     Return the positions that show an effect of temperature, shape (n_positions,): a position whose
     temperature changes by more than a tenth of the span of all temperatures, or whose mean is as
-    far from the median; all positions if there is no such position. Beside a ramp the rests of a
-    tumble in a room do not count: their short drifts hardly separate bias and scale factor.
+    far from the median; all positions if there is no such position. Beside a ramp the short rests
+    of a tumble in a room do not count, as their drifts hardly separate bias and scale factor.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]

@@ -234,7 +234,7 @@ class Growth:
         state = posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
-            # Errors of an incomplete model also enter attitudes and offsets of rests in a pose.
+            # Attitudes and offsets of rests in a pose absorb errors of the model: add both.
             turned = regression.gravity * state.from_pose
             square += float(np.mean(state.offset**2) + np.mean(turned**2))
         slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)

@@ -75,7 +75,7 @@ def learn_thermometer(
     if not long:
         return base
     quantum = quantum_of(np.concatenate(long))
-    # The noise is at least 0.1 mK, because with less the recursion would follow rounding errors.
+    # With a noise setting below 0.1 mK the thermometer's estimate would follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
     histories = _rate_histories(recorded, noise, quantum)
     with_ramps = [history for history in histories if history.fastest > history.least_ramp]

@@ -45,8 +45,8 @@ class Whitener:
         lengths = np.diff(np.r_[starts, len(position)])
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
-        #: Window number of each step of each position; 0 for steps beyond the position's end.
         self._is_there = step < lengths
+        #: Window number of each step of each position; 0 for steps beyond the position's end.
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
         since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])
@@ -167,7 +167,7 @@ class Base:
     (`Windows.tilt`); the measured values of the three axes less their mean in the position.
 
     columns: the active columns; moved: places in `columns` of the columns with a lag
-    lag: number of the lag of each moved column
+    lag: number of the lag of each column in `moved`
     at_start, t, tilts, measured: places of the derivatives by the initial lag states, of t for the
         nonlinear terms, shape (1,) or (0,), of a support's temperatures, of the measured values
     """
@@ -182,7 +182,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Lay out the series, given the lag of every column, -1 for none."""
+        """Assign places to the series, given the number of the lag of each column, -1 for none."""
         moved = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(moved), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -231,7 +231,7 @@ class Series:
 
     windows: the data
     nominal_scale: nominal scale factors [input units per m/s^2], shape (3,)
-    t: temperature for the nonlinear terms, shape (n, 1) or (n, 0)
+    t: board temperature less the reference for nonlinear terms [K], shape (n, 1) or (n, 0)
     """
 
     def __init__(self, windows: Windows, nominal_scale: Floats, t: Floats) -> None:
@@ -315,7 +315,7 @@ class Series:
         return np.hstack((self._ones, self.columns[:, base.columns], at_start, self._others))
 
     def starts(self, state: State, base: Base) -> Floats:
-        """Return the initial state of the lag of each moved column, (n_positions, n_moved) [K]."""
+        """Return the initial state of the lag of each column with a lag, (n_positions, m) [K]."""
         return np.asarray((state.start @ self.start_root.T)[self.bag_of_position][:, base.lag])
 
     def at_starts(self, rows: Floats, state: State, base: Base) -> Floats:
@@ -330,6 +330,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert products of base series, (n_positions, n_base, n_base), to lags of `state`."""
+        """Convert products of base series as `at_starts` does, (n_positions, n_base, n_base)."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

@@ -44,10 +44,11 @@ class Tangent:
     combinations of base series. The derivative of axis i in position p by unknown u is ``factor[p,
     i, u]`` times the series ``place[u]``, in the order base series, combinations. An axis has the
     unknowns of the position (2 of the attitude, stretch, offset, tilts), then those of the bag
-    (initial lag states), then those of the unit (kappa, bias, weights, nonlinear coefficients,
-    radius, 3 of the misalignment). The last "unknown" is the residual, measured minus predicted.
+    (initial lag states, turn-on offset), then those of the unit (kappa, bias, weights, nonlinear
+    coefficients, radius, 3 of the misalignment, 2 of each pose). The last "unknown" is the
+    residual, measured minus predicted.
 
-    combined: the combinations, shape (n_positions, 3, n_base, n_combined)
+    combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
     place: index of the series of each unknown, shape (k + 1,)
     factor: factor of the series of each unknown, shape (n_positions, 3, k + 1)
     n_local: number of unknowns of position and bag

@@ -42,8 +42,8 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 def temperature_range(windows: ThermalWindows) -> Range:
     """Return the valid range of board temperatures."""
-    # The calibration of a test at one temperature is valid within 0.5 K. Without a thermometer the
-    # covariance of the slope covers the unknown curve.
+    # The calibration of a test at one temperature is valid within 0.5 K, or within 50 K without a
+    # thermometer, because then the covariance of the slope covers the unknown curve.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 

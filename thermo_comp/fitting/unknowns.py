@@ -40,7 +40,7 @@ class Windows:
     """
     The data of a fit: windows sorted by position and time, with every column of the table.
 
-    position, bag: numbers from 0; a position lies in one bag, shape (n,)
+    position, bag: position and bag of each window, from 0; a position lies in one bag, shape (n,)
     section: number of the program section, from 0, rising with time in each bag, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: number of samples divided by that of a typical window, shape (n,)
@@ -170,7 +170,7 @@ class Noise(NamedTuple):
     ratio: stationary variance of each process / white variance of a typical window; 0 without
         slow noise
     time_s: the shortest correlation time [s]
-    n_times: number of processes
+    n_times: number of Gauss-Markov processes
     """
 
     ratio: float = 0.0

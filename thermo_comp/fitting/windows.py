@@ -36,7 +36,8 @@ from .unknowns import Windows
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
 #: Groups whose columns, with those of the curve, are summed in a curve over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
-#: Groups linear in a temperature difference; products of it with temperature, and its squares.
+#: Groups of columns linear in a difference of temperatures; groups of the products of such a
+#: difference with temperature, and of its squares.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Smallest number of windows of a short rest: fewer windows do not determine the rest's noise.
 FEWEST_WINDOWS = 20
@@ -190,7 +191,7 @@ class _Rows(NamedTuple):
     thermal: board temperature [degC], its rate [K/s], weight of the dynamic set, gradient [K], and
         the columns of the response without powers of t, as in `ThermalWindows`, shape (n, 4 + k)
     columns: values of the columns, as in `Windows`
-    start: derivatives of the k columns of the response, as in `Windows`, shape (n, k)
+    start: derivatives of the k columns of the response by their initial lag states, shape (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3) or (n, 0)
     """
 
@@ -260,7 +261,7 @@ def _rows(
     """
     Average the used windows of a rest to windows of 60 s, or shorter windows in a short rest.
 
-    `states`: thermal states of the windows, (width, n); `begin_s`: time at which lags begin [s]
+    `states`: thermal states, (width, n); `begin_s`: start of the lags, since the first sample [s]
     """
     time, count = interval.time[use], interval.count[use]
     window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)

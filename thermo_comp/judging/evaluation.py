@@ -121,7 +121,7 @@ def evaluate(
     accepted RMS of ``|f| - g`` [m/s^2]; for `serial` see `replay.check_unit`; `force`: the user's
     options about rests at which |f| is not g.
 
-    Raises RecordingError if a recording cannot be read, or none has a window at rest;
+    Raises RecordingError if a recording cannot be read, or none has a window at rest, and
     CalibrationError if a calibration is for another unit.
     """
     models = [model for _, model in calibrations]
@@ -188,8 +188,8 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Sort the calibrations of the first calibration's unit by date. If several calibrations were
-    fitted on the same bags, only the first is kept: two models of the same data show no change.
+    Sort the calibrations of the first calibration's unit by date. Only the first of several
+    calibrations from the same bags is kept, because two models of the same data show no change.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []

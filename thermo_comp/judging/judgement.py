@@ -174,7 +174,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
         return Verdict.OUTSIDE, f'{text}; {_numbers(outside)}'
     worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
-    # Without a claimed sd `claimed_rms` is NaN, and the comparison is false.
+    # Without a claimed sd `claimed_rms` is NaN, and `is_wide` is false.
     is_wide = full.claimed_rms > (tolerance or min(verdicts.WIDE_PART * full.raw_rms, _WIDE_CLAIM))
     if windows.is_swapped.any():
         kind = Verdict.SWAPPED

@@ -143,7 +143,7 @@ class RateJudgement:
 
 def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | None:
     """
-    Judge a gyroscope by the windows of bags; None without a gyroscope or an angular rate.
+    Judge a gyroscope by the windows of bags, or return None without gyroscope or angular rate.
 
     At rest a gyroscope reads the Earth's rate and its turn-on bias, both unknown, so the changes
     from the mean of each rest are judged, against the sd claimed for the changes.

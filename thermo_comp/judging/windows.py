@@ -119,8 +119,8 @@ def corrected_windows(
     window_s: float = WINDOW_S,
 ) -> Windows:
     """
-    Build the windows of bags, corrected if there is a calibration; RecordingError if the samples
-    are too slow for windows of `window_s`.
+    Build the windows of bags, corrected if there is a calibration; raises RecordingError if the
+    samples are too slow for windows of `window_s`.
     """
     if calibration is not None:
         gravity = calibration.gravity_m_s2 if gravity is None else gravity
