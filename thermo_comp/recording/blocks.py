@@ -305,7 +305,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Shorten jumps of the stamps to an hour, backward jumps too; RecordingError for invalid clocks.
     A clock that is set while it runs leaves a gap of years, which would make any grid over time
-    huge. After an hour without a reading a unit's thermal state is unknown anyway.
+    huge. A gap of an hour remains: after an hour without readings the thermal state is unknown.
     """
     last_ns: int | None = None
     offset = 0

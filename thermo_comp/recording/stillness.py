@@ -5,8 +5,8 @@ Owns still intervals: raw samples -> short cells (count, mean, variance) -> wher
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
 (vibration, handling) and the step between adjacent cells (a turn, a knock). A step starts a new
-interval, because a tilt of one microradian is already one micro-g. Temperature tilts a unit at
-rest, too: a steady change over several cells, slower than the Earth rotates, is a drift and not a
+interval, because a tilt of one microradian is already one micro-g. Temperature also tilts a unit
+at rest, so a steady change over several cells, slower than the Earth rotates, is a drift and not a
 step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest: a
 sensor at rest scatters by no more than its noise, and does not rotate.
 """
@@ -197,7 +197,7 @@ class CellAccumulator:
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
             # A polled buffer gives bursts of samples at a constant interval of 5 s at most, unlike
-            # the pauses of a tumble by hand. A cell contains two bursts.
+            # the pauses of a tumble by hand; a cell contains two of these bursts.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -301,8 +301,9 @@ def still_runs(
     level = np.quantile(cells.variance[plausible], 0.1, axis=0)
     colour = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise: toggling between two adjacent
-    # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
-    # variance times 1.3 is the mean for cells of 60 samples, and 0.9 of the mean for 32 samples.
+    # numbers has a variance of a quarter step squared. For white noise 1.3 times the tenth
+    # percentile of the variances is their mean with 60 samples a cell, and 0.9 of their mean with
+    # 32 samples.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
@@ -409,7 +410,7 @@ def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
         return np.zeros(len(step), dtype=bool)
-    # With many short rests most steps are turns: limit the spread of the steps.
+    # With many short rests most steps between cells are turns: limit the steps' spread.
     spread = np.minimum(
         1.4826 * np.median(np.abs(step[both]), axis=0), STILL_SD / _STEP_SDS * _one_g(cells)
     )

@@ -20,7 +20,7 @@ from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .messages import LiveField, live_field, message_class
 from .waitloop import RawSubscription, WaitLoop, separate_node
 
-#: Interval of the search for publishers, and of the blocks [s].
+#: Interval of the search for publishers, and of the blocks of messages [s].
 SEARCH_S, BLOCK_S = 0.5, 1.0
 
 NODE_NAME = 'thermo_comp_record'

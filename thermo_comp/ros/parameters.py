@@ -223,8 +223,8 @@ def _checked(name: str, value: Any) -> Any:
 class ParameterRequests:
     """Answers a node's parameter services."""
 
-    # `prepare` does the slow part of a change in parallel to the samples, `apply` sets its result
-    # between two samples. An exception of `prepare` or `apply` refuses the change.
+    # `prepare` does the slow part of a parameter change in parallel to the samples, `apply` sets
+    # its result between two samples; an exception of either refuses the change.
     def __init__(
         self,
         loop: WaitLoop,
