@@ -30,7 +30,7 @@ LARGEST_RATE: Final = 1.5
 #: or duration [s].
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
-#: Largest relative deviation from the calibrated rate at which the calibrated noise applies.
+#: Largest relative deviation of the samples' rate at which the calibrated noise applies.
 RATE_TOLERANCE: Final = 0.1
 _WINDOW_S: Final = 1.0  # time over which the rate of samples is measured [s]
 #: Duration of a window of the gravity check [ns]: shortest, and longest if samples are few.

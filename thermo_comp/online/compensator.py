@@ -260,7 +260,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take regime flags since the last call: deciding reading's stamp [ns], is dynamic."""
+        """Take the new regime flags: stamp of the deciding reading [ns], whether dynamic."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 

@@ -35,7 +35,7 @@ _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # `without_rotation` subtracts from the angular rate its median over this time [s].
 _ROTATION_S = 10.0
-# Size of a step that ends a rest, in robust sd of all steps; noise alone does not reach it.
+# Size of a step between cells that ends a rest, in robust sd of all steps; noise is smaller.
 _STEP_SDS = 8.0
 # Number of steps between cells whose median is the drift, and the largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
@@ -58,10 +58,10 @@ class Cells:
     `time` is the mean since `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
     `is_glitch`. `n_repeated` counts the samples with the stamp of the sample before. `quantum` is
-    the samples' step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in
-    rad/s. `roughness` is half the mean square change from sample to sample:
-    the variance of white noise; `seam` the change to a cell's first sample from the last sample of
-    the cell right before it.
+    the step between the samples' possible values, or 0; `middle` is 32768 for unsigned 16-bit
+    words, else 0; rates are in rad/s. `roughness` is half the mean square change from sample to
+    sample, which is the variance of white noise; `seam` the change to a cell's first sample from
+    the last sample of the cell right before it.
     """
 
     start_ns: int

@@ -94,7 +94,7 @@ class Topics:
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: Part = WHOLE
-    input: Input = 'auto'  # auto prefers the counts
+    input: Input = 'auto'  # 'auto' prefers counts to an Imu
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> Topics:

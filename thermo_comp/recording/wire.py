@@ -143,7 +143,7 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
         )
     endian = '<' if representation else '>'
     frame_size = int(number_at(rows, 12, f'{endian}u4')[0])
-    # Start of the numbers: (12 + length of frame_id + 7) // 8 * 8 bytes after the encapsulation.
+    # The numbers start (12 + length of frame_id + 7) // 8 * 8 bytes after the encapsulation.
     at = (frame_size + (HEAD_BYTES + 3) & -8) + 4
     length = rows.dtype.itemsize
     if not 0 <= length - (at + 8 * n_numbers) <= _MAX_PADDING:

@@ -283,7 +283,7 @@ class ParameterRequests:
         return changes, self._prepare(changes)
 
     def _set(self, prepared: Future[Any], results: list[SetParametersResult]) -> None:
-        """Apply one group; an unexpected error refuses the group and is logged by the loop."""
+        """Apply one group of parameters; an unexpected error refuses the group and is logged."""
         try:
             changes, preparation = prepared.result()
             news = [change for change in changes if not self._is_in_force(change)]

@@ -61,8 +61,8 @@ class Sources:
     Decides whether a topic's messages are from one publisher while several publishers are known.
 
     The middleware lists a killed publisher for the time of its lease, 20 s. Messages do not
-    identify their publisher, but each publisher numbers its messages: consecutive numbers over a
-    long enough time come from one publisher.
+    identify their publisher, but each publisher numbers its messages, so consecutive numbers over
+    a long enough time come from one publisher.
     """
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class Sources:
             self.is_contested, self._number = False, numbers[-1]
             return len(numbers) if was_contested else 0
         if n_known > n_before:
-            # The first message does not show which of the publishers is new.
+            # With a new publisher, the next message may come from any of the publishers.
             self._begin(None, 0)
         first = 0
         for place, (number, at_ns) in enumerate(zip(numbers, received_ns, strict=True)):

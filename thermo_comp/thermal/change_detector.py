@@ -230,7 +230,7 @@ class ChangeDetector:
 
     def _follow(self, rate: float, dt: float) -> None:
         """
-        Let the baseline follow a rate that lasts for `dt` [s]; swing and error limit the step.
+        Let the baseline follow a rate that lasts for `dt` [s]; swing and error limit the change.
         """
         baseline, error = self._baseline, self._baseline_error
         limit = self.swing + error

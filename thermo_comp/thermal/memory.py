@@ -127,7 +127,7 @@ class ThermalMemory:
     The memory of a tracker: lags of the board and of each gradient, plays.
 
     A play (Prandtl-Ishlinskii operator of rate-independent hysteresis) of half-width r [K] follows
-    an input v only when v is farther than r from the output P: ``P = min(max(P, v - r), v + r)``.
+    an input v only when v is farther than r from the output ``P = min(max(P, v - r), v + r)``.
     """
 
     def __init__(self, spec: MemorySpec) -> None:
@@ -182,7 +182,7 @@ class ThermalMemory:
         self.board.step(stamp_ns, board, sd)
         values = self.board.lagging
         if self._needs_sensors:
-            # The other sensors have no reading at this stamp, so their last gradients are used.
+            # Other sensors have no reading at the board's stamp, so their last gradients are used.
             gradients = [self.banks[name].input for name in self.spec.sensors]
             values, _ = self._single_lags(stamp_ns, board, gradients)
         inputs = [
@@ -253,9 +253,7 @@ class ThermalMemory:
         return values, extra
 
     def start_shares(self, stamp_ns: int) -> list[float]:
-        """
-        Return the share of each lag's initial value that remains at a stamp, in order of the spec.
-        """
+        """Return each lag's remaining share of its initial value, in the order of `spec.lags`."""
         ages = {name: bank.age_s(stamp_ns) for name, bank in self.banks.items()}
         return [lag.start_share(min(map(ages.__getitem__, lag.inputs))) for lag in self.spec.lags]
 

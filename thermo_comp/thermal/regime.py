@@ -6,10 +6,10 @@ Owns the causal decision between static and dynamic regime; the only clock is th
 The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
 rate of any sensor is clearly that of a ramp. The dynamic state is *held* while the rate of any
-sensor, as it is or as predicted half a lag ahead, may exceed the relaxed rate, which covers the
-ramp, where the second derivative is 0, and the time until the board has relaxed. With `closes` =
-'case' (the paper's rule) the dynamic state ends with the change of the case temperature, and the
-board is used only while the case is lost. The derivation of the detector is in docs/regime.md.
+sensor, at present or predicted half a lag ahead, may exceed the relaxed rate, thus in a ramp of
+constant rate, too, and until the board has relaxed. With `closes` = 'case' (the paper's rule) the
+dynamic state ends with the change of the case temperature, and the board is used only while the
+case is lost. The derivation of the detector is in docs/regime.md.
 
 References
 ----------

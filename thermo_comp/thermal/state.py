@@ -50,9 +50,9 @@ class Gradient(Quantity):
 
 class Layout:
     """
-    The numbers of a thermal state: BOARD to UNKNOWN, (value, variance) of each quantity, plays.
+    The numbers of a thermal state from BOARD to UNKNOWN, then (value, variance) pairs, then plays.
 
-    pairs: number of each quantity's (value, variance) pair; `lag_pairs`: the pairs of the lags
+    pairs: number of each quantity's (value, variance) pair; `lag_pairs` is the slice of the lags
     lags: number of each lag among the lags
     variances: places of the quantities' variances in the state
     numbers: name of each number of the state

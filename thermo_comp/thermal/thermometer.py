@@ -144,7 +144,7 @@ class Thermometer:
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-        # The cheap test comes first: an outlier differs by at least OUTLIER_SIGMAS standard
+        # The cheap test comes first: an outlier's innovation is at least OUTLIER_SIGMAS standard
         # deviations.
         if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
             limit := OUTLIER_SIGMAS * sqrt(spread)

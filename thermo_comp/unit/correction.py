@@ -282,7 +282,7 @@ class Correction:
         v += slow
         growth = np.ones((3, len(board)))
         is_beyond = bool(beyond_range.any())
-        # A part that lags the board may still be outside the range when the board is back inside.
+        # A part that lags the board may return into the calibrated range after the board does.
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
         if is_beyond or outside.any() or parts_out.any():

@@ -56,7 +56,7 @@ class CovarianceMap:
         self._places, self._factors = _sums(yx, zx, zy)
 
     def coefficients(self, rows: Floats) -> Floats:
-        """Return the coefficients of the elements, (40, n), for rows of shape (45, n)."""
+        """Return the coefficients of xx, xy, ..., zz, (40, n), for rows of shape (45, n)."""
         return in_order(self._factors * rows[self._places], 1)
 
 
