@@ -255,7 +255,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     Give readings without a stamp the newest stamp of the samples before them (`last_ns` before the
     block); return the block and its newest stamp. Readings before any sample are dropped.
 
-    Times of reception are not used, because they depend on the speed of a playback.
+    Times of reception are not used as stamps: they depend on the speed of a playback.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1

@@ -247,7 +247,7 @@ class WaitLoop:
                 if self._soon:
                     self._guarded(self._soon.popleft())
                     on_data()
-                    # The callback may have created or destroyed entities.
+                    # The callback may have created or destroyed entities of the wait sets.
                     self._is_stale = True
                     continue
                 now = now_ns()
@@ -267,7 +267,7 @@ class WaitLoop:
                 if woken_ns >= look_ns:
                     ready = [others[entity] for entity in everything.wait(0) if entity in others]
                     served = [self._guarded(serve) for serve in ready]
-                    # After a request the next request may wait already.
+                    # After a request the next request may wait already: look again at once.
                     look_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
                 # An interval of 0 means that the middleware gives no arrival times.
                 if waking and 0 < waking.interval_ns < crowd_ns:

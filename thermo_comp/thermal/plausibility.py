@@ -141,7 +141,7 @@ class SensorCheck:
         last_ns, fault = sensor.stamp_ns, self.fault
         self.is_revived = False
         if last_ns is None or stamp_ns <= last_ns or not isfinite(celsius):
-            return True  # the first reading, or a reading that the estimator rejects
+            return True  # a first reading, or a reading that the estimator itself rejects
         if celsius == sensor.reading:
             self._n_same += 1
             self.fault = self._judge_still(stamp_ns)

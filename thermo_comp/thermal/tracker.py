@@ -207,7 +207,7 @@ class ThermalTracker:
         board = self.board if self.board.stamp_ns is not None else None
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
         if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s:
-            # A ramp may have begun or ended between readings that are far apart.
+            # Between readings far apart a ramp may have begun or ended: restart the detector.
             self._begin_watch()
         regime = self.detector.update(stamp_ns, case, board)
         target = 1.0 if regime is Regime.DYNAMIC else 0.0
