@@ -79,7 +79,7 @@ class _Family(ABC):
 
 @dataclass(frozen=True)
 class Polynomial(_Family):
-    """``c[0] + c[1] t + c[2] t^2 + ...`` (equation 10), c[0] = 0 for a bias, 1 for a scale."""
+    """``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10)): c[0] is 0 for a bias, 1 for a scale."""
 
     coefficients: Annotated[tuple[float, ...], QUANTITIES['coefficients']]
     kind: Literal['polynomial'] = 'polynomial'

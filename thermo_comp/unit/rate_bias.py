@@ -62,7 +62,7 @@ class Gyroscope:
     """
     Bias of the angular rate over temperature: ``w = measured - bias``.
 
-    Order of the posterior, axis by axis: level and coefficients of each set, columns' weights.
+    Order of the posterior, axis by axis: level and coefficients of each set, then the weights.
     """
 
     bias_rad_s: Annotated[
