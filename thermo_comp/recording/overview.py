@@ -214,7 +214,7 @@ class _Clock:
 
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
-    """Describe a thermometer by pieces of its readings; None without a finite reading."""
+    """Describe a thermometer, given its readings in pieces; None without a finite reading."""
     if not readings:
         return None
     stamp_ns = np.concatenate([reading.stamp_ns for reading in readings])
