@@ -47,8 +47,8 @@ class CompensatedBlock:
     stamp_ns: Stamps
     specific_force: Floats  # corrected specific force [m/s^2], shape (n, 3)
     covariance: Floats  # covariance of the force, row-major 3x3 [m^2/s^4], shape (n, 9)
-    #: Corrected angular rate [rad/s] and its variances [rad^2/s^2], shape (n, 3); None without an
-    #: angular rate or a gyroscope in the calibration.
+    #: Corrected angular rate [rad/s] and its variances [rad^2/s^2], shape (n, 3), or None without
+    #: an angular rate or a gyroscope in the calibration.
     angular_rate: Floats | None = None
     angular_rate_variance: Floats | None = None
 

@@ -9,7 +9,7 @@ wire. A count is charge per cycle, so the scale factor changes with the sample r
 calibration, or that of another unit, |f| at rest differs from gravity by more than the claimed
 uncertainty. |f| is averaged over still windows of a second or longer: their scatter is the
 sensor's noise, and their mean agrees with that of the window before. A step of |f| from one rest
-to another is not a motion: the step is judged within a second.
+to another is not a motion, and is judged within a second.
 """
 
 import math
@@ -30,7 +30,7 @@ LARGEST_RATE: Final = 1.5
 #: or duration [s].
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
-#: Largest relative deviation from the calibrated rate at which the calibrated noise applies.
+#: Largest relative deviation of the samples' rate at which the calibrated noise applies.
 RATE_TOLERANCE: Final = 0.1
 _WINDOW_S: Final = 1.0  # time over which the rate of samples is measured [s]
 #: Duration of a window of the gravity check [ns]: shortest, and longest if samples are few.
@@ -45,7 +45,7 @@ SCATTER_FACTOR: Final = 3.0
 LARGEST_CHANGE: Final = 5e-3
 #: Number of still windows averaged into one residual, with exponentially falling weight.
 MEMORY_WINDOWS: Final = 30.0
-#: Number of consecutive still windows that refute a calibration, and that clear it again.
+#: Number of consecutive still windows that refute a calibration, and that restore it.
 REFUTING_WINDOWS: Final = 3
 RESTORING_WINDOWS: Final = 2
 #: Time at rest after a step of |f|, after which the step is judged [ns].
@@ -165,7 +165,7 @@ class GravityCheck:
         self._begin_ns = self._last_ns = 0
         self._last_mean: list[float] | None = None
         self._weight = 0.0
-        # Residual of |f|; None before the first still window.
+        # Residual of |f|, or None before the first still window.
         self.result: GravityResidual | None = None
 
     def wants(self, stamp_ns: int) -> bool:
@@ -175,7 +175,7 @@ class GravityCheck:
     def add(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """Take a force [m/s^2], its covariance (xx to zz), and the trace of the noise's part."""
+        """Take a force [m/s^2], its covariance (xx to zz), and the trace of its noise part."""
         self._watch_step(stamp_ns, force, covariance, noise)
         if (
             not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS

@@ -83,7 +83,7 @@ class CompensatorStatus:
     #: Whether the board temperature has led that of the case in a ramp: most likely the two topics
     #: are swapped.
     is_lead_reversed: bool = False
-    gravity: GravityResidual | None = None  # residual at rest; None before the first rest
+    gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
     #: Whether |f| at rest differs from gravity by more than the tolerance: nothing is published.
     is_refuted: bool = False
     #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
@@ -260,7 +260,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take the regime flags since the last call: stamp of deciding reading [ns], dynamic."""
+        """Take the new regime flags: stamp of the deciding reading [ns], whether dynamic."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
@@ -370,7 +370,7 @@ def corrected(
     """Return force x, y, z and covariance xx, xy, xz, yy, yz, zz, `dt` s after a segment began."""
     bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
     yx, zx, zy = misalignment
-    # Eq. (7) of the paper, solved for the input of each axis.
+    # Equation 7 of the paper, solved for the input of each axis.
     x = (x - (bx + bx1 * dt)) / (sx + sx1 * dt)
     y = (y - (by + by1 * dt)) / (sy + sy1 * dt)
     z = (z - (bz + bz1 * dt)) / (sz + sz1 * dt)

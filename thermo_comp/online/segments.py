@@ -74,7 +74,7 @@ class Model:
         self.needs_temperature = calibration.needs_temperature
         self.correction = Correction(calibration)
         self.uncertainty = [SlowUncertainty(calibration, self.correction)]
-        #: Correction of the angular rate by the thermal state; None without a gyroscope.
+        #: Correction of the angular rate by the thermal state, or None without a gyroscope.
         self.rate_correction: Correction | None = None
         if calibration.gyroscope is not None:
             triad = rate_triad(calibration)
@@ -209,7 +209,7 @@ class ThermalSide:
 
     def count_unmeasured(self, n_samples: int) -> None:
         """
-        Count samples as dropped: no board temperature yet, or the last one is older than allowed.
+        Count samples as dropped: the board temperature is missing, or older than allowed.
         """
         if self.tracker.board.stamp_ns is None:
             self.counters.n_no_temperature += n_samples

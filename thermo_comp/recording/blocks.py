@@ -138,7 +138,7 @@ class Readings(NamedTuple):
 
     def thinned(self) -> Readings:
         """Keep the finite readings that changed, and a reading every ten seconds."""
-        # Readings repeated at the rate of other columns would look like a stuck sensor.
+        # Readings that a table repeats at its samples' rate would look like a stuck sensor.
         kept: list[int] = []
         last_ns, last = 0, math.nan
         rows = zip(self.stamp_ns.tolist(), self.celsius.tolist(), strict=True)
@@ -255,7 +255,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     Give readings without a stamp the newest stamp of the samples before them (`last_ns` before the
     block); return the block and its newest stamp. Readings before any sample are dropped.
 
-    Node and reader take stamps of samples, which do not depend on the speed of a playback.
+    Times of reception are not used as stamps: they depend on the speed of a playback.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -305,7 +305,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Shorten jumps of the stamps to an hour, backward jumps too; RecordingError for invalid clocks.
     A clock that is set while it runs leaves a gap of years, which would make any grid over time
-    huge. After an hour without a reading a unit's thermal state is unknown anyway.
+    huge. A gap of an hour remains: after an hour without readings the thermal state is unknown.
     """
     last_ns: int | None = None
     offset = 0

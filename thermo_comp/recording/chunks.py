@@ -4,8 +4,8 @@
 Owns the spans of a file that hold messages: unpacking within limits, and finding the messages.
 
 The size that a chunk or frame declares is only used as an upper limit. The message index of a
-chunk is never trusted: the records it points at must fill the chunk without gap or overlap;
-otherwise the records are read one by one. https://mcap.dev/spec
+chunk is only used if its records fill the chunk without gap or overlap; otherwise the records of
+the chunk are read one by one. https://mcap.dev/spec
 """
 
 import bz2
@@ -189,8 +189,8 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
 
 def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
-    Read complete records one by one; return the messages and the reason why reading stopped. A
-    last message before zeros is dropped: the zeros may have replaced its last bytes.
+    Read complete records one by one; return the messages and the reason why reading stopped. The
+    last message before zeros is dropped, because the zeros may have replaced its last bytes.
     """
     view = data.data
     places: list[int] = []
@@ -224,7 +224,7 @@ def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Mess
     log_ns = number_at(head, 15, '<i8').astype(np.int64)
     if len(log_ns) and int(np.min(log_ns)) < 0:
         raise DamagedError('a message has a log time beyond the year 2262')
-    channel = number_at(head, 9, '<u2').astype(np.uint16)  # contiguous for fast searches
+    channel = number_at(head, 9, '<u2').astype(np.uint16)  # a contiguous array, for fast searches
     return Messages(data, at + MESSAGE_HEAD_BYTES, size, channel, log_ns)
 
 
@@ -247,7 +247,7 @@ def expand(packed: Path, target: Path) -> str | None:
 def inflate(
     compression: str, packed: Any, limit: int, step: int = _STEP_BYTES, *, is_torn: bool = False
 ) -> Bytes:
-    """Decompress bytes, or the readable part of a torn piece; DamagedError above `limit` bytes."""
+    """Decompress bytes, or a torn piece's readable part; DamagedError for over `limit` bytes."""
     if not compression:
         return np.asarray(packed)
     pieces: list[bytes] = []
@@ -266,7 +266,7 @@ def inflate_ros1_chunk(packed: bytes) -> bytes:
 
 
 def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[bytes]:
-    """Decompress bytes, or with zstd a file, by `step` bytes; DamagedError above `limit` bytes."""
+    """Decompress bytes, or a zstd file, by `step` bytes; DamagedError for over `limit` bytes."""
     n_left = limit
     for piece in iter(partial(_reader(compression, source), step), b''):
         n_left -= len(piece)

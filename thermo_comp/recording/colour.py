@@ -26,9 +26,9 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
     Return the spread of the variances of cells at rest relative to white noise, per axis.
 
     After a low pass a cell has few independent samples. With a correlation r of successive samples
-    the effective number is (1 - r) / (1 + r) of the number of samples, and the roughness is 1 - r
-    of the mean variance. The mean variance follows from the tenth percentile `level` and the
-    effective number.
+    the effective number of samples is (1 - r) / (1 + r) times their number, and the roughness is
+    1 - r times the mean variance. The mean variance follows from the tenth percentile `level` and
+    the effective number of samples.
     """
     n_free = float(np.median(cells.count[plausible])) - 1.0
     quiet = plausible & (cells.variance <= level).any(axis=1)

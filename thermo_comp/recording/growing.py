@@ -4,8 +4,9 @@
 Owns live recording: new messages of a bag that another program writes, and numbered bags.
 
 Each pass reads the growing bag from its beginning, so the pauses grow with the duration of a pass.
-New messages are written to a folder of bags, `01.mcap`, ... with the node's topic names. The end
-of a position is recognised with a delay, so the newest messages are held back.
+New messages are written with the node's topic names to numbered bags, from `01.mcap` on. The end
+of a position is recognised with a delay, so the newest messages are held back until their bag is
+known.
 """
 
 import re
@@ -51,7 +52,7 @@ def growing_blocks(
         try:
             reader = open_recording(path, topics, require=())
         except RecordingError:
-            # A recorder creates its files before it writes complete records.
+            # An empty or growing file is new: a recorder creates a file before it writes records.
             before, size = size, _size(path)
             if n_seen or 0 < size == before:
                 raise
@@ -146,7 +147,7 @@ class PositionBags:
             if self._writer is not None:
                 self._writer.flush()
         except OutputError:
-            self._writer, self._held = None, []  # report the error once, do not try again
+            self._writer, self._held = None, []  # report a failed write once, do not repeat it
             raise
 
     def _write(self, block: Block) -> None:

@@ -60,7 +60,7 @@ _SPAN_FIELDS = attrgetter(
     *('chunk_start_offset', 'chunk_length', 'message_index_length'),
     *('uncompressed_size', 'message_start_time', 'message_end_time'),
 )
-_new_stream: Any = ReadDataStream  # type hints differ between mcap's versions
+_new_stream: Any = ReadDataStream  # type hints differ between versions of the `mcap` library
 
 
 class McapFile(BagFile):
@@ -112,7 +112,7 @@ class McapFile(BagFile):
             schema = self._schemas.get(channel.schema_id)
             kind = schema.name if schema else 'no type'
             package, _, name = kind.partition('/')
-            if name and '/' not in name:  # ROS 1 writes package/Type
+            if name and '/' not in name:  # ROS 1 writes types as package/Type
                 kind = f'{package}/msg/{name}'
             topic = Topic(channel.topic, kind, channel.message_encoding, self._counts[number])
             self.topics[number] = topic

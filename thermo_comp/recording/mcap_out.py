@@ -33,7 +33,7 @@ from .serialized import Messages, join_messages, scatter
 
 Compression = Literal['none', 'lz4', 'zstd']
 
-#: Compression of data with a zstd level.
+#: Functions that compress data, given the level of zstd.
 _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
     'none': lambda data, _: data,
     'lz4': lambda data, _: lz4.frame.compress(data),
@@ -42,7 +42,7 @@ _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
 #: Topics of which a late subscriber gets the last message; a namespace may precede the name.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
-# Type hints differ between versions of the `mcap` library.
+# Any callable, because the type hints differ between versions of the `mcap` library.
 _new_builder: Callable[[], Any] = RecordBuilder
 #: Head of a message record: opcode, length, channel, sequence, log time, publish time.
 _RECORD_HEAD = np.dtype('u1, <u8, <u2, <u4, <i8, <i8')

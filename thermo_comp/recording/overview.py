@@ -162,7 +162,7 @@ def survey_recording(
         (clock.n_gaps, f'{clock.n_gaps} gaps, the longest {clock.longest_gap_s:.3g} s'),
     ]
     duration_s = (clock.last_ns - clock.first_ns) * 1e-9
-    # The first and the last cell may extend beyond the samples.
+    # The first and the last cell may extend beyond the samples: limit the time at rest.
     still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
     return Survey(
         info,
@@ -214,7 +214,7 @@ class _Clock:
 
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
-    """Describe a thermometer by pieces of its readings; None without a finite reading."""
+    """Describe a thermometer, given its readings in pieces; None without a finite reading."""
     if not readings:
         return None
     stamp_ns = np.concatenate([reading.stamp_ns for reading in readings])

@@ -371,7 +371,7 @@ class ForeignFile(BagFile):
                 self.start_ns = int(reader.start_time)
                 self.end_ns = int(reader.end_time) - 1
             for number, link in enumerate(reader.connections):
-                # Columns of an SQLite database have no fixed type.
+                # Columns of an SQLite database have no fixed type: a name may be a number.
                 if not (isinstance(link.topic, str) and isinstance(link.msgtype, str)):
                     raise RecordingError('a topic has no name or no type')
                 self.topics[number] = Topic(link.topic, link.msgtype, encoding, link.msgcount)

@@ -5,8 +5,8 @@ Owns still intervals: raw samples -> short cells (count, mean, variance) -> wher
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
 (vibration, handling) and the step between adjacent cells (a turn, a knock). A step starts a new
-interval, because a tilt of one microradian is already one micro-g. Temperature tilts a unit at
-rest, too: a steady change over several cells, slower than the Earth rotates, is a drift and not a
+interval, because a tilt of one microradian is already one micro-g. Temperature also tilts a unit
+at rest, so a steady change over several cells, slower than the Earth rotates, is a drift and not a
 step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest: a
 sensor at rest scatters by no more than its noise, and does not rotate.
 """
@@ -35,7 +35,7 @@ _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # `without_rotation` subtracts from the angular rate its median over this time [s].
 _ROTATION_S = 10.0
-# Size of a step that ends a rest, in robust sd of all steps; noise alone does not reach it.
+# Size of a step between cells that ends a rest, in robust sd of all steps; noise is smaller.
 _STEP_SDS = 8.0
 # Number of steps between cells whose median is the drift, and the largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
@@ -59,10 +59,10 @@ class Cells:
     `start_ns` [s]; `index` the cell's number on the bag's time grid.
     Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
     `is_glitch`. `n_repeated` counts the samples with the stamp of the sample before. `quantum` is
-    the samples' step or 0; `middle` is 32768 for unsigned 16-bit words, else 0; rates are in
-    rad/s. `roughness` is half the mean square change from sample to sample:
-    the variance of white noise; `seam` the change to a cell's first sample from the last sample of
-    the cell right before it.
+    the step between the samples' possible values, or 0; `middle` is 32768 for unsigned 16-bit
+    words, else 0; rates are in rad/s. `roughness` is half the mean square change from sample to
+    sample, which is the variance of white noise; `seam` the change to a cell's first sample from
+    the last sample of the cell right before it.
     """
 
     start_ns: int
@@ -199,7 +199,7 @@ class CellAccumulator:
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
             # A polled buffer gives bursts of samples at a constant interval of 5 s at most, unlike
-            # the pauses of a tumble by hand. A cell contains two bursts.
+            # the pauses of a tumble by hand; a cell contains two of these bursts.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -303,8 +303,9 @@ def still_runs(
     level = np.quantile(cells.variance[plausible], 0.1, axis=0)
     colour = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise: toggling between two adjacent
-    # numbers has a variance of a quarter step squared. The tenth percentile of a chi-square
-    # variance times 1.3 is the mean for cells of 60 samples, and 0.9 of the mean for 32 samples.
+    # numbers has a variance of a quarter step squared. For white noise 1.3 times the tenth
+    # percentile of the variances is their mean with 60 samples a cell, and 0.9 of their mean with
+    # 32 samples.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
@@ -411,7 +412,7 @@ def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
         return np.zeros(len(step), dtype=bool)
-    # With many short rests most steps are turns: limit the spread of the steps.
+    # With many short rests most steps between cells are turns: limit the steps' spread.
     spread = np.minimum(
         1.4826 * np.median(np.abs(step[both]), axis=0), STILL_SD / _STEP_SDS * _one_g(cells)
     )

@@ -35,7 +35,7 @@ TWINS = 'one topic for both {} and {}: a single thermometer is the board, leave 
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
-_FIRST_STAMP_S = 1e8  # larger times are stamps: no bag lasts 3 years, no clock shows before 1973
+_FIRST_STAMP_S = 1e8  # smallest limit of a `Part` that is a stamp [s]: 1973, longer than any bag
 
 #: The topics of a bag with their type and number of messages.
 Present = Mapping[str, tuple[str, int]]
@@ -94,7 +94,7 @@ class Topics:
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
     part: Part = WHOLE
-    input: Input = 'auto'  # auto prefers the counts
+    input: Input = 'auto'  # 'auto' prefers counts to an Imu
 
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
@@ -139,7 +139,7 @@ class Selected(NamedTuple):
 
 
 def read_names(path: str | Path) -> dict[str, str]:
-    """Read a file of ``INPUT: TOPIC`` lines, as in config/drivers."""
+    """Read a YAML file of topics by input, as in config/drivers."""
     names = read_plain_yaml(path)
     if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
         raise ThermoCompError('expected lines of INPUT: TOPIC', path)
@@ -147,7 +147,7 @@ def read_names(path: str | Path) -> dict[str, str]:
 
 
 def parse_name(text: str) -> tuple[str, str]:
-    """Read ``INPUT=TOPIC``; ValueError for another form."""
+    """Read ``INPUT=TOPIC``; ValueError for text of another form."""
     name, equals, topic = text.strip().partition('=')
     if not equals:
         raise ValueError(f'expected INPUT=TOPIC, got {text}')
@@ -205,7 +205,7 @@ def select_topics(
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    among = ["driver's", 'only']  # the topic with the usual name, and the only topic of its type
+    among = ["driver's", 'only']  # a note's words for a topic of REP 145, or of a unique type
     chosen = [
         choice_note(
             name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]

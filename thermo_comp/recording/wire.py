@@ -10,8 +10,8 @@ All three input types are a std_msgs/Header followed only by float64 numbers. In
     12  uint32 length of frame_id with its final NUL, then its characters
     4 + align8(12 + length)   the float64 numbers
 
-Only `frame_id` makes the size vary: messages of equal layout are gathered as rows of bytes, with
-stamps and numbers as views. ROS 1 messages are converted by `rosbags`, one by one.
+Only `frame_id` makes the size of a message vary, so messages of equal layout are gathered as rows
+of bytes, with stamps and numbers as views. ROS 1 messages are converted by `rosbags`, one by one.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -143,7 +143,7 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
         )
     endian = '<' if representation else '>'
     frame_size = int(number_at(rows, 12, f'{endian}u4')[0])
-    # (12 + length of frame_id + 7) // 8 * 8 bytes after the end of the encapsulation
+    # The numbers start (12 + length of frame_id + 7) // 8 * 8 bytes after the encapsulation.
     at = (frame_size + (HEAD_BYTES + 3) & -8) + 4
     length = rows.dtype.itemsize
     if not 0 <= length - (at + 8 * n_numbers) <= _MAX_PADDING:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the writing of columns to a rosbag2 directory or a bare MCAP file, or block by block to a
-table: CSV or (extra ``parquet``) Parquet.
+table in CSV or (extra ``parquet``) Parquet.
 
 The target's name appears only when `BagWriter.close` has succeeded; if writing fails, an older
 file of this name stays.

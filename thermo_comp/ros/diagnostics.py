@@ -31,7 +31,7 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # silence of the samples after which readings apply [s]; Fast DDS may be 3 s late
+IDLE_S = 5.0  # silence of samples after which readings apply [s]; Fast DDS may deliver 3 s late
 #: Readings stamped later than the samples by more than this time are of another clock [s].
 AHEAD_S = 5.0
 #: Delay of the next sample, in cycles and in s, beyond both of which the samples have stopped.

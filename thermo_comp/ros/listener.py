@@ -20,7 +20,7 @@ from ..topics import SAMPLES, TEMPERATURE, thermometer
 from .messages import LiveField, live_field, message_class
 from .waitloop import RawSubscription, WaitLoop, separate_node
 
-#: Interval of the search for publishers, and of the blocks [s].
+#: Interval of the search for publishers, and of the blocks of messages [s].
 SEARCH_S, BLOCK_S = 0.5, 1.0
 
 NODE_NAME = 'thermo_comp_record'
@@ -79,7 +79,7 @@ class LiveTopics:
             if is_over:
                 self._stack.close()
             waiting = self._received[:]
-            # The receiving thread may have appended more messages meanwhile.
+            # Keep the messages that the receiving thread may have appended after the copy.
             del self._received[: len(waiting)]
             if waiting:
                 feeds = [Feed(k, *source) for k, source in enumerate(self._feeds.items())]

@@ -223,8 +223,8 @@ def _checked(name: str, value: Any) -> Any:
 class ParameterRequests:
     """Answers a node's parameter services."""
 
-    # `prepare` does the slow part of a change in parallel to the samples, `apply` sets its result
-    # between two samples. An exception of `prepare` or `apply` refuses the change.
+    # `prepare` does the slow part of a parameter change in parallel to the samples, `apply` sets
+    # its result between two samples; an exception of either refuses the change.
     def __init__(
         self,
         loop: WaitLoop,
@@ -283,7 +283,7 @@ class ParameterRequests:
         return changes, self._prepare(changes)
 
     def _set(self, prepared: Future[Any], results: list[SetParametersResult]) -> None:
-        """Apply one group; an unexpected error refuses the group and is logged by the loop."""
+        """Apply one group of parameters; an unexpected error refuses the group and is logged."""
         try:
             changes, preparation = prepared.result()
             news = [change for change in changes if not self._is_in_force(change)]

@@ -7,7 +7,7 @@ subscribers take it.
 Topics have the node's relative names, messages are unchanged and in the bag's order; ROS 1
 messages are rewritten in CDR. After `WINDOW` messages of a topic the player waits until every
 reliable subscriber has acknowledged them. Fast DDS requests acknowledgements with every message
-only while the history is full, and otherwise every 3 s: therefore the histories are small, and
+only while the history is full, otherwise every 3 s, so the histories are small, and
 transient-local durability keeps them full.
 """
 
@@ -59,7 +59,7 @@ class PlayReport:
     #: Topics without a subscriber, and with a best-effort subscriber, which may lose messages.
     unheard: list[str]
     lossy: list[str]
-    #: The bag: topics chosen by their type, and parts that could not be read.
+    #: Description of the bag, with topics chosen by type and parts that could not be read.
     info: RecordingInfo
 
 

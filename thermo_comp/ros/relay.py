@@ -78,7 +78,7 @@ class Relay:
             for flag, pack in FLAGS.items()
         ]
         self.rests = RestKeeper(config.rest_log) if config.rest_log else None
-        #: Samples that the rest log has not summed yet; None without a rest log.
+        #: Samples that the rest log has not summed yet, or None without a rest log.
         self.waiting: list[bytes] | None = [] if self.rests else None
         self._readings: list[_Reading] = []
         self._newest_reading_ns: int | None = None
@@ -163,7 +163,7 @@ class Relay:
             self._loop.unsubscribe(samples)
 
     def on_data(self) -> None:
-        """Process everything that has arrived."""
+        """Process all samples and readings that have arrived."""
         messages, received_ns, n_others = self.samples.drain_single_source()
         for name, subscription in self.thermometers.items():
             readings, read_ns, n_more = subscription.drain_single_source()

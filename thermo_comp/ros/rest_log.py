@@ -154,8 +154,8 @@ class RestKeeper:
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
         """Sum messages that the compensator has corrected; queue the rests that end in them."""
-        # Sum with the present calibration: after a reload, samples of the last second or two
-        # may have been corrected by the calibration before.
+        # All messages are summed with the present calibration, although after a reload the old
+        # calibration has corrected up to two seconds of them.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
         if not len(stamps):

@@ -3,10 +3,10 @@
 """
 Owns the loop around a node's wait sets, and all uses of rclpy beyond its documented API.
 
-rclpy's executor costs ten times the compensation itself. In this loop messages stay serialized.
-While samples flow, the loop waits only for samples, and each wake-up empties their queue; services
-and ordinary subscriptions are polled. Timers, clients and middleware events are not served by this
-loop.
+rclpy's executor costs ten times the CPU time of the compensation. `WaitLoop` leaves messages
+serialized. While samples flow, the loop waits only for samples, and each wake-up empties their
+queue; services and ordinary subscriptions are polled. Timers, clients and middleware events are
+not served by this loop.
 
 Undocumented parts of rclpy in use: `rclpy.impl.implementation_singleton` (`WaitSet`), the methods
 `take_message`, `get_publisher_count`, `service_take_request` and `publish_raw` of handles, and the
@@ -45,7 +45,7 @@ _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 #: Shortest time between two logged failures [ns].
 _LOG_PERIOD_NS = 10 * 10**9
 
-#: Consecutive numbers over at least this time [ns] and this many messages prove one publisher.
+#: Duration [ns] and number of messages with consecutive numbers that prove a single publisher.
 ALONE_NS, ALONE_MESSAGES = 10**9, 5
 
 _KINDS = {Subscription: 'subscription', Service: 'service', GuardCondition: 'guard_condition'}
@@ -61,8 +61,8 @@ class Sources:
     Decides whether a topic's messages are from one publisher while several publishers are known.
 
     The middleware lists a killed publisher for the time of its lease, 20 s. Messages do not
-    identify their publisher, but each publisher numbers its messages: consecutive numbers over a
-    long enough time come from one publisher.
+    identify their publisher, but each publisher numbers its messages, so consecutive numbers over
+    a long enough time come from one publisher.
     """
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class Sources:
             self.is_contested, self._number = False, numbers[-1]
             return len(numbers) if was_contested else 0
         if n_known > n_before:
-            # The first message does not show which of the publishers is new.
+            # With a new publisher, the next message may come from any of the publishers.
             self._begin(None, 0)
         first = 0
         for place, (number, at_ns) in enumerate(zip(numbers, received_ns, strict=True)):
@@ -152,7 +152,7 @@ class RawSubscription:
 
 
 class WaitLoop:
-    """Runs a node without an executor; raw subscriptions are left to the caller."""
+    """Runs a node without an executor; the caller takes the messages of raw subscriptions."""
 
     # `rest_s`: pause after each wake-up by best-effort messages [s], if four messages or more
     # arrive in three times this pause.
@@ -247,7 +247,7 @@ class WaitLoop:
                 if self._soon:
                     self._guarded(self._soon.popleft())
                     on_data()
-                    # The callback may have created or destroyed entities.
+                    # The callback may have created or destroyed entities of the wait sets.
                     self._is_stale = True
                     continue
                 now = now_ns()
@@ -267,7 +267,7 @@ class WaitLoop:
                 if woken_ns >= look_ns:
                     ready = [others[entity] for entity in everything.wait(0) if entity in others]
                     served = [self._guarded(serve) for serve in ready]
-                    # After a request the next request may wait already.
+                    # After a request the next request may wait already: look again at once.
                     look_ns = 0 if any(served) else woken_ns + OTHERS_PERIOD_NS
                 # An interval of 0 means that the middleware gives no arrival times.
                 if waking and 0 < waking.interval_ns < crowd_ns:
@@ -364,7 +364,7 @@ def separate_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
 
 
 def wait_until(is_done: Callable[[], object], timeout_s: float, nap_s: float = 0.02) -> bool:
-    """Poll `is_done` until it is true; False after the time-out [s]."""
+    """Poll `is_done` until it is true, or return False after the time-out [s]."""
     deadline = time.monotonic() + timeout_s
     while not is_done():
         if time.monotonic() > deadline:

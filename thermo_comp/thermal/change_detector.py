@@ -56,8 +56,8 @@ class ChangeDetector:
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
         self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
         # Memory (1 / tracking frequency) of each filter [s]: the memory that detects the filter's
-        # acceleration soonest at readings of 1 Hz. The spectral density of the acceleration
-        # follows from the memory, and is used for any interval of readings.
+        # acceleration soonest at readings of 1 Hz. The filter's memory determines the spectral
+        # density of the acceleration, which is used for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
         memories = [
@@ -111,7 +111,7 @@ class ChangeDetector:
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
         Use the sensor's last accepted reading. The baseline follows the rate at a relative speed
-        `pace`: 1 in a soak, 0 in a ramp. Returns the sign of the rate's departure from the
+        `pace`, 1 in a soak and 0 in a ramp. Returns the sign of the rate's departure from the
         baseline, 0 = none.
         """
         stamp = self._stamp_ns
@@ -230,7 +230,7 @@ class ChangeDetector:
 
     def _follow(self, rate: float, dt: float) -> None:
         """
-        Let the baseline follow a rate that lasts for `dt` [s]; swing and error limit the step.
+        Let the baseline follow a rate that lasts for `dt` [s]; swing and error limit the change.
         """
         baseline, error = self._baseline, self._baseline_error
         limit = self.swing + error

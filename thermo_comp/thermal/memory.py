@@ -77,7 +77,7 @@ class LagBank:
         for variance, e, tau in zip(self.extra, decays, self.taus, strict=True):
             grown = variance
             if dt > SPARSE_SHARE * tau:
-                # Between readings far apart, the time at which the input changed is unknown.
+                # Between readings far apart, the unknown time of the input's change adds variance.
                 grown += (change * (1.0 - e)) ** 2
             if sd:
                 # The input has the same error in all steps, so the standard deviations of the
@@ -127,7 +127,7 @@ class ThermalMemory:
     The memory of a tracker: lags of the board and of each gradient, plays.
 
     A play (Prandtl-Ishlinskii operator of rate-independent hysteresis) of half-width r [K] follows
-    its input v only when v is farther than r away: ``P = min(max(P, v - r), v + r)``.
+    an input v only when v is farther than r from the output ``P = min(max(P, v - r), v + r)``.
     """
 
     def __init__(self, spec: MemorySpec) -> None:
@@ -149,7 +149,7 @@ class ThermalMemory:
             self._sums = []
         #: For each play: index of the lag that it follows, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
-        #: The single lags of the lag that each play follows, as in `_sums`; none for the board.
+        #: The single lags of each play's lag, by index and share; none for a play of the board.
         self._followed = [
             [(singles.index(single), share) for single, share in play.lag.singles.items()]
             if play.lag
@@ -182,7 +182,7 @@ class ThermalMemory:
         self.board.step(stamp_ns, board, sd)
         values = self.board.lagging
         if self._needs_sensors:
-            # The other sensors have no reading at this stamp, so their last gradients are used.
+            # Other sensors have no reading at the board's stamp, so their last gradients are used.
             gradients = [self.banks[name].input for name in self.spec.sensors]
             values, _ = self._single_lags(stamp_ns, board, gradients)
         inputs = [
@@ -253,9 +253,7 @@ class ThermalMemory:
         return values, extra
 
     def start_shares(self, stamp_ns: int) -> list[float]:
-        """
-        Return the share of each lag's initial value that remains at a stamp, in order of the spec.
-        """
+        """Return each lag's remaining share of its initial value, in the order of `spec.lags`."""
         ages = {name: bank.age_s(stamp_ns) for name, bank in self.banks.items()}
         return [lag.start_share(min(map(ages.__getitem__, lag.inputs))) for lag in self.spec.lags]
 

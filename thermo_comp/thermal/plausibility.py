@@ -47,8 +47,8 @@ LARGEST_ERROR: Final = 60.0
 #: share of the temperature change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: A sensor leads after this number of consecutive readings with at least this ratio of the slower
-#: to the faster rate. Above `DOUBTFUL_RATE_SHARE` a lead of the board adds variance.
+#: Number of readings in a row with at least this ratio of the slower to the faster sensor's rate
+#: after which a sensor leads; from `DOUBTFUL_RATE_SHARE` on a lead of the board adds variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
@@ -68,8 +68,8 @@ class Fault(Enum):
     FROZEN = 'frozen'
     #: A reading that changed faster than any part of a unit can: it is not used.
     STEP = 'jumped'
-    #: A difference from the case that neither a ramp nor the unit's heat explains: a thermometer
-    #: may be loose. Readings with this fault are used, with a larger variance.
+    #: A difference from the case that neither a ramp nor the unit's heat explains, as of a loose
+    #: thermometer; the readings are used, with a larger variance.
     LOOSE = 'apart'
 
 
@@ -141,7 +141,7 @@ class SensorCheck:
         last_ns, fault = sensor.stamp_ns, self.fault
         self.is_revived = False
         if last_ns is None or stamp_ns <= last_ns or not isfinite(celsius):
-            return True  # the first reading, or a reading that the estimator rejects
+            return True  # a first reading, or a reading that the estimator itself rejects
         if celsius == sensor.reading:
             self._n_same += 1
             self.fault = self._judge_still(stamp_ns)
@@ -193,8 +193,7 @@ class SensorCheck:
         if self.lag_s > 0.0:
             dt = (now_ns - (self._seen_ns or now_ns)) * 1e-9
             if dt > 0.0:
-                # The expected change of this sensor is that of the other sensor with a first-order
-                # lag.
+                # Expect the judged sensor to change as the other sensor, with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
             # The sensor that follows may reach the leading sensor's temperature, but not pass it.

@@ -8,7 +8,7 @@ from ..quantities import QUANTITIES
 
 
 class Quantity:
-    """A quantity of the thermal state; `input` is the thermometer that it is computed from."""
+    """A quantity of the thermal state, computed from the readings of the thermometer `input`."""
 
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.

@@ -5,11 +5,11 @@ Owns the causal decision between static and dynamic regime; the only clock is th
 
 The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
-rate of any sensor is clearly that of a ramp. The dynamic state is *held* while any sensor's rate,
-now or predicted half a lag ahead, may exceed the relaxed rate: during the ramp, where the second
-derivative is 0, and after the ramp until the board has relaxed. With `closes` = 'case' (the
-paper's rule) the dynamic state ends with the change of the case temperature, and the board is used
-only while the case is lost. The derivation is in docs/regime.md.
+rate of any sensor is clearly that of a ramp. The dynamic state is *held* while the rate of any
+sensor, at present or predicted half a lag ahead, may exceed the relaxed rate, thus in a ramp of
+constant rate, too, and until the board has relaxed. With `closes` = 'case' (the paper's rule) the
+dynamic state ends with the change of the case temperature, and the board is used only while the
+case is lost. The derivation of the detector is in docs/regime.md.
 
 References
 ----------
@@ -26,8 +26,8 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state, in lags of the leading sensor
-# Margin for "the rate is below a limit", in sd of the rate. A margin of half a sd suffices: in a
-# soak most of the rate's variance is an allowance for a ramp that may begin at any time.
+# Margin for "the rate is below a limit", in sd of the rate; half a sd suffices, because in a soak
+# most of the rate's variance is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
 OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
 FIRST_READINGS: Final = 20  # number of readings that correct a declared noise that is too small
@@ -128,7 +128,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Use a new direction after half a dwell time: a coarse quantum makes the rate step."""
+        """Use a direction that lasts half a dwell time: a coarse quantum makes the rate step."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -192,7 +192,7 @@ class _Watch:
         stamp = self._stamp_ns
         self._stamp_ns = stamp_ns
         if stamp is None or sd > relaxed:
-            self._mean = rate  # restart the mean while the rate is too uncertain
+            self._mean = rate  # restart the mean rate while the rate is too uncertain
         else:
             dt = (stamp_ns - stamp) * 1e-9
             self._mean += dt / (dt + self._memory_s) * (rate - self._mean)

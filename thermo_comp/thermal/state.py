@@ -50,10 +50,11 @@ class Gradient(Quantity):
 
 class Layout:
     """
-    The numbers of a thermal state: indices to UNKNOWN, then (quantity, variance) pairs, plays.
+    The numbers of a thermal state from BOARD to UNKNOWN, then (value, variance) pairs, then plays.
 
-    pairs, lags: index of each pair, and of each lag; the pairs of lags are `lag_pairs`
-    variances: places of the pairs' variances in the state
+    pairs: number of each quantity's (value, variance) pair; `lag_pairs` is the slice of the lags
+    lags: number of each lag among the lags
+    variances: places of the quantities' variances in the state
     numbers: name of each number of the state
     places: place of each quantity in the state
     """

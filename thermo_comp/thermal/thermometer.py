@@ -6,9 +6,9 @@ Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stampe
 Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, in which the
 acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
 acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
-the mixture of both filters, and its variance includes their difference. A sensor whose quantum
-exceeds its noise is read through its cells: a changed reading is a precise measurement of the edge
-between two cells, an unchanged reading only bounds the temperature by its cell.
+the mixture of both filters, and its variance includes their difference. If a sensor's quantum
+exceeds its noise, a changed reading is a precise measurement of the edge between two cells, and an
+unchanged reading only bounds the temperature by its cell.
 
 References
 ----------
@@ -144,7 +144,7 @@ class Thermometer:
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
             self._noise_scale = max(1.0, scale * (1.0 + excess / self._n_turns))
-        # The cheap test comes first: an outlier differs by at least OUTLIER_SIGMAS standard
+        # The cheap test comes first: an outlier's innovation is at least OUTLIER_SIGMAS standard
         # deviations.
         if surprise * surprise > OUTLIER_SIGMAS**2 * spread and abs(surprise) > (
             limit := OUTLIER_SIGMAS * sqrt(spread)

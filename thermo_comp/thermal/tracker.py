@@ -22,7 +22,7 @@ from .thermometer import RESTART_READINGS, Thermometer
 
 #: Relative sd of the gradient that is estimated from the board's rate while a sensor is lost.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
-#: Time without a reading after which the regime is unknown, as a share of the thermal lag.
+#: Time without a reading after which the regime is unknown, as a share of the case's lag.
 UNWATCHED_SHARE: Final = 0.25
 #: Largest change of the self-heating gradient that does not count as an error of the board
 #: temperature, because the air flow may differ: in K, and as a share of the gradient in the fit.
@@ -55,7 +55,7 @@ class ThermalTracker:
             **{name: SensorCheck(sensor, self.board, 0.0) for name, sensor in beside.items()},
         }
         self.memory = ThermalMemory(self.spec)
-        #: Stamp of the newest reading that was used; None before the first reading.
+        #: Stamp of the newest reading that was used, or None before the first reading.
         self.updated_ns: int | None = None
         self._decided_ns: int | None = None
         self._weight = 0.0
@@ -96,7 +96,7 @@ class ThermalTracker:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
         self._configure(config, board_lag_s, rest_gradient_range_k)
-        # The check is copied, because another tracker may share it.
+        # The check of the board's readings is copied: another tracker may share the original.
         self.checks = {**self.checks, BOARD_INPUT: copy(self.checks[BOARD_INPUT])}
         self.checks[BOARD_INPUT].lag_s = board_lag_s
 
@@ -144,7 +144,7 @@ class ThermalTracker:
                 if sensor is board or not bank.taus or bank.stamp_ns is None:
                     continue
                 if not self.is_live(stamp_ns, sensor):
-                    # The lags of a gradient continue while its sensor is lost.
+                    # The lags of a gradient whose sensor is lost follow an estimated gradient.
                     gradient, variance = self._lost_gradient(name, stamp_ns, board.rate)
                     bank.step(stamp_ns, gradient, sqrt(variance))
         for name in self.spec.sensors:
@@ -207,7 +207,7 @@ class ThermalTracker:
         board = self.board if self.board.stamp_ns is not None else None
         decided_ns, self._decided_ns = self._decided_ns, stamp_ns
         if decided_ns is not None and (stamp_ns - decided_ns) * 1e-9 > self._unwatched_s:
-            # A ramp may have begun or ended between readings that are far apart.
+            # Between readings far apart a ramp may have begun or ended: restart the detector.
             self._begin_watch()
         regime = self.detector.update(stamp_ns, case, board)
         target = 1.0 if regime is Regime.DYNAMIC else 0.0
@@ -263,8 +263,8 @@ class ThermalTracker:
 
     def _board_error(self, gradient: float) -> float:
         """
-        Return the variance of an error of the board temperature [K^2] that the gradient of the
-        leading sensor shows: the thermometer may be loose, or topics may be swapped.
+        Return the variance of an error of the board temperature [K^2] that shows in the gradient
+        of the leading sensor, as with a loose thermometer or with swapped topics.
         """
         loose = self.loose_k(gradient)
         # If the board leads the case in a ramp, the topics of case and board may be swapped.

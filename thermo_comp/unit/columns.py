@@ -10,13 +10,13 @@ calibrated temperatures the curves continue along their tangents, but the powers
 Along a tangent ``u t^p`` would have the slope ``u p t^(p - 1)``, but no recording determines how a
 coefficient that changes with temperature continues beyond the calibrated temperatures.
 
-Each group of the bank has the columns of the kind with the same name, except these groups:
-*product* has the kind board, and *gradient_x_temperature* the kinds gradient and gradient_lag,
-times a power of temperature, for coefficients that change with temperature. *square* also has the
-kind cube, and *gradient_even* the kinds size and square. *part* has the kinds board, square and
-cube, whose sum with a curve over the board temperature is a curve over a part's temperature.
-*gradient_even_about_rest* has the columns of *gradient_even* as functions of the gradient less its
-value at rest.
+Each group of the bank has the columns of the kind with the same name, with these exceptions. Group
+*product* has the kind board, and group *gradient_x_temperature* the kinds gradient and
+gradient_lag, times a power of temperature, for coefficients that change with temperature. Group
+*square* also has the kind cube, and group *gradient_even* the kinds size and square. Group *part*
+has the kinds board, square and cube, whose sum with a curve over the board temperature is a curve
+over a part's temperature. Group *gradient_even_about_rest* has the columns of *gradient_even* as
+functions of the gradient less its value at rest.
 
 Tracker, fit, correction, covariance and calibration file use this table of columns.
 """

@@ -67,7 +67,7 @@ class Correction:
     """
     Static and dynamic set of a calibration, blended by the dynamic weight, and thermal response.
 
-    memory: the given memory, else that which the tracker needs for force and angular rate
+    memory: contents of the thermal memory; by default those that `memory_of_unit` returns
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: elements yx, zx, zy of the misalignment matrix M
@@ -264,7 +264,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Without lags a rate beyond the range counts; the variance of lags covers any rate.
+            # Without lags, a rate beyond its range adds variance; lags add variance at any rate.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
@@ -282,7 +282,7 @@ class Correction:
         v += slow
         growth = np.ones((3, len(board)))
         is_beyond = bool(beyond_range.any())
-        # A part that lags the board may still be outside the range when the board is back inside.
+        # A part that lags the board may return into the calibrated range after the board does.
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
         if is_beyond or outside.any() or parts_out.any():

@@ -3,18 +3,18 @@
 """
 Owns the covariance of a corrected sample as polynomials in the forces of the three axes.
 
-x, y, z are the specific forces along the axes, before the misalignment. The nine elements of u are
-errors: a constant error and a scale error of each axis, and the errors of the three elements of
-the misalignment M. To first order the error e of the corrected force is ::
+x, y, z are the specific forces along the axes, before the misalignment. The vector u has nine
+elements, namely a constant error and a scale error of each axis, and the errors of the three
+elements of the misalignment M. To first order the error e of the corrected force is ::
 
     e_x = u0 + x u1
     e_y = yx (u0 + x u1) + u2 + y u3 + x u6
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
 Each element of the covariance of e is a polynomial of second degree in x, y, z, and its
-coefficients are sums over the elements of the covariance of u. In an array the rows of the
-covariance of u are a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then
-one row for each pair in `BETWEEN`.
+coefficients are sums over the elements of the covariance of u. In an array, the covariance of the
+errors u has as rows a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then
+one row for each pair of errors in `BETWEEN`.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ _OF_AXES: Final = [(u + i, u + j) for u in (0, 2, 4) for i, j in ((0, 0), (0, 1)
 _PAIRS: Final = list(combinations_with_replacement(range(9), 2))
 #: Pairs of errors of different axes or of the misalignment, each pair once.
 BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
-#: Number of rows of a covariance of u.
+#: Number of rows of a covariance of the nine errors u.
 N_ROWS: Final = len(_PAIRS)
 _FIRST, _SECOND = np.array(BETWEEN).T
 _OF_M: Final = [BETWEEN.index((u, u)) for u in (6, 7, 8)]
@@ -49,14 +49,14 @@ CONSTANTS: Final = tuple(sum(map(len, _TERMS[:element])) for element in (0, 3, 5
 
 
 class CovarianceMap:
-    """Linear map from the rows of the covariance of u to the coefficients of xx, xy, ..., zz."""
+    """Linear map from rows of the covariance of errors u to coefficients of xx, xy, ..., zz."""
 
     def __init__(self, misalignment: Sequence[float]) -> None:
         yx, zx, zy = misalignment
         self._places, self._factors = _sums(yx, zx, zy)
 
     def coefficients(self, rows: Floats) -> Floats:
-        """Return the coefficients of the elements, (40, n), for rows of shape (45, n)."""
+        """Return the coefficients of xx, xy, ..., zz, (40, n), for rows of shape (45, n)."""
         return in_order(self._factors * rows[self._places], 1)
 
 

@@ -219,7 +219,7 @@ class Exponential(_Family):
         return np.asarray(result)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives by the amplitudes, for a fixed value at the reference."""
+        """Evaluate the function's derivatives by the amplitudes, with a fixed reference value."""
         return [by_element(math.exp, t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 

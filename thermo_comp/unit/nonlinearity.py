@@ -176,8 +176,8 @@ def nonlinear_covariance(
 
 class BeyondForce(NamedTuple):
     """
-    The variance of an unknown square term that begins at the largest |f| of the fit [m/s^2];
-    `growth`: variance / fourth power of twice the distance beyond this force.
+    The variance of an unknown square term that begins at the force `edge` [m/s^2]; `growth`:
+    variance / fourth power of twice the distance beyond `edge`.
     """
 
     edge: float

@@ -86,7 +86,7 @@ class Block(NamedTuple):
     """
     Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
     level of the set, followed by its function's coefficients; `response` to `end` (exclusive):
-    weights.
+    weights of the columns.
     """
 
     static: int

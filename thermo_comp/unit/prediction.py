@@ -46,7 +46,7 @@ class SlowUncertainty:
         #: By axis the rows of the posterior's factor, and the added variances: of bias, scale and
         #: nonlinear terms.
         self._blocks: list[list[tuple[Floats, Floats]]] = []
-        #: Rows of the factor and added variances of the misalignment.
+        #: Rows of the posterior's factor, and added variances, of the misalignment.
         self._misalignment = np.zeros((3, 0)), np.square(calibration.misalignment_sd)
         posterior = calibration.posterior
         if posterior is None:
@@ -63,9 +63,9 @@ class SlowUncertainty:
     ) -> Floats:
         """
         Evaluate the rows of the error covariance (see `unit.covariance`) at thermal states, shape
-        (width, n), each state alone, with the remaining shares of the lags' initial states,
-        (n_lags, n), and with `ThermalMemory.start_rate` of each state, (n,), which is 0 if it is
-        not given. Returns `Correction.n_slow` rows: a, b, c of each axis' error variance
+        (width, n), each state alone, with `start_shares`, the remaining shares of the lags'
+        initial states, (n_lags, n), and `start_rates`, `ThermalMemory.start_rate` of each state,
+        (n,), by default 0. Returns `Correction.n_slow` rows: a, b, c of each axis' error variance
         ``v(x) = a + b x + c x^2`` [m^2/s^4], then the rows between axes and misalignment, then the
         part of a nonlinearity in the coefficients of x^2 to x^6 of each axis' variance.
         """

@@ -3,12 +3,12 @@
 """
 Owns the kinds of regressors of the thermal response, one class each: a new kind is a new class.
 
-The value is ``u = form.value(x)``, ``x = (n - centre) / width``. The number n is a quantity of the
-thermal state, the `source`; with `is_temperature` it is ``t - source``, the temperature of a part
-that lags the board. Notation: ``t = T_board - T_ref``, ``g_s = T_s - T_board`` of a sensor s, and
-``q_s = g_s - rest``: rest is 0, or the gradient at rest, where self-heating makes the board warmer
-than the case. Even functions of q_s have the same value for heating and for cooling at the same
-rate.
+The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``. The number n is a
+quantity of the thermal state, the `source`; with `is_temperature` it is ``t - source``, the
+temperature of a part that lags the board. Notation: ``t = T_board - T_ref``,
+``g_s = T_s - T_board`` of a sensor s, and ``q_s = g_s - rest``: rest is 0, or the gradient at
+rest, where self-heating makes the board warmer than the case. Even functions of the gradient q_s
+have the same value for heating and for cooling at the same rate.
 """
 
 from __future__ import annotations
@@ -72,11 +72,11 @@ class Term(ABC):
         """Return the quantity of the thermal state that a column is computed from."""
 
     def centre(self, column: Column) -> float:
-        """Return the centre of the normalised variable x of a column."""
+        """Return the centre in ``x = (n - centre) / width`` of a column."""
         return float(getattr(column, self.centre_key, 0.0))
 
     def width(self, column: Column) -> float:
-        """Return the width of the normalised variable x of a column."""
+        """Return the width in ``x = (n - centre) / width`` of a column."""
         return float(getattr(column, self.width_key, 1.0))
 
     def largest(self, column: Column) -> float:
