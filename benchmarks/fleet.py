@@ -272,7 +272,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
 
 
 def paper(found: Measured) -> None:
-    """Estimate 100 and 1000 workers, to which one scheduler sends the measured tasks singly."""
+    """Estimate runs with 100 and 1000 workers, to which one scheduler sends each measured task."""
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
     print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')

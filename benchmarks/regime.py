@@ -144,7 +144,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count detected and missed ramps, and flips of the state, by the rate of the readings."""
+    """Count all ramps, missed ramps and ramps whose flag flips, by the rate of the readings."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]
@@ -191,7 +191,7 @@ def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Count switches in soaks."""
+    """Count switches of the regime in soaks."""
     hours = 25.0 if arguments.quick else arguments.soak_hours
     yield 'Switches in soak with ripple and drift, 1 Hz', soak_table(pool, hours, arguments.seed)
 
@@ -209,7 +209,7 @@ def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_cost(_pool: Pool, _arguments: argparse.Namespace) -> Tables:
-    """Measure the time that a reading takes."""
+    """Measure the time that the detector takes for a reading."""
     yield 'Cost', cost_table()
 
 

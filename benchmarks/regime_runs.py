@@ -65,7 +65,7 @@ def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
 
 
 def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
-    """Return onset delay, flips of the state and flagged share of ramps from 0 to `duration`."""
+    """Return onset delays, flips of the flag and flagged share of ramps from 0 to `duration` s."""
     outcome = Outcome([], 0, 0, 0, 0.0, 0)
     for t, flag in flags:
         outcome.n += 1

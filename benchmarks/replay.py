@@ -3,10 +3,10 @@
 """
 Owns the measurement of the offline run: reading, compensating and writing a bag, in one run.
 
-The library is measured as `thermo_comp replay` uses it. The peer is a script with rosbags that
-reads and deserializes each message, corrects the message with the same compensator, serializes and
-writes it. The library and the peer write chunks packed with zstd. All bags hold 400 Hz of counts
-and two temperatures at 1 Hz.
+The library of thermo_comp is measured as `thermo_comp replay` uses it. The peer is a script with
+rosbags that reads and deserializes each message, corrects the message with the same compensator,
+serializes and writes it. thermo_comp and the peer write chunks packed with zstd. All bags hold
+400 Hz of counts and two temperatures at 1 Hz.
 
     python benchmarks/replay.py --hours 24        # time of reading and compensating a day
     python benchmarks/replay.py --gigabytes 10    # peak memory of a replay of a large bag

@@ -54,7 +54,7 @@ class Temperatures:
         self.case = self.board = 20.0
 
     def step(self, seconds: float) -> tuple[float, float]:
-        """Advance by one reading; return (board, case)."""
+        """Advance by one reading; return the temperatures of board and case [degC]."""
         phase = seconds % (2.0 * (RAMP_S + REST_S))
         up = min(phase, RAMP_S) - min(max(phase - RAMP_S - REST_S, 0.0), RAMP_S)
         dt = 1.0 / READINGS_HZ

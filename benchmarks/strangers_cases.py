@@ -49,7 +49,7 @@ HELD = (
 )
 FROST = program(5, 10, (12, 0.5, 60), (28, 0.8, 30))
 ROOM = program(21, 20)
-#: The range of SHORT ends 2 K before the range of USE, on both sides.
+#: The temperatures of the program SHORT end 2 K before those of the programs USE on both sides.
 SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
 USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
 #: Programs of the tests of MEMS units, as in a simple oven.

@@ -40,7 +40,7 @@ def sample_bag(path: Path) -> Bag:
 
 
 def samples(which: str) -> Iterator[Study]:
-    """Return the sample bags with board and case, the board alone, or the board as case, too."""
+    """Yield the sample bags with readings of board and case, board alone, or board for both."""
     bags = [sample_bag(path) for path in sorted((ROOT / 'bags/fit').glob('*.mcap'))]
     bags.append(sample_bag(ROOT / 'bags/held_out.mcap'))
     if which != 'sample-bags':

@@ -139,7 +139,8 @@ def _slips(draw: Specimen) -> list[Effect]:
     return effects
 
 
-# Kinds with a thermal node for each head, and kinds whose heads are also linked to the case.
+# Kinds of units with a thermal node for the head of each axis, and kinds whose heads are also
+# linked to the case.
 _OWN_HEADS = ('own-lags', 'between', 'switched-load')
 _BETWEEN = ('between', 'switched-load')
 _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {

@@ -232,7 +232,7 @@ def _behind_s(parts: Sequence['Part']) -> list[float]:
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Say how far the part of each axis lags the board, or a temperature that leads the board."""
+    """Describe the lag of each axis' part behind the board, or a temperature ahead of the board."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):

@@ -91,7 +91,7 @@ class _Curves(NamedTuple):
 
     @property
     def scale_drift(self) -> float:
-        """Largest relative change of a scale."""
+        """Largest relative change of a scale factor over the range of temperatures."""
         return float(np.max(np.abs(self.scale)))
 
 

@@ -49,7 +49,7 @@ NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row without a stamp
 PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # number of rows processed at a time, to bound the memory
 _EXAMPLES = 5
-_RESTART_NS = 10**9  # a larger backward step restarts the clock [ns], as in the compensator
+_RESTART_NS = 10**9  # a larger backward step of stamps is a restart of the clock [ns]
 SLOW_HZ = 5.0  # logs with a lower sample rate are only good for soaks
 
 

@@ -68,7 +68,7 @@ class Stamp:
     column: Column | None = None
     unit: TimeUnit | None = None
     rate_hz: Positive | None = None
-    start_s: NotNegative = 1.0  # ROS takes a zero stamp for "no time yet"
+    start_s: NotNegative = 1.0  # above 0, as ROS takes a zero stamp for "no time yet"
 
     def __post_init__(self) -> None:
         if (self.column is None) == (self.rate_hz is None):

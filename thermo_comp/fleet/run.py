@@ -33,7 +33,7 @@ _FORMAT = 3
 _LONGEST_NAME = 100
 # Largest number of rows listed on the page; the table has all rows.
 _MOST_ROWS = 60
-# Verdicts on the bags of the fit itself that no further data would change.
+# Verdicts of a fit on its bags that contradict the fit: more data would not change them.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )

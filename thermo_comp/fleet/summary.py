@@ -22,8 +22,8 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation for a normal spread, relative to the sample sd.
 _MAD_EFFICIENCY = 0.37
-# Ratio of a unit's own sd to the spread of the units above which its data do not determine the
-# quantity: the value is (about) that of the prior of the fit.
+# Largest ratio of own sd to spread over the units, for a unit whose data determine the quantity;
+# with a larger ratio the value is about that of the prior of the fit.
 _LARGEST_SD = 5.0
 # Smallest size of a residual or noise, so that its logarithm is finite.
 _LEAST = 1e-12

@@ -57,7 +57,7 @@ class Storage:
             raise ThermoCompError(f'{url}: {words(error)}') from error
         self._root = str(root).rstrip('/')
         self._is_local = 'file' in self._fs.protocol
-        # Address that is valid in any process, whatever its working directory.
+        # Address of the folder, valid in any process, whatever the working directory.
         self.address = self._root if self._is_local else url
         self.name = self._root.rpartition('/')[2]
 

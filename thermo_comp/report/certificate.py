@@ -27,7 +27,7 @@ class Contribution(NamedTuple):
 
     name: str
     evaluation: str
-    standard: float | None  # None if not stated
+    standard: float | None  # None if the uncertainty is not stated
     basis: str
 
 
@@ -238,7 +238,7 @@ def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
 
 
 def conformity(evidence: Evidence) -> tuple[str, str]:
-    """Return the statement of conformity to the specified limit, '' without a limit; the rule."""
+    """Return the statement of conformity ('' if none is made), and its rule or the reason."""
     judgement = evidence.judgement
     if judgement is None:
         return '', 'No recording was judged: no statement of conformity is made.'
