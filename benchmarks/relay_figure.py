@@ -26,7 +26,7 @@ STYLES = {'reliable': ('-', 'o'), 'best_effort': ('--', 's')}
 
 
 def draw(measured: list[dict[str, Any]], path: Path) -> None:
-    """Draw both panels into one file."""
+    """Draw a panel of CPU time and a panel of latency into one file."""
     figure, (cpu, latency) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout='constrained')
     for reliability, (line, marker) in STYLES.items():
         cases = [case for case in measured if case['reliability'] == reliability]

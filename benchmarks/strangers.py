@@ -333,7 +333,7 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Studies of one label, each with another bag left out, are numbered like units.
+                # Studies of the same label, each with another bag left out, are numbered like units.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns simulated units for tests and benchmarks: triads with one kind of physics each, and siblings
-of a unit. docs/accuracy.md describes the kinds.
+of a unit. docs/accuracy.md describes the kinds of physics.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def check_calibration(data: bytes) -> None:
     assert row is None or not value.needs_temperature
 
 
-#: Functions have the required keys only, because the fuzzer tries short inputs more often.
+#: Bias and scale functions without optional keys, as the fuzzer tries short inputs more often.
 _FUNCTIONS = (
     '{bias_function: {kind: polynomial, coefficients: [0]}, '
     'scale_function: {kind: polynomial, coefficients: [1]}}'

@@ -168,7 +168,7 @@ class Acquisition:
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest again, relative to their own noise.
+        # Search the cells after the last rest for a further rest, by the noise of these cells.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [

@@ -75,7 +75,7 @@ def export_calibration(
     content = replace(content, notes=notes, noise=noise)
     text = tool.write(content, number, device_id)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
-    # A note is a single line; imu_tk's reader knows no comments.
+    # Write each note as a comment line; none for imu_tk, whose reader knows no comments.
     head = [] if to == 'imu_tk' else [f'# {one_line(line)}\n' for line in (title, *content.notes)]
     return replace(content, text=''.join(head) + text)
 

@@ -164,7 +164,7 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
     else:
         cells = csv.reader(file, delimiter=delimiter)
     for number, row in enumerate(cells, 1):
-        # A row that begins with a digit, as nearly all do, needs no further test.
+        # A row that begins with a digit, as nearly all do, is no comment and not empty.
         if row and (
             row[0][:1].isdigit() or (not _is_comment(row[0]) and any(map(str.strip, row)))
         ):
