@@ -117,7 +117,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Flights:
-    """Errors of all flights over time, shape (steps, flights), and the filter's sigma."""
+    """Errors of all flights over time, shape (steps, flights), and sigma of the position [m]."""
 
     time_s: Floats
     position: Floats

@@ -252,7 +252,7 @@ def _machine_time() -> tuple[int, int]:
     file = Path('/proc/stat')
     if not file.is_file():
         return 0, 0
-    # Fields of the first line: user nice system idle iowait irq softirq steal.
+    # /proc/stat begins with the times: user nice system idle iowait irq softirq steal.
     ticks = [int(field) for field in file.read_text(encoding='utf-8').split()[1:9]]
     return ticks[7], sum(ticks)
 

@@ -53,7 +53,7 @@ def draw(measured: list[dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """Read the figures and draw them."""
+    """Read the results of `node_relay.py` and draw the figure."""
     parser = argparse.ArgumentParser(description='Draw the figures of node_relay.py.')
     parser.add_argument('figures', type=Path, nargs='+', help='what `node_relay.py --json` wrote')
     parser.add_argument('picture', type=Path, help='PNG file to write')

@@ -153,7 +153,7 @@ def seconds(run: Callable[[], object], repeats: int = 1) -> tuple[float, float]:
 
 
 def pipelines(folder: Path, n: int, repeats: int) -> None:
-    """Print the samples per second of both pipelines, from bag to bag."""
+    """Print the samples per second from bag to bag, by rosbags and by thermo_comp."""
     path, output = folder / 'in.mcap', folder / 'out'
     n_peer = n // 20
     peer = folder / 'peer.mcap'

@@ -220,9 +220,9 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     """
     Return a calibration whose covariance has no constants: bias, scale and misalignment.
 
-    One pose determines the constants to 50 mg only. The constants cancel in the drift of one pose,
-    but not in the difference of two variances: an acceleration `a` contributes ``a^2`` times the
-    variance of the scale factor, and has noise.
+    One pose determines the constants to 50 mg only. The drift of one pose does not contain the
+    constants, but the difference of two claimed variances does: an acceleration `a`, which has
+    noise, contributes ``a^2`` times the variance of the scale factor.
     """
     if calibration.posterior is None:
         return calibration
@@ -333,7 +333,7 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Studies of the same label, each with another bag left out, are numbered like units.
+                # Studies of one label, which leave out different bags, are numbered like units.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)

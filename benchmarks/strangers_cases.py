@@ -99,7 +99,10 @@ class Study:
 
 @dataclass(frozen=True)
 class Bound:
-    """True bias at the reference, and the smallest sd that an unbiased fit may have [m/s^2]."""
+    """
+    True bias at the reference temperature, and the smallest sd that an unbiased fit may have
+    [m/s^2].
+    """
 
     unit: Unit
     bias: Floats
@@ -363,7 +366,7 @@ def cold_start(number: int) -> Iterator[Study]:
 
 
 def slow_thermometer(number: int) -> Iterator[Study]:
-    """Record with a board thermometer that lags by 30 to 90 s; bags of the fit have FROST."""
+    """Record with a board thermometer that lags by 30 to 90 s; the fit has the program FROST."""
     rng = rng_of('slow-thermometer', number)
     unit = navigation(rng, thermometer_s=rng.uniform(30, 90), sensors=('board',))
     fit = positions(unit, FROST, spread(12, rng), rng)

@@ -200,7 +200,7 @@ def judged_ratio(score: Score) -> float:
 
 
 def rows_of(results: Sequence[Result]) -> list[Row]:
-    """Average over the units of each row; the rows are in the order of the results."""
+    """Average the figures of each row over its units; rows are in the order of the results."""
     titles = list(dict.fromkeys(result.title for result in results))
     return [_row([result for result in results if result.title == title]) for title in titles]
 

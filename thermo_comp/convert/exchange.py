@@ -151,7 +151,7 @@ def _ppm(part: float) -> str:
 
 
 def _constant(calibration: Calibration, curves: _Curves) -> Content:
-    """Return bias, scale and misalignment at the reference temperature, for tumble tests."""
+    """Return bias, scale and misalignment at the reference temperature, as of a tumble test."""
     drift = 'the calibration has no correction for temperature'
     if calibration.needs_temperature:
         drift = (

@@ -97,7 +97,7 @@ class Table:
 def read_text(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
 ) -> Table:
-    """Read columns of a table of text, by headings or numbers from 0; None reads all columns."""
+    """Read columns of a table of text, by headings or numbers from 0; all if `columns` is None."""
     try:
         with TextIOWrapper(
             open_regular(path), encoding='utf-8-sig', errors='replace', newline=''

@@ -227,7 +227,7 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
 
 
 def _sds(drift: Drift) -> float:
-    """Return the size of a change in its standard deviations; 0 if its sd is not known."""
+    """Return the size of a change divided by its standard deviation; 0 if the sd is not known."""
     return abs(drift.change) / drift.sd if drift.sd > 0.0 else 0.0
 
 

@@ -275,7 +275,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read an earlier run's table; missing columns are empty. ThermoCompError for other files."""
+    """Read an earlier run's table, missing columns empty; ThermoCompError for another file."""
     from pyarrow import ArrowException, parquet
 
     try:

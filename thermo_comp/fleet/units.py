@@ -70,7 +70,7 @@ class Storage:
                 listing = self._fs.find(self._root, detail=True)
             if not listing and not self._fs.isdir(self._root):
                 raise NotADirectoryError(errno.ENOTDIR, 'no such directory')
-        except Exception as error:  # each file system has different exceptions
+        except Exception as error:  # each file system raises its own exceptions
             raise ThermoCompError(f'{self.url}: cannot be listed: {words(error)}') from error
         files = []
         for path, facts in listing.items():
@@ -92,7 +92,7 @@ class Storage:
             )
             try:
                 self._fs.get(sources, copies)
-            except Exception as error:  # each file system has different exceptions
+            except Exception as error:  # each file system raises its own exceptions
                 raise OSError(errno.EIO, words(error)) from error
             yield Path(scratch, name)
 
@@ -113,7 +113,7 @@ def words(error: Exception) -> str:
 
 
 def find_units(storage: Storage) -> list[FoundUnit]:
-    """Find the units by name; ThermoCompError if nothing can be listed or there is no bag."""
+    """Find a fleet's units; ThermoCompError if the folder cannot be listed or has no bag."""
     bags = group_files(storage.files())
     if not bags:
         raise ThermoCompError(

@@ -169,7 +169,7 @@ def _blocks(
     unit, (n_cycles, block_size, rate_hz) = truth.unit, cycles
     K = np.array(unit.scale_factor)
     to_axes = np.asarray(np.linalg.inv(unit.M), np.float64)
-    # Mean of white noise over a cycle: density times the root of the cycle rate.
+    # Sd of white noise averaged over a cycle: density times the root of the cycle rate.
     root = math.sqrt(rate_hz)
     noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
     noise, rate_noise = white(seed, Stream.ACCEL_NOISE), white(seed, Stream.GYRO_NOISE)
