@@ -237,7 +237,7 @@ def overhead(folder: Path, n_units: int) -> None:
 
 
 def kill(folder: Path, n_units: int, model: str) -> int:
-    """Kill a worker twice during a run, while it fits a unit; return the number of lost results."""
+    """Kill a worker twice in a run, while it fits a unit; return the number of lost results."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fleet = Path(tempfile.mkdtemp(prefix='fleet-', dir=folder))
     for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:

@@ -119,7 +119,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         if abs(z) > spread.limit
     ]
     wide = Verdict.WIDE.value
-    # Write 'little' for the amount in the verdict WIDE, so that equal verdicts count together.
+    # Replace the amount in the verdict WIDE by 'little', so that equal verdicts count together.
     texts = (str(row['verdict']) for row in rows)
     verdicts = (f'{wide} little' if text.startswith(wide) else text for text in texts)
     return Summary(
