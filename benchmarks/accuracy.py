@@ -166,7 +166,7 @@ class Errors:
 
 
 def errors(means: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[SimulatedRun]) -> Errors:
-    """Compare corrected means with the truth."""
+    """Compare corrected means of the specific force with the simulated truth."""
     vector = [
         mean - record.truth.specific_force for mean, record in zip(means, tests, strict=True)
     ]

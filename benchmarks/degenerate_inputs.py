@@ -149,7 +149,7 @@ def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rosbag2(storage: StoragePlugin, mode: CompressionMode | None) -> Callable[[Path], Path]:
-    """Write the whole recording in another storage."""
+    """Write the whole recording as rosbag2 with a given storage plugin and compression."""
 
     def make(folder: Path) -> Path:
         bare = write(folder, whole())

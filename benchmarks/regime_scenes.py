@@ -70,7 +70,7 @@ def temperatures(
 
 
 def read(truth: Floats, scene: Scene, rng: np.random.Generator) -> Floats:
-    """Return the readings of a sensor."""
+    """Return the readings of a sensor [degC], with its noise and rounding."""
     reading = truth + rng.normal(0.0, scene.noise_sd, truth.shape)
     return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
 

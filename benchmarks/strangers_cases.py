@@ -433,8 +433,9 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     Return the Cramer-Rao bound of the bias at the reference temperature, shape (3,), for a unit
     whose bias and scale factor are parabolas.
 
-    The unknowns are the constants, both parabolas, and the direction of each position. The data
-    are the means of the three axes over windows that are short compared with the program.
+    The unknowns are the constants, the parabolas of bias and scale, and the direction of each
+    position. The data are the means of the three axes over windows that are short compared with
+    the program.
     """
     n = len(up)
     tangents = np.array([np.linalg.svd(attitude[None])[2][1:] for attitude in up])

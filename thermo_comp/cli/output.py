@@ -174,7 +174,7 @@ def aligned(head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
 
 
 def picked(value: object, names: str) -> dict[str, Any]:
-    """Return attributes by their names, for JSON."""
+    """Return attributes of an object by their names, for JSON."""
     return {name: getattr(value, name) for name in names.split()}
 
 

@@ -208,7 +208,7 @@ def import_calibration(
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same set.
-    `number` chooses a set or IMU of the file, None the file's only set. `full_scale` is in m/s^2.
+    `number` chooses a set or IMU of the file, None the only set; `full_scale` of readings [m/s^2].
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)

@@ -204,7 +204,7 @@ def _commented(head: str, delimiter: str, width: int) -> list[str]:
 
 
 def _number(cell: str) -> float | None:
-    """Read a cell as a number, including NaN and infinity; None for any other text."""
+    """Read a cell as a number, including NaN and infinity; None if the cell is no number."""
     try:
         return float(cell)
     except ValueError:
@@ -288,7 +288,7 @@ def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) 
 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
-    """Return the exact stamp of a number or a date; `NO_STAMP` for any other cell."""
+    """Return the exact stamp of a number or a date; `NO_STAMP` for a cell that is neither."""
     if unit == 'iso':
         return _iso_ns(str(cell).strip())
     try:

@@ -101,7 +101,7 @@ def _walk(root: str) -> Iterator[str]:
     """Yield the files of a local tree; links are followed, unlike by fsspec."""
     for folder, folders, names in os.walk(root, followlinks=True):
         here = Path(folder).resolve()
-        # Skip links to a containing folder: they would never end.
+        # Skip links to a containing folder: the walk would never end.
         folders[:] = [n for n in folders if Path(folder, n).resolve() not in (here, *here.parents)]
         yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
 
