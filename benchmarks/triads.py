@@ -28,7 +28,7 @@ from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G
 
 #: Kinds of triads, each with one kind of physics beside temperature coefficients. The order of
-#: the kinds numbers the streams of random numbers, after those of the instruments.
+#: the kinds gives the numbers of their streams of random numbers, from `FIRST_KIND`.
 TRIAD_NAMES = (
     *('own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load'),
     *('paper', 'slow-noise', 'plain'),
@@ -81,8 +81,8 @@ def _only(axis: int, value: float) -> Triple:
 
 def triad(kind: str, seed: int = 0) -> UnitModel:
     """
-    Return a triad of bare heads on a board, with temperature coefficients of parts that lag, and
-    the physics of its kind.
+    Return a triad of bare sensor heads on a board, with temperature coefficients of parts that
+    lag, and the physics of its kind.
     """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']

@@ -78,7 +78,7 @@ class Specimen:
         )
 
     def triad(self, network: ThermalNetwork, drift: Iterable[Effect], **others: Any) -> UnitModel:
-        """Return a triad of bare heads on a board, with random constants."""
+        """Return a triad of bare sensor heads on a board, with random constants."""
         # Noise of 3 ug/sqrt(Hz) and the converter's rounding at 4 Hz give 60 s means an sd of 0.65
         # ug.
         noise: dict[str, Any] = {'noise_density': (3.0, 3.0, 3.0), 'full_scale_g': 9.975}
