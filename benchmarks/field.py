@@ -72,7 +72,7 @@ def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, F
 
 
 def errors_of(series: Series, calibrated: Calibration, force: Floats) -> Floats:
-    """Return the errors of |f| and of the axes x, y, z, shape (n, 4)."""
+    """Return the errors of |f| and of the axes x, y, z [m/s^2], shape (n, 4)."""
     f = series.force @ np.array(calibrated.misalignment).T
     return np.column_stack((series.residual, f - force))
 

@@ -156,7 +156,7 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
 
 
 def process_cpu() -> float:
-    """Return the processor time of this process including its threads."""
+    """Return the processor time of this process including its threads [s]."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 

@@ -63,7 +63,7 @@ def table(title: str, rows: Rows) -> None:
 
 
 def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
-    """Return onset delays by sensor, and those of a CUSUM test that knows the ramp."""
+    """Return onset delays [s] by sensor, and those of a CUSUM test that knows the ramp."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, n, seed, rippled) for scene in scenes for rippled in (False, True)]

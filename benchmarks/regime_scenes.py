@@ -79,7 +79,7 @@ def known_signature_delays(
     scene: Scene, per_hour: float, hours: float, n: int, seed: int
 ) -> tuple[float, float]:
     """
-    Return median and 95 % delay of a CUSUM with known ramp, baseline and noise.
+    Return median and 95 % delay [s] of a CUSUM with known ramp, baseline and noise.
 
     Page's statistic with the signature of the true ramp: the largest log likelihood ratio over the
     onset times. The threshold of the statistic follows from the exceedances counted in noise
