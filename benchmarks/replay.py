@@ -67,20 +67,20 @@ def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
 
 
 def read(path: Path) -> int:
-    """Read a bag to columns, block by block."""
+    """Read a bag to columns, block by block; return the number of samples."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
 
 def read_and_compensate(path: Path) -> int:
-    """Read a bag to columns and correct them."""
+    """Read a bag to columns and correct them; return the number of samples."""
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
         return sum(len(process_block(compensator, block).index) for block in reader.blocks())
 
 
 def compensate(path: Path) -> tuple[int, float]:
-    """Correct columns; return their number and the CPU seconds of the correction alone."""
+    """Correct a bag's columns; return the number of samples and the correction's CPU time [s]."""
     compensator = Compensator(calibration())
     spent = 0.0
     n = 0
