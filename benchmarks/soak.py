@@ -8,9 +8,9 @@ Soaks the node: hours at full rate with reloads and regime changes; every sample
 The node runs in a separate process, with settings under which no message is lost. The temperatures
 ramp up, rest, ramp down and rest every three minutes, so the regime changes; `calibration_file` is
 set every two seconds. The resident memory of the node is read every second, the latency of the
-samples (from before the publish call to after the take) every ten seconds. The slopes of
-memory and latency are least squares over the run without its first tenth, with the standard error
-of independent windows of a minute. The exit code is 1 if a sample is missing.
+samples (from before the publish call to after the take) every ten seconds. The slopes of memory
+and latency are least squares over the run without its first tenth, with the standard error of
+independent windows of a minute. The exit code is 1 if a sample is missing.
 """
 
 from __future__ import annotations

@@ -189,7 +189,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # If the expanded uncertainty U is withheld, its known part gives the digits of the value.
+        # The known part of a withheld expanded uncertainty sets the digits of value and deviation.
         digits = np.where(known * sd > 0.0, known * sd, _four_digits(value))
         sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         for k, table in enumerate(tables):

@@ -127,8 +127,8 @@ def positions(n: int, seed: int = 0) -> Floats:
     Six attitudes are the faces of a cube, nine the corners of a three-capped prism, twelve the
     corners of an icosahedron: the best sets of 6, 9 and 12 attitudes to determine bias, scale and
     misalignment. Up to 26 attitudes, except 9 and 12, take the faces of a cube, then its edges,
-    then its corners; more attitudes than 26 follow a uniform spiral on the sphere. The vectors of
-    6, 9, 12, 18, 24 and 26 attitudes sum to 0. `seed` tilts each attitude by a small random angle.
+    then its corners; more than 26 attitudes follow a uniform spiral on the sphere. Sets of 6, 9,
+    12, 18, 24 and 26 vectors sum to about 0. `seed` tilts each attitude by a small random angle.
     """
     if n == 9:
         # The prism has three corners on the equator, and six between them at elevations of +-44

@@ -37,7 +37,7 @@ class PartHistory:
     step: float
 
     def of(self, part: str) -> Floats:
-        """Return one part's deviation from the reference's steady state [K], shape (m,)."""
+        """Return a part's temperature deviation from the reference's steady state [K], (m,)."""
         return self.deviation[:, self.nodes.index(part)]
 
 
