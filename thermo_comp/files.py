@@ -195,7 +195,7 @@ class Draft:
     def _move_folder(self) -> None:
         old = None
         if self._is_replacing and self._target.exists():
-            # The operating system replaces a folder only if that folder is empty.
+            # Rename the old folder first: the operating system only replaces an empty folder.
             old = self._target.rename(_hidden_sibling(self._target))
         try:
             self.partial.rename(self._target)

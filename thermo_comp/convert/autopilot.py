@@ -300,7 +300,7 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
 
 
 def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments: Any) -> Any:
-    """Read a file with the library of an extra."""
+    """Read a file with `module`, the optional library that the extra `extra` installs."""
     read = getattr(library(module, extra, what, path), name)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         # On damaged files the libraries raise any exception.

@@ -198,7 +198,7 @@ def render_fleet(
             [spread.limit for spread in summary.spreads],
         ),
     )
-    # With fewer than eight units all limits of outliers are infinite.
+    # Outliers are not sought with fewer than eight units: all limits are infinite.
     is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
     return render(
         'fleet.html',

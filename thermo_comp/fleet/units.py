@@ -136,7 +136,7 @@ def folders_of_tables(storage: Storage) -> tuple[str, ...]:
     """Name the folders that hold tables, which `convert` reads, and no bag."""
     stored = storage.files()
     with_bags = [f'{_folder(name)}/' for name in group_files(stored)]
-    # A result of an earlier run, fleet.csv, may be in a folder of the fleet.
+    # fleet.csv, the result of an earlier run, is not a table to convert.
     tables = {
         _folder(file.name)
         for file in stored
