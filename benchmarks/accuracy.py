@@ -166,7 +166,7 @@ class Errors:
 
 
 def errors(means: Sequence[Floats], sd: Sequence[Floats], tests: Sequence[SimulatedRun]) -> Errors:
-    """Compare corrected means with the truth."""
+    """Compare corrected means of the specific force with the simulated truth."""
     vector = [
         mean - record.truth.specific_force for mean, record in zip(means, tests, strict=True)
     ]
@@ -198,13 +198,13 @@ def corrected_by_truth(run: SimulatedRun) -> Floats:
 
 
 def floor(tests: Sequence[SimulatedRun]) -> Errors:
-    """Return the errors of the true thermal model, by the noise of the test records alone."""
+    """Return the errors left by the true thermal model: the noise of the test records alone."""
     forces = [corrected_by_truth(record) for record in tests]
     return errors(forces, [np.ones_like(force) for force in forces], tests)
 
 
 def judged(result: Errors, goal: Goal | None, least: Errors) -> str:
-    """Return RMS of |f| - g and of the error vector as a cell, marked above the limits."""
+    """Return RMS of |f| - g and of the error vector as a table cell, marked above the limits."""
     cell = f'{result.norm:.2f} / {result.vector:.2f}'
     if goal is None:
         return cell

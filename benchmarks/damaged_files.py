@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the damages to the file of a bag: bits flipped, parts wiped or cut off, rows removed, a bomb.
+Owns the damages to the file of a bag: bits flipped, parts wiped or cut off, rows removed, a
+compression bomb.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _leaning(force: np.ndarray) -> np.ndarray:
-    """Add a large part of x to y, which no real triad has."""
+    """Add a large part of axis x to axis y: a misalignment that no real triad has."""
     return force @ np.array([[1.0, 0.6, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -149,7 +149,7 @@ def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rosbag2(storage: StoragePlugin, mode: CompressionMode | None) -> Callable[[Path], Path]:
-    """Write the whole recording in another storage."""
+    """Write the whole recording as rosbag2 with a given storage plugin and compression."""
 
     def make(folder: Path) -> Path:
         bare = write(folder, whole())

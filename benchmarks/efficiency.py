@@ -47,7 +47,8 @@ def exact_unit(seed: int) -> UnitModel:
 
 def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) -> Floats:
     """
-    Return the Cramer-Rao bounds of bias [counts] and ln K at the reference as sd, shape (2, 3).
+    Return the Cramer-Rao bounds of bias [counts] and ln K at the reference temperature, as sd,
+    shape (2, 3).
 
     The bounds are computed without the fit, by numerical derivatives of window means of counts
     with white noise. The unknowns are two angles of each attitude, M, and for each axis bias and
@@ -102,7 +103,7 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
 
 def efficiency(n_units: int) -> None:
-    """Compare bias and scale at the reference with the Cramer-Rao bound."""
+    """Compare bias and scale at the reference temperature with the Cramer-Rao bound."""
     print(
         '| positions | units | bias: RMS error / bound | scale | bias: error / claimed sd | scale '
         '| 95 % intervals, bias | scale |'

@@ -10,7 +10,8 @@ days: bias walk 15 ug and scale walk 10 ppm per root day, turn-on 20 ug, one sho
 unit. On several days the calibration is updated with all rests so far, as in `thermo_comp update`,
 and judged on the rests of the next day. At the end the errors of the calibration are compared with
 those of a Kalman filter that is given the process and the time of the shock. With --recordings
-FOLDER, the real recordings in FOLDER are cut into parts, and updates are judged on the next part.
+FOLDER, the real recordings in FOLDER are cut into parts, and an update by all parts so far is
+judged on the next part.
 """
 
 from __future__ import annotations
@@ -53,7 +54,10 @@ LABORATORY = calibration()
 
 
 def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, Floats]:
-    """Build noise-free rests in use: rests, counts / K, board temperature [K], true forces."""
+    """
+    Build noise-free rests in attitudes of use; return the rests, their counts / `K`, their board
+    temperatures less the reference [K], and the true forces [m/s^2].
+    """
     rng = np.random.default_rng(seed)
     force = G * np.array([attitude(kind, rng) for _ in range(N_PROBES)])
     warmth = rng.normal(0.0, 5.0, N_PROBES)
@@ -68,7 +72,7 @@ def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, F
 
 
 def errors_of(series: Series, calibrated: Calibration, force: Floats) -> Floats:
-    """Return the errors of |f| and of the axes x, y, z, shape (n, 4)."""
+    """Return the errors of |f| and of the axes x, y, z [m/s^2], shape (n, 4)."""
     f = series.force @ np.array(calibrated.misalignment).T
     return np.column_stack((series.residual, f - force))
 
@@ -80,9 +84,11 @@ def root_mean(values: Floats) -> float:
 
 def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     """
-    Return whether the update, and the best filter, have a larger error than the old file on a day.
+    Return whether the update, and the best filter, have a larger error on the rests of a day than
+    the old calibration.
 
-    The excess must be above the standard error of an RMS over n starts, claimed sd / sqrt(2 n).
+    The excess of the error must be above the standard error of an RMS over n turn-ons, claimed sd
+    / sqrt(2 n).
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
@@ -103,14 +109,14 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
 
 
 def filtered(history: History, process: Process, days: int) -> Floats:
-    """Return the state of the best filter after the first days, without the last turn-on."""
+    """Return the state of the best filter after `days` days, without the last turn-on offset."""
     state = best(history, process, days).state.copy()
     state[21:] = 0.0
     return state
 
 
 def best(history: History, process: Process, days: int) -> BestFilter:
-    """Run the best filter over the rests of the first days, each averaged as one measurement."""
+    """Run the best filter over the rests of the first `days` days, a measurement for each rest."""
     found = BestFilter(process)
     rests: dict[tuple, list[Rest]] = defaultdict(list)
     for (_, rest), day, start in zip(history.rests, history.day, history.start, strict=True):
@@ -149,8 +155,8 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
     kalman = filtered(history, process, days)
     f = corrected(counts, warmth, kalman)
     of_best = np.column_stack((np.linalg.norm(f, axis=1) - G, f - force))
-    # The claimed sd is that of a window a day later, after another start: add turn-on, noise and a
-    # day's walk to the error.
+    # The claimed sd is that of a window a day later, after another turn-on: add the offset of the
+    # turn-on, noise and a day's walk to the error.
     rng = np.random.default_rng([seed, 9])
     of_bias = np.hypot(process.turn_on, process.bias)
     more = (series.direction * rng.normal(0.0, of_bias, (N_PROBES, 3))).sum(axis=1)

@@ -32,7 +32,7 @@ from thermo_comp.unit.calibration import Calibration
 
 
 def part(of: Columns, begin: float, end: float) -> Columns:
-    """Cut seconds out of a recording."""
+    """Cut the time from `begin` to `end` [s] out of a recording."""
 
     def cut(time_s: np.ndarray, *values: np.ndarray) -> tuple[np.ndarray, ...]:
         is_in = (time_s >= begin) & (time_s < end)
@@ -44,7 +44,7 @@ def part(of: Columns, begin: float, end: float) -> Columns:
 
 
 def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple[Start, Rest]]:
-    """Return the rest log that a node would write if it started at the beginning of a part."""
+    """Return the rest log that a node started at the beginning of a recording would write."""
     compensator = Compensator(calibration)
     correction = compensator.thermal.correction
     start = Start(

@@ -4,9 +4,10 @@
 Owns the ageing units of the benchmark `field.py`: physics, rests, reference filter.
 
 A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
-calibration states. In the field bias and scale walk at random, each start has another bias offset,
-and one shock moves the biases. The forward model and the Kalman filter are written here in numpy
-and share no code with the update; the filter is given the true variances and the shock's start.
+calibration states. In the field bias and scale walk at random, each turn-on has another bias
+offset, and one shock moves the biases. The forward model and the Kalman filter are written here in
+numpy and share no code with the update; the filter is given the true variances and the time of the
+shock.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ CREATED = '2026-01-01T00:00:00Z'
 DAY_ZERO = 20454  # 2026-01-01 in days since 1970
 #: Slope of the bias [m/s^2 per K] and of the scale [1/K] that the calibration corrects.
 SLOPE, SCALE_SLOPE = 30 * UG, 1e-5
-#: Sd of the calibration's error: bias, its slope per K, scale, its slope per K, misalignment.
+#: Sd of the calibration's error: bias and its slope per K [m/s^2], relative scale and its slope
+#: per K, misalignment [rad].
 PRIOR = np.repeat([10 * UG, 0.3 * UG, 10e-6, 0.3e-6, 5e-6], 3)
 #: Length of a window [s], and density of its white noise [m/s^2/sqrt(Hz)].
 WINDOW_S, NOISE = 10.0, 60 * UG
@@ -65,7 +67,7 @@ class History:
     """Rests of a unit, and its true deviations from the calibration after each day."""
 
     rests: list[tuple[Start, Rest]] = field(default_factory=list)
-    #: For each window: day, number of the start, direction of f.
+    #: For each window: day, and number of the turn-on.
     day: list[int] = field(default_factory=list)
     start: list[int] = field(default_factory=list)
     states: list[Floats] = field(default_factory=list)
@@ -101,7 +103,7 @@ def calibration() -> Calibration:
 
 
 def _parts(state: Floats, warmth: Floats) -> tuple[Floats, Floats, Floats]:
-    """Evaluate bias [m/s^2], relative scale and M of deviations (15,) or (15 + 9,)."""
+    """Return bias [m/s^2], relative scale and M for deviations `state`, shape (15,) or (24,)."""
     bias, slope, scale, scale_slope, tilt = state[:15].reshape(5, 3)
     if len(state) > 15:
         walk_bias, walk_scale, turn_on = state[15:].reshape(3, 3)
@@ -157,7 +159,7 @@ def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[flo
 
 
 def live(kind: str, seed: int, days: int, process: Process) -> History:
-    """Let a unit age: three starts a day, two to ten minutes of rest each."""
+    """Let a unit age: three turn-ons a day, each with a rest of two to ten minutes."""
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     state = np.concatenate((PRIOR * rng.standard_normal(15), np.zeros(9)))
     history, before, is_shocked, n_starts = History(), 0.0, False, 0

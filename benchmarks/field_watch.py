@@ -5,12 +5,13 @@ Measures verdict and forecasts of the drift watch against simulated units (`fiel
 
     python benchmarks/field_watch.py [--units 20] [--days 30]
 
-Units of five kinds of attitudes age by random walks of known sd and write rests. The bound is a
-tolerance of 200 ug. For each unit 200 futures are drawn: its random walk goes on until the RMS of
-|f| - g over the attitudes of use, with the scatter of the starts, exceeds the bound. The figures
-are the share of futures within the printed 10 to 90 % interval, and the median time divided by the
-printed median. In a second part, the verdicts of level and carried units, half of which do not
-age, are taken every five days; the figures are the share of "outside", by classes of the true RMS.
+Units with attitudes of five kinds age by random walks of known sd and log rests. For each unit 200
+futures are drawn: the random walk goes on until the RMS of |f| - g over the attitudes of use, with
+the scatter of the turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast are the share
+of the drawn times within its 10 to 90 % interval, and its median divided by the median drawn time.
+In a second part, a verdict is taken every five days on level and on carried units, half of which
+do not age; the figures are the number of verdicts "outside", by classes of the true RMS of |f| - g
+divided by the limit.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from thermo_comp.field.series import Series, series_of
 from thermo_comp.field.update import update
 from thermo_comp.field.watch import LIMIT, watch
 
-#: Classes of the true RMS divided by the limit.
+#: Classes of the true RMS of |f| - g divided by the limit.
 CLASSES = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 9.0)
 LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
@@ -35,7 +36,7 @@ def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generat
     """Draw the days until the RMS of |f| - g exceeds a bound, for 200 futures, in steps of 8 h."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
-    # The norm of `root @ (1, levels)` is the RMS over the rests of `probe`.
+    # The norm of `root @ (1, levels)` is the RMS of |f| - g over the rests of `probe`.
     joined = np.column_stack((probe.residual, probe.by_level)) / np.sqrt(len(probe))
     root = np.asarray(np.linalg.qr(joined, mode='r'))
     for step in range(3 * 3650):
@@ -50,10 +51,10 @@ def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generat
 
 def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
     """
-    Compare forecasts and recalibration intervals with simulated times of leaving the claim.
+    Compare forecasts and recalibration intervals with simulated times to the tolerance [days].
 
     Each row has the share of simulated times in the forecast's 10 to 90 % interval, the median of
-    the times, and the forecast's quantiles.
+    the simulated times [days], and the forecast's quantiles [days].
     """
     rng, process = np.random.default_rng(3), Process()
     found: dict[str, list[tuple[float, ...]]] = {'forecast': [], 'interval': []}

@@ -156,7 +156,7 @@ def measure(folder: Path, n_units: int, n_workers: int, options: FleetOptions) -
 
 
 def process_cpu() -> float:
-    """Return the processor time of this process including its threads."""
+    """Return the processor time of this process including its threads [s]."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
@@ -237,7 +237,7 @@ def overhead(folder: Path, n_units: int) -> None:
 
 
 def kill(folder: Path, n_units: int, model: str) -> int:
-    """Kill a worker twice during a run, each time while it fits a unit; count the rows."""
+    """Kill a worker twice in a run, while it fits a unit; return the number of lost results."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fleet = Path(tempfile.mkdtemp(prefix='fleet-', dir=folder))
     for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:
@@ -272,7 +272,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
 
 
 def paper(found: Measured) -> None:
-    """Estimate 100 and 1000 workers, to which one scheduler sends the measured tasks singly."""
+    """Estimate runs with 100 and 1000 workers if one scheduler sends the measured tasks singly."""
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
     print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')

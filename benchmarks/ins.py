@@ -6,8 +6,8 @@ Owns the position error of an inertial navigator due to accelerometer drift, raw
 A platform stands in the chamber of the held-out bag, so that any motion that its navigator
 computes is an error. The navigator levels itself for five minutes, then navigates freely for half
 an hour; or it gets a zero-velocity update (ZUPT) every minute, and then coasts for five minutes.
-One flight of each kind begins in every minute of the run, with the raw accelerometer, with one set
-of coefficients, and compensated.
+One flight of each kind begins in every minute of the run, with the raw samples, with the samples
+corrected by one set of coefficients, and with the compensated samples.
 
 The gyroscopes are ideal and the Earth does not rotate, so that only the accelerometer matters; the
 height, which needs a barometer, is kept constant. The filter has four errors per level axis,
@@ -44,7 +44,7 @@ EARTH_RADIUS = 6.371009e6
 ALIGN_S, FREE_S, COAST_S, STANDING_S = 300.0, 1800.0, 300.0, 1500.0
 #: Interval of zero-velocity updates, their sd [m/s], and interval between starts of flights.
 ZUPT_S, ZUPT_SD, EVERY_S = 60.0, 1e-3, 60.0
-#: Correlation time of the accelerometer's error in the filter: some lags of a board.
+#: Correlation time of the accelerometer's error in the filter [s]: a few lags of a board.
 BIAS_S = 1800.0
 COLOURS = {'raw': '#b2182b', 'one set': '#e08214', 'compensated': '#2166ac'}
 
@@ -91,7 +91,7 @@ class Navigator:
         self.position = self.position + self.velocity * dt
 
     def correct(self, gain: Floats, innovation: Floats) -> None:
-        """Subtract the estimated errors p, v, a, b of both level axes."""
+        """Correct position, velocity, attitude and bias by the errors of both level axes."""
         level = innovation[..., :2, None] * gain
         up = np.zeros((*level.shape[:-2], 1))
         position, velocity, tilt, bias = (
@@ -117,7 +117,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Flights:
-    """Errors of all flights over time, shape (steps, flights), and the filter's sigma."""
+    """Errors of all flights over time, shape (steps, flights), and sigma of the position [m]."""
 
     time_s: Floats
     position: Floats
@@ -161,8 +161,8 @@ def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> 
 
 def models() -> tuple[dict[str, Model], float, Floats, float]:
     """
-    Fit the sample bags and correct the held-out bag; also return its step [s], true up and
-    gravity.
+    Fit the sample bags and correct the held-out bag; also return the bag's sample interval [s],
+    true direction of up and gravity [m/s^2].
     """
     bags, held_out = sorted((BAGS / 'fit').glob('*.mcap')), BAGS / 'held_out.mcap'
     full = tc.fit(bags, gravity=9.80665)

@@ -236,7 +236,7 @@ def _process(role: str, options: list[str]) -> Iterator[subprocess.Popen[str]]:
         try:
             process.wait(timeout=3)
         except subprocess.TimeoutExpired:
-            # rclpy.spin sometimes misses a signal.
+            # Kill the process, as rclpy.spin sometimes misses SIGTERM.
             process.kill()
 
 
@@ -252,7 +252,7 @@ def _machine_time() -> tuple[int, int]:
     file = Path('/proc/stat')
     if not file.is_file():
         return 0, 0
-    # user nice system idle iowait irq softirq steal
+    # /proc/stat begins with the times: user nice system idle iowait irq softirq steal.
     ticks = [int(field) for field in file.read_text(encoding='utf-8').split()[1:9]]
     return ticks[7], sum(ticks)
 

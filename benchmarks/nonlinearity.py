@@ -45,7 +45,7 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit by its truth, columns x, y, z; K2 [g/g^2], K3 [g/g^3] change by a `share` per K."""
+    """True constants of a unit for x, y, z; K2 [g/g^2], K3 [g/g^3] change by a `share` per K."""
 
     scale: Floats
     scale_slope: Floats
@@ -188,7 +188,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
     result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # A fit with nonlinear terms pinned to 0 by their prior shows the change of bias and scale.
+        # Repeat the fit with K2 and K3 pinned to 0: do nonlinear terms change bias and scale?
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])

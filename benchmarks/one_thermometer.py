@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the table of the benefit of a second thermometer: fits with and without the case, on new runs.
+Owns the table of the benefit of a second thermometer: fits with and without the case thermometer,
+judged on held-out bags.
 
 python benchmarks/one_thermometer.py
 """

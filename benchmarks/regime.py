@@ -63,7 +63,7 @@ def table(title: str, rows: Rows) -> None:
 
 
 def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
-    """Return onset delays by sensor, and those of a CUSUM test that knows the ramp."""
+    """Return onset delays [s] by sensor, and those of a CUSUM test that knows the ramp."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, n, seed, rippled) for scene in scenes for rippled in (False, True)]
@@ -144,7 +144,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count detected and missed ramps, and flips of the state, by the rate of the readings."""
+    """Count all ramps, missed ramps and ramps whose flag flips, by the rate of the readings."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]
@@ -191,7 +191,7 @@ def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Count switches in soaks."""
+    """Count switches of the regime in soaks."""
     hours = 25.0 if arguments.quick else arguments.soak_hours
     yield 'Switches in soak with ripple and drift, 1 Hz', soak_table(pool, hours, arguments.seed)
 
@@ -209,7 +209,7 @@ def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_cost(_pool: Pool, _arguments: argparse.Namespace) -> Tables:
-    """Measure the time that a reading takes."""
+    """Measure the time that the detector takes for a reading."""
     yield 'Cost', cost_table()
 
 

@@ -15,7 +15,7 @@ BLUE, RED, GREEN = '#0072b2', '#d55e00', '#009e73'
 
 
 def plot_ramp(t: Floats, case: Floats, board: Floats, is_dynamic: Bools, folder: Path) -> None:
-    """Draw one ramp and its relaxation: temperatures, derivatives of the case, the flag."""
+    """Draw a ramp and its relaxation: temperatures, derivatives of the case temperature, flag."""
     minutes = t / 60.0
     rate = np.gradient(case, t) * 60.0
     bend = np.gradient(rate, t) * 60.0

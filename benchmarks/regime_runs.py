@@ -65,7 +65,7 @@ def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
 
 
 def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
-    """Return onset delay, flips of the state and flagged share of ramps from 0 to `duration`."""
+    """Return onset delays, flips of the flag and flagged share of ramps from 0 to `duration` s."""
     outcome = Outcome([], 0, 0, 0, 0.0, 0)
     for t, flag in flags:
         outcome.n += 1
@@ -89,7 +89,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     """Run the package's detector over ramps of one scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
-    # The ramp lasts four quanta of the sensor and two lags, within 40 min and 2 h.
+    # The ramp lasts for four quanta of the sensor and two lags, but 40 min at least, 2 h at most.
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)

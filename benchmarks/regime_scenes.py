@@ -50,7 +50,7 @@ def second_order(t: Floats, lag: float, other: float) -> Floats:
 def temperatures(
     scene: Scene, t: Floats, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
 ) -> tuple[Floats, Floats]:
-    """Return case and board for a ramp from 0 to `duration`; no ramp if the duration is 0."""
+    """Return case and board temperatures for a ramp from 0 to `duration`; 0: no ramp."""
     rate = scene.ramp_k_min / 60.0 * rng.choice((-1.0, 1.0))
     start = 20.0 + rng.uniform(-0.5, 0.5) * max(scene.quantum, 0.1)
     board_lag = BOARD_LAG_S if abs(BOARD_LAG_S - scene.lag_s) > 1.0 else 1.01 * scene.lag_s
@@ -70,7 +70,7 @@ def temperatures(
 
 
 def read(truth: Floats, scene: Scene, rng: np.random.Generator) -> Floats:
-    """Return the readings of a sensor."""
+    """Return the readings of a sensor [degC], with its noise and rounding."""
     reading = truth + rng.normal(0.0, scene.noise_sd, truth.shape)
     return np.round(reading / scene.quantum) * scene.quantum if scene.quantum else reading
 
@@ -79,7 +79,7 @@ def known_signature_delays(
     scene: Scene, per_hour: float, hours: float, n: int, seed: int
 ) -> tuple[float, float]:
     """
-    Return median and 95 % delay of a CUSUM with known ramp, baseline and noise.
+    Return median and 95 % delay [s] of a CUSUM with known ramp, baseline and noise.
 
     Page's statistic with the signature of the true ramp: the largest log likelihood ratio over the
     onset times. The threshold of the statistic follows from the exceedances counted in noise

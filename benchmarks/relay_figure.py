@@ -26,7 +26,7 @@ STYLES = {'reliable': ('-', 'o'), 'best_effort': ('--', 's')}
 
 
 def draw(measured: list[dict[str, Any]], path: Path) -> None:
-    """Draw both panels into one file."""
+    """Draw a panel of CPU time and a panel of latency into one file."""
     figure, (cpu, latency) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout='constrained')
     for reliability, (line, marker) in STYLES.items():
         cases = [case for case in measured if case['reliability'] == reliability]
@@ -53,7 +53,7 @@ def draw(measured: list[dict[str, Any]], path: Path) -> None:
 
 
 def main() -> None:
-    """Read the figures and draw them."""
+    """Read the results of `node_relay.py` and draw the figure."""
     parser = argparse.ArgumentParser(description='Draw the figures of node_relay.py.')
     parser.add_argument('figures', type=Path, nargs='+', help='what `node_relay.py --json` wrote')
     parser.add_argument('picture', type=Path, help='PNG file to write')

@@ -53,7 +53,7 @@ def _source(arguments: argparse.Namespace) -> None:
 
     rclpy.init()
     node = rclpy.create_node('source')
-    # The publisher is reliable, so that it matches both kinds of subscription.
+    # The publisher is reliable, so that it matches reliable and best-effort subscriptions.
     qos = _qos('reliable', arguments.depth)
     counts = node.create_publisher(Vector3Stamped, 'accel/counts', qos)
     temperatures = [

@@ -3,10 +3,10 @@
 """
 Owns the measurement of the offline run: reading, compensating and writing a bag, in one run.
 
-The library is measured as `thermo_comp replay` uses it. The peer is a script with rosbags that
-reads and deserializes each message, corrects the message with the same compensator, serializes and
-writes it. The library and the peer write chunks packed with zstd. All bags hold 400 Hz of counts
-and two temperatures at 1 Hz.
+The library of thermo_comp is measured as `thermo_comp replay` uses it. The peer is a script with
+rosbags that reads and deserializes each message, corrects the message with the same compensator,
+serializes and writes it. thermo_comp and the peer write chunks packed with zstd. All bags hold
+400 Hz of counts and two temperatures at 1 Hz.
 
     python benchmarks/replay.py --hours 24        # time of reading and compensating a day
     python benchmarks/replay.py --gigabytes 10    # peak memory of a replay of a large bag
@@ -67,20 +67,20 @@ def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
 
 
 def read(path: Path) -> int:
-    """Read a bag to columns, block by block."""
+    """Read a bag to columns, block by block; return the number of samples."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
 
 def read_and_compensate(path: Path) -> int:
-    """Read a bag to columns and correct them."""
+    """Read a bag to columns and correct them; return the number of samples."""
     compensator = Compensator(calibration())
     with open_recording(path) as reader:
         return sum(len(process_block(compensator, block).index) for block in reader.blocks())
 
 
 def compensate(path: Path) -> tuple[int, float]:
-    """Correct columns; return their number and the CPU seconds of the correction alone."""
+    """Correct a bag's columns; return the number of samples and the correction's CPU time [s]."""
     compensator = Compensator(calibration())
     spent = 0.0
     n = 0
@@ -153,7 +153,7 @@ def seconds(run: Callable[[], object], repeats: int = 1) -> tuple[float, float]:
 
 
 def pipelines(folder: Path, n: int, repeats: int) -> None:
-    """Print the samples per second of both pipelines, from bag to bag."""
+    """Print the samples per second from bag to bag, by rosbags and by thermo_comp."""
     path, output = folder / 'in.mcap', folder / 'out'
     n_peer = n // 20
     peer = folder / 'peer.mcap'

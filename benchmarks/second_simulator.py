@@ -9,8 +9,8 @@ Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md,
 Air, case, board, three heads and their pendulums are nodes of one ODE network, integrated in steps
 of 2 s; the board's own heat makes it warmer than the case. Bias and scale are functions of the
 pendulums' temperatures. Samples come at 1 Hz with 5 ug of noise, thermometers at 0.5 Hz with 5 mK.
-Three runs are held out, with other attitudes, ramps, orders, and another temperature at which the
-unit has soaked.
+Three runs are held out, with attitudes, ramps, order of ramps and temperature of the first soak
+other than in the runs of the fit.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ Soaks the node: hours at full rate with reloads and regime changes; every sample
 The node runs in a separate process, with settings under which no message is lost. The temperatures
 ramp up, rest, ramp down and rest every three minutes, so the regime changes; `calibration_file` is
 set every two seconds. The resident memory of the node is read every second, the latency of the
-samples (from before the publish call to after the take) every ten seconds. Slopes are least
-squares over the run without its first tenth, with the standard error of independent windows of a
-minute. The exit code is 1 if a sample is missing.
+samples (from before the publish call to after the take) every ten seconds. The slopes of memory
+and latency are least squares over the run without its first tenth, with the standard error of
+independent windows of a minute. The exit code is 1 if a sample is missing.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Temperatures:
         self.case = self.board = 20.0
 
     def step(self, seconds: float) -> tuple[float, float]:
-        """Advance by one reading; return (board, case)."""
+        """Advance by one reading; return the temperatures of board and case [degC]."""
         phase = seconds % (2.0 * (RAMP_S + REST_S))
         up = min(phase, RAMP_S) - min(max(phase - RAMP_S - REST_S, 0.0), RAMP_S)
         dt = 1.0 / READINGS_HZ
@@ -254,7 +254,8 @@ def _resident_kib(pid: int) -> float:
 
 def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, float] | None:
     """
-    Return the slope per hour and its standard error, from means over windows; None in a short run.
+    Return the slope per hour and its standard error, from means over windows; None if the run is
+    short.
     """
     table = np.array(rows)
     table = table[table[:, 0] >= 0.1 * table[-1, 0]]

@@ -14,7 +14,8 @@ is measured on recordings that were not fitted, unless the row states otherwise.
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
 is the RMS of error / claimed sd. Figures are RMS over the units. MISS marks a limit of
 `strangers_limits.py` that a row exceeds; the exit code is then 1. The baselines fitted by the
-package take most of the time; ``--baselines strangers.json`` reads them from an earlier run.
+package take most of the time; ``--baselines strangers.json`` reads the scores of the baselines
+from an earlier run.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class Corrected:
 def fitted(
     study: Study, prior: thermo_comp.Calibration | None = None, **model: Any
 ) -> thermo_comp.Calibration:
-    """Fit a study's bags; `model` holds further options."""
+    """Fit a study's bags; `model` holds further options of the fit."""
     # Leave out the option `gravity_sd` for versions of the package that lack this option.
     known = {option.name for option in fields(FitOptions)}
     options = {name: value for name, value in study.options.items() if name in known}
@@ -110,8 +111,9 @@ def corrected(
     out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
     first, size = slots(bag)
     force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
-    # The published covariance is that of one sample. White noise and the rounding of the converter
-    # average down over a minute; the other errors are common to all samples of a minute.
+    # The published covariance is that of one sample, not of a mean over a minute. White noise and
+    # the rounding of the converter average down over a minute; the other errors are common to all
+    # samples of a minute.
     density = np.square(calibration.noise_density_m_s2_sqrt_hz)
     scale = np.array([axis.scale_factor for axis in calibration.axes])
     rounding = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
@@ -193,7 +195,7 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     unit, cycle_s = study.bound.unit, calibration.unit.cycle_time_s
     time_s = cycle_s * np.arange(1.0, 3600.0 / cycle_s)
     zero = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
-    # Readings without noise would be taken for those of a broken thermometer.
+    # Readings have noise, as constant readings would be taken for those of a broken thermometer.
     rng, read_s = rng_of('rest'), np.arange(0.0, 3600.0, 5.0)
     rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
     temperatures = {
@@ -221,9 +223,9 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     """
     Return a calibration whose covariance has no constants: bias, scale and misalignment.
 
-    One pose determines the constants to 50 mg only. The constants cancel in the drift of one pose,
-    but not in the difference of two variances: an acceleration `a` contributes ``a^2`` times the
-    variance of the scale factor, and has noise.
+    One pose determines the constants to 50 mg only. The drift of one pose does not contain the
+    constants, but the difference of two claimed variances does: an acceleration `a`, which has
+    noise, contributes ``a^2`` times the variance of the scale factor.
     """
     if calibration.posterior is None:
         return calibration
@@ -334,7 +336,7 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Studies of one label, each with another bag left out, are numbered like units.
+                # Studies of one label, which leave out different bags, are numbered like units.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)

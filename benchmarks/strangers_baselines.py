@@ -21,8 +21,8 @@ from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
 Ints = npt.NDArray[np.int64]
 
 WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
-#: Largest bias [g], error of the scale and misalignment of a plausible unit. Without a bound the
-#: best fit to few attitudes has scale factors that make the forces of all attitudes equal.
+#: Largest bias [g], error of the scale and misalignment of a plausible unit. An unbounded fit to
+#: few attitudes finds scale factors that make the forces of all attitudes equal.
 LARGEST = 0.2
 SPAN_K = (
     15.0  # unit of the temperatures of a cubic, so that its powers have similar magnitudes [K]

@@ -49,7 +49,7 @@ HELD = (
 )
 FROST = program(5, 10, (12, 0.5, 60), (28, 0.8, 30))
 ROOM = program(21, 20)
-#: The range of SHORT ends 2 K before the range of USE, on both sides.
+#: The temperatures of the program SHORT end 2 K before those of the programs USE on both sides.
 SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
 USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
 #: Programs of the tests of MEMS units, as in a simple oven.
@@ -99,7 +99,10 @@ class Study:
 
 @dataclass(frozen=True)
 class Bound:
-    """True bias at the reference, and the smallest sd that an unbiased fit may have [m/s^2]."""
+    """
+    True bias at the reference temperature, and the smallest sd that an unbiased fit may have
+    [m/s^2].
+    """
 
     unit: Unit
     bias: Floats
@@ -363,7 +366,7 @@ def cold_start(number: int) -> Iterator[Study]:
 
 
 def slow_thermometer(number: int) -> Iterator[Study]:
-    """Record with a board thermometer that lags by 30 to 90 s; bags of the fit have FROST."""
+    """Record with a board thermometer that lags by 30 to 90 s; the fit has the program FROST."""
     rng = rng_of('slow-thermometer', number)
     unit = navigation(rng, thermometer_s=rng.uniform(30, 90), sensors=('board',))
     fit = positions(unit, FROST, spread(12, rng), rng)
@@ -430,8 +433,9 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     Return the Cramer-Rao bound of the bias at the reference temperature, shape (3,), for a unit
     whose bias and scale factor are parabolas.
 
-    The unknowns are the constants, both parabolas, and the direction of each position. The data
-    are the means of the three axes over windows that are short compared with the program.
+    The unknowns are the constants, the parabolas of bias and scale, and the direction of each
+    position. The data are the means of the three axes over windows that are short compared with
+    the program.
     """
     n = len(up)
     tangents = np.array([np.linalg.svd(attitude[None])[2][1:] for attitude in up])

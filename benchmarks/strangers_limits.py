@@ -121,15 +121,16 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # In 'returned' `score` subtracts the variance of a slope, that at the reference: no limit.
+    # The variance at the reference temperature, which `score` subtracts for 'returned', contains
+    # that of a slope: error / claimed sd has no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
     'mems': _TURN_ON,
-    # One recording does not show how well turn-ons repeat.
+    # One recording does not show how well turn-ons repeat: error / claimed sd has no limit.
     'sessions one': Limit(high=np.inf),
     'sessions two': Limit(low=0.7, high=1.4),
-    # An update has the error of the joint fit, within the noise of the sd of turn-ons.
+    # The error after an update is that of the joint fit, within the noise of the sd of turn-ons.
     'sessions update': Limit(than='two', times=1.05),
     'ageing': Limit(),
     'kink': Limit(norm=12.0),
@@ -140,7 +141,8 @@ LIMITS = {
     # The baselines use the fit's wrong gravity, which no data show: limit only error / claimed sd.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
-    # The claimed sd contains flicker noise over times that are longer than the recordings.
+    # The claimed sd contains flicker noise over times that are longer than the recordings: the
+    # error may be half the claimed sd.
     'flicker': Limit(low=0.5, high=1.4, unit=2.0),
     'slow-thermometer': Limit(),
     'third-node alone': Limit(),
@@ -160,7 +162,7 @@ LIMITS = {
 @dataclass(frozen=True)
 class Row:
     """
-    RMS over the units of one row.
+    A row of the results: a case, a study and held-out bags, with RMS figures over the units.
 
     Parameters
     ----------
@@ -198,7 +200,7 @@ def judged_ratio(score: Score) -> float:
 
 
 def rows_of(results: Sequence[Result]) -> list[Row]:
-    """Average over the units of each row; the rows are in the order of the results."""
+    """Average the figures of each row over its units; rows are in the order of the results."""
     titles = list(dict.fromkeys(result.title for result in results))
     return [_row([result for result in results if result.title == title]) for title in titles]
 

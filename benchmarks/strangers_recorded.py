@@ -40,7 +40,7 @@ def sample_bag(path: Path) -> Bag:
 
 
 def samples(which: str) -> Iterator[Study]:
-    """Return the sample bags with board and case, the board alone, or the board as case, too."""
+    """Yield the sample bags with readings of board and case, board alone, or board for both."""
     bags = [sample_bag(path) for path in sorted((ROOT / 'bags/fit').glob('*.mcap'))]
     bags.append(sample_bag(ROOT / 'bags/held_out.mcap'))
     if which != 'sample-bags':
@@ -97,7 +97,7 @@ def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
 
 
 def cats(path: Path) -> Iterator[Study]:
-    """Hold out every second block of the real unit, then each rest of the unit."""
+    """Hold out every second block of the real unit's recording, then each of its rests."""
     whole = real_unit(path)
     rests = [part(whole, rows, f'rest{k}') for k, rows in enumerate(rests_of(whole))]
     still: tuple[list[Bag], list[Bag]] = ([], [])

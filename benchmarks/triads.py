@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns simulated units for tests and benchmarks: triads with one kind of physics each, and siblings
-of a unit. docs/accuracy.md describes the kinds.
+of a unit. docs/accuracy.md describes the kinds of physics.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G
 
 #: Kinds of triads, each with one kind of physics beside temperature coefficients. The order of
-#: the kinds numbers the streams of random numbers, after those of the instruments.
+#: the kinds gives the numbers of their streams of random numbers, from `FIRST_KIND`.
 TRIAD_NAMES = (
     *('own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load'),
     *('paper', 'slow-noise', 'plain'),
@@ -81,8 +81,8 @@ def _only(axis: int, value: float) -> Triple:
 
 def triad(kind: str, seed: int = 0) -> UnitModel:
     """
-    Return a triad of bare heads on a board, with temperature coefficients of parts that lag, and
-    the physics of its kind.
+    Return a triad of bare sensor heads on a board, with temperature coefficients of parts that
+    lag, and the physics of its kind.
     """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
@@ -139,7 +139,8 @@ def _slips(draw: Specimen) -> list[Effect]:
     return effects
 
 
-# Kinds with a thermal node for each head, and kinds whose heads are also linked to the case.
+# Kinds of units with a thermal node for the head of each axis, and kinds whose heads are also
+# linked to the case.
 _OWN_HEADS = ('own-lags', 'between', 'switched-load')
 _BETWEEN = ('between', 'switched-load')
 _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
@@ -157,7 +158,7 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
         FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ],
-    # Leakage doubles every 7 to 10 K; a few ug at the reference.
+    # Leakage doubles every 7 to 10 K; a few ug at the reference temperature.
     'convection': lambda draw: [
         LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))
     ],

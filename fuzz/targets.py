@@ -30,7 +30,7 @@ from thermo_comp.unit.functions import Polynomial
 
 START_NS = 1_767_225_600_000_000_000
 MAGIC = b'\x89MCAP0\r\n'
-#: Folder for files that may be bags.
+#: File to which an input is written before it is read as a bag.
 BAG = Path(files.FOLDER.name, 'any.mcap')
 
 
@@ -44,7 +44,7 @@ class Target:
 
 
 def small_calibration() -> Calibration:
-    """Make a unit of a few terms."""
+    """Make a valid calibration with few terms."""
     axis = AxisSet(Polynomial((0.0, 0.5)), Polynomial((1.0, 1e-5)))
     sets = RegimeSet(x=axis, y=axis, z=axis, temperature_range_c=(5, 35), rate_range_k_min=(-1, 1))
     return Calibration(
@@ -79,11 +79,11 @@ def check_calibration(data: bytes) -> None:
         return
     assert parse_calibration(dump_calibration(value).encode()) == value
     row = Compensator(value).process(START_NS, 1.0, 2.0, 3.0)
-    # No temperature has been given; only a correction by constants needs no temperature.
+    # No thermometer has a reading, so only a calibration that needs no temperature gives a row.
     assert row is None or not value.needs_temperature
 
 
-#: Functions have the required keys only, because the fuzzer tries short inputs more often.
+#: Bias and scale functions without optional keys, as the fuzzer tries short inputs more often.
 _FUNCTIONS = (
     '{bias_function: {kind: polynomial, coefficients: [0]}, '
     'scale_function: {kind: polynomial, coefficients: [1]}}'

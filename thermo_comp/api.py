@@ -130,7 +130,7 @@ def correct(
     Raises
     ------
     ValueError
-        If shapes do not fit, times do not rise, or the calibration has no such thermometer.
+        If shapes do not fit, times do not rise, or the calibration lacks one of `sensors`.
 
     """
     unknown = sorted(set(sensors) - set(calibration.sensors))

@@ -97,8 +97,8 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> bytes:
     """
-    Read a regular file. ValueError if the file is larger than `limit` bytes, PermissionError if it
-    lies outside of the folder `within`, OSError as in `open_regular`.
+    Read a regular file of limited size. ValueError if the file is larger than `limit` bytes,
+    PermissionError if it lies outside of the folder `within`, OSError as in `open_regular`.
     """
     with open_regular(path) as file:
         # Check the path of the opened file: a link could be exchanged between a check and the
@@ -161,7 +161,7 @@ class Draft:
 
     def publish(self) -> None:
         """
-        Give the complete output its final name; OutputError if another process took this name.
+        Give the complete output its final name; OutputError if another process took the name.
         """
         with _output_errors(self._path):
             if self.partial.is_dir():
@@ -195,7 +195,7 @@ class Draft:
     def _move_folder(self) -> None:
         old = None
         if self._is_replacing and self._target.exists():
-            # The operating system replaces a folder only if that folder is empty.
+            # Rename the old folder first: the operating system only replaces an empty folder.
             old = self._target.rename(_hidden_sibling(self._target))
         try:
             self.partial.rename(self._target)

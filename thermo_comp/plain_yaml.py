@@ -44,7 +44,7 @@ class PlainYamlError(ValueError):
 
 
 def load_plain_yaml(text: str | bytes, node_limit: int = NODE_LIMIT) -> Any:
-    """Read a YAML document of plain values, None if empty; PlainYamlError for any other text."""
+    """Read a YAML document, None if empty; PlainYamlError if the text is not plain YAML."""
     try:
         return _load(text, node_limit)
     except yaml.YAMLError as error:

@@ -111,10 +111,10 @@ class Acquisition:
         # Samples kept until there are enough to choose the length of a cell.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
-        #: The next position cannot begin before this stamp [ns].
+        #: Earliest stamp at which the next position can begin [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
-        # Mean of the position's first rest, which the search no longer finds after a quieter rest.
+        # Mean sample of the position's first rest, which the search loses after a quieter rest.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
@@ -168,7 +168,7 @@ class Acquisition:
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest again, relative to their own noise.
+        # Search the cells after the last rest for a further rest, by the noise of these cells.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [

@@ -73,7 +73,7 @@ app.add_typer(_fleet)
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and leave the process with its exit code."""
     hold_standard_streams()
-    # With several BLAS threads small matrices take up to 16 times longer on busy cores.
+    # One BLAS thread: with several, small matrices take up to 16 times longer on busy cores.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))

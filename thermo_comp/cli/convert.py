@@ -163,7 +163,7 @@ def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
 
     if log.guessed is None:
         return
-    if log.guessed.format is None:  # the table has known headings
+    if log.guessed.format is None:  # map guessed from known headings
         lines = map_lines(log.guessed)
         first = shown.setdefault('\n'.join(lines), log.path)
         if first != log.path:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..field.ageing import Ageing
     from ..field.update import Update
 
-#: Exit code of an update that gains nothing.
+#: Exit code of an update whose gain is not above one standard error.
 NOTHING_GAINED = 3
 
 

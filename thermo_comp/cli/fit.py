@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..unit.columns import Part
     from ..unit.rate_bias import Gyroscope
 
-#: Largest width of a model in a table [characters].
+#: Largest width of a model's name in a table [characters].
 _MODEL_WIDTH = 46
 #: Properties of a gyroscope that are printed.
 _RATES = 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
@@ -232,7 +232,7 @@ def _behind_s(parts: Sequence['Part']) -> list[float]:
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Say how far the part of each axis lags the board, or a temperature that leads the board."""
+    """Describe the lags of the axes' parts behind the board, or a temperature that leads it."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):

@@ -109,7 +109,7 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     )
     out.sources((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        # The reservations of a calibrated test also name the bags left out.
+        # Print the bags left out only without reservations, which name the bags left out, too.
         text = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {problem}' for problem in text if problem)
     out.points(

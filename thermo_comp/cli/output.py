@@ -59,7 +59,7 @@ class Output:
             self.note(f'{names[0]}{more}: {chosen}')
 
     def end(self, code: int = 0, /, **data: Any) -> None:
-        """End a command: print its JSON if requested; exit with `code`, or 1 for a torn bag."""
+        """End a command: print JSON if requested; exit with `code`, or 1 if a bag lacks parts."""
         if self.as_json:
             print(json.dumps(plain(data), indent=2, allow_nan=False))
         if code or self._is_torn:
@@ -174,7 +174,7 @@ def aligned(head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
 
 
 def picked(value: object, names: str) -> dict[str, Any]:
-    """Return attributes by their names, for JSON."""
+    """Return attributes of an object by their names, for JSON."""
     return {name: getattr(value, name) for name in names.split()}
 
 

@@ -261,7 +261,7 @@ def _accuracy(account: 'Account') -> str:
 
 
 def _lines(account: 'Account') -> list[str]:
-    """Return the lines below the positions: state, and missing data."""
+    """Return the lines below the table of positions: state of the test, and missing data."""
     from ..fitting.coverage import direction_text
 
     lines = [_accuracy(account)]

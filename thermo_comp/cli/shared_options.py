@@ -220,7 +220,7 @@ def judging(
     tolerance: str | None = option('Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
-    """Return the keywords of a judgement."""
+    """Return the options for judging a calibration, as keywords of `evaluation.evaluate`."""
     return {
         'gravity': where[0],
         'window_s': window_s,

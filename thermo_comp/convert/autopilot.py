@@ -77,7 +77,7 @@ def read_autopilot(
     """
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     try:
-        # Overflows of the integer conversion are found later, among the stamps.
+        # Ignore overflows of integer conversions: `_stamps` finds impossible time stamps.
         with np.errstate(invalid='ignore', over='ignore'):
             imus, baros, compensated = read(path)
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
@@ -188,7 +188,7 @@ def _combined(columns: _Columns) -> list[_Columns]:
 
 
 def _stamps(columns: _Columns) -> Ints:
-    """Return stamps from microseconds since the start; `NO_STAMP` (damage) beyond a century."""
+    """Return stamps from microseconds since boot; `NO_STAMP` if negative or over a century."""
     # The time of the sample if logged; older logs only have the time of publication.
     micros = columns['timestamp_sample' if 'timestamp_sample' in columns else 'timestamp']
     size = micros.astype(np.float64)
@@ -206,7 +206,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the angular rate to the accelerometer's stamps; None for sparse rates."""
+    """Interpolate the angular rate to the accelerometer's stamps; None if rates are too few."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -300,7 +300,7 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
 
 
 def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments: Any) -> Any:
-    """Read a file with the library of an extra."""
+    """Read a file with `module`, the optional library that the extra `extra` installs."""
     read = getattr(library(module, extra, what, path), name)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         # On damaged files the libraries raise any exception.

@@ -336,7 +336,7 @@ def _stamp(
     steps = np.diff(times)
     if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
         step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # Large temperature changes show that a slow log of a unit without turns is long.
+        # Shortest possible log [s]: no board changes its temperature faster than `_FASTEST_K_S`.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
         # Take the largest unit with a plausible interval of samples: 5 ms is plausible, 5 s is

@@ -75,7 +75,7 @@ def export_calibration(
     content = replace(content, notes=notes, noise=noise)
     text = tool.write(content, number, device_id)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
-    # A note is a single line; imu_tk's reader knows no comments.
+    # Write each note as a comment line; none for imu_tk, whose reader knows no comments.
     head = [] if to == 'imu_tk' else [f'# {one_line(line)}\n' for line in (title, *content.notes)]
     return replace(content, text=''.join(head) + text)
 
@@ -91,7 +91,7 @@ class _Curves(NamedTuple):
 
     @property
     def scale_drift(self) -> float:
-        """Largest relative change of a scale."""
+        """Largest relative change of a scale factor over the range of temperatures."""
         return float(np.max(np.abs(self.scale)))
 
 
@@ -151,7 +151,7 @@ def _ppm(part: float) -> str:
 
 
 def _constant(calibration: Calibration, curves: _Curves) -> Content:
-    """Return bias, scale and misalignment at the reference temperature, for tumble tests."""
+    """Return bias, scale and misalignment at the reference temperature, as of a tumble test."""
     drift = 'the calibration has no correction for temperature'
     if calibration.needs_temperature:
         drift = (
@@ -208,7 +208,7 @@ def import_calibration(
 ) -> Calibration:
     """
     Read the file of one of `TOOLS`, recognised by its content; both regimes get the same set.
-    `number` chooses a set or IMU of the file, None the file's only set. `full_scale` is in m/s^2.
+    `number` chooses a set or IMU of the file, None the only set; `full_scale` of readings [m/s^2].
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)

@@ -42,14 +42,14 @@ _CELL_S, _MIN_SAMPLES = 0.5, 12
 # Ratio of a cell's scatter to the quiet level, above which the unit is handled: the sd of a cell
 # of 12 noise samples stays within a factor of 2 of its mean.
 _MOVING_RATIO = 4.0
-_MERGE_NS = 10 * 10**9  # shortest rest between two separate movements
+_MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
 NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row without a stamp
 #: Range of temperatures on a circuit board [degC]; kelvins and raw counts are outside.
 PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # number of rows processed at a time, to bound the memory
 _EXAMPLES = 5
-_RESTART_NS = 10**9  # a larger backward step restarts the clock [ns], as in the compensator
+_RESTART_NS = 10**9  # a larger backward step of stamps is a restart of the clock [ns]
 SLOW_HZ = 5.0  # logs with a lower sample rate are only good for soaks
 
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from . import autopilot, bag, column_map
 from .log import ForeignLog, write_log
 
-#: Keywords of `read_log` that apply to each kind of file.
+#: For each kind of file, the keywords that `read_log` takes.
 KEYWORDS: dict[str, tuple[str, ...]] = {
     'table': ('columns', 'rate_hz'),
     'log': ('imu', 'baro', 'allow_compensated'),

@@ -68,7 +68,7 @@ class Stamp:
     column: Column | None = None
     unit: TimeUnit | None = None
     rate_hz: Positive | None = None
-    start_s: NotNegative = 1.0  # ROS takes a zero stamp for "no time yet"
+    start_s: NotNegative = 1.0  # above 0, as ROS takes a zero stamp for "no time yet"
 
     def __post_init__(self) -> None:
         if (self.column is None) == (self.rate_hz is None):
@@ -97,7 +97,7 @@ class Table:
 def read_text(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
 ) -> Table:
-    """Read columns of a table of text, by headings or numbers from 0; None reads all columns."""
+    """Read columns of a table of text, by headings or numbers from 0; all if `columns` is None."""
     try:
         with TextIOWrapper(
             open_regular(path), encoding='utf-8-sig', errors='replace', newline=''
@@ -136,7 +136,7 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # The last columns are blank in most rows if a slower thermometer writes them.
+        # Most rows lack the columns of a slower thermometer at their end: use a whole row.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -164,7 +164,7 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
     else:
         cells = csv.reader(file, delimiter=delimiter)
     for number, row in enumerate(cells, 1):
-        # A row that begins with a digit, as nearly all do, needs no further test.
+        # A row that begins with a digit, as nearly all do, is no comment and not empty.
         if row and (
             row[0][:1].isdigit() or (not _is_comment(row[0]) and any(map(str.strip, row)))
         ):
@@ -204,7 +204,7 @@ def _commented(head: str, delimiter: str, width: int) -> list[str]:
 
 
 def _number(cell: str) -> float | None:
-    """Read a cell as a number, including NaN and infinity; None for any other text."""
+    """Read a cell as a number, including NaN and infinity; None if the cell is no number."""
     try:
         return float(cell)
     except ValueError:
@@ -288,7 +288,7 @@ def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) 
 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
-    """Return the exact stamp of a number or a date; `NO_STAMP` for any other cell."""
+    """Return the exact stamp of a number or a date; `NO_STAMP` for a cell that is neither."""
     if unit == 'iso':
         return _iso_ns(str(cell).strip())
     try:

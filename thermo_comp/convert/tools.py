@@ -110,7 +110,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for any other text."""
+    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for another tool's."""
     values = _Parameters(text)
     numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not numbers:

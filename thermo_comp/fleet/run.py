@@ -33,7 +33,7 @@ _FORMAT = 3
 _LONGEST_NAME = 100
 # Largest number of rows listed on the page; the table has all rows.
 _MOST_ROWS = 60
-# Verdicts on the bags of the fit itself that no further data would change.
+# Verdicts of a fit on its bags that contradict the fit: more data would not change them.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )
@@ -198,7 +198,7 @@ def render_fleet(
             [spread.limit for spread in summary.spreads],
         ),
     )
-    # With fewer than eight units all limits of outliers are infinite.
+    # Outliers are not sought with fewer than eight units: all limits are infinite.
     is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
     return render(
         'fleet.html',

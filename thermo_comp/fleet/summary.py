@@ -22,8 +22,8 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation for a normal spread, relative to the sample sd.
 _MAD_EFFICIENCY = 0.37
-# Ratio of a unit's own sd to the spread of the units above which its data do not determine the
-# quantity: the value is (about) that of the prior of the fit.
+# Largest ratio of own sd to spread over the units, for a unit whose data determine the quantity;
+# with a larger ratio the value is about that of the prior of the fit.
 _LARGEST_SD = 5.0
 # Smallest size of a residual or noise, so that its logarithm is finite.
 _LEAST = 1e-12
@@ -119,7 +119,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         if abs(z) > spread.limit
     ]
     wide = Verdict.WIDE.value
-    # Write 'little' for the amount in the verdict WIDE, so that equal verdicts count together.
+    # Replace the amount in the verdict WIDE by 'little', so that equal verdicts count together.
     texts = (str(row['verdict']) for row in rows)
     verdicts = (f'{wide} little' if text.startswith(wide) else text for text in texts)
     return Summary(
@@ -227,7 +227,7 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
 
 
 def _sds(drift: Drift) -> float:
-    """Return the size of a change in its standard deviations; 0 if its sd is not known."""
+    """Return the size of a change divided by its standard deviation; 0 if the sd is not known."""
     return abs(drift.change) / drift.sd if drift.sd > 0.0 else 0.0
 
 

@@ -180,7 +180,7 @@ def fitted_cells(
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
-    # Without a prior, too few positions do not separate the slopes of bias and scale.
+    # Too few positions do not separate the slopes of bias and scale without a prior: no sd.
     is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
     for quantity, unit, slope, sd in _slopes(calibration):
         parts[f'{quantity}_slope_{{0}}_{unit}'] = slope
@@ -275,7 +275,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read an earlier run's table; missing columns are empty. ThermoCompError for other files."""
+    """Read an earlier run's table, missing columns empty; ThermoCompError for another file."""
     from pyarrow import ArrowException, parquet
 
     try:

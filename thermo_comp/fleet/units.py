@@ -57,7 +57,7 @@ class Storage:
             raise ThermoCompError(f'{url}: {words(error)}') from error
         self._root = str(root).rstrip('/')
         self._is_local = 'file' in self._fs.protocol
-        # Address that is valid in any process, whatever its working directory.
+        # Address of the folder, valid in any process, whatever the working directory.
         self.address = self._root if self._is_local else url
         self.name = self._root.rpartition('/')[2]
 
@@ -70,7 +70,7 @@ class Storage:
                 listing = self._fs.find(self._root, detail=True)
             if not listing and not self._fs.isdir(self._root):
                 raise NotADirectoryError(errno.ENOTDIR, 'no such directory')
-        except Exception as error:  # each file system has different exceptions
+        except Exception as error:  # each file system raises its own exceptions
             raise ThermoCompError(f'{self.url}: cannot be listed: {words(error)}') from error
         files = []
         for path, facts in listing.items():
@@ -92,7 +92,7 @@ class Storage:
             )
             try:
                 self._fs.get(sources, copies)
-            except Exception as error:  # each file system has different exceptions
+            except Exception as error:  # each file system raises its own exceptions
                 raise OSError(errno.EIO, words(error)) from error
             yield Path(scratch, name)
 
@@ -101,7 +101,7 @@ def _walk(root: str) -> Iterator[str]:
     """Yield the files of a local tree; links are followed, unlike by fsspec."""
     for folder, folders, names in os.walk(root, followlinks=True):
         here = Path(folder).resolve()
-        # Skip links to a containing folder: they would never end.
+        # Skip links to a containing folder: the walk would never end.
         folders[:] = [n for n in folders if Path(folder, n).resolve() not in (here, *here.parents)]
         yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
 
@@ -113,7 +113,7 @@ def words(error: Exception) -> str:
 
 
 def find_units(storage: Storage) -> list[FoundUnit]:
-    """Find the units by name; ThermoCompError if nothing can be listed or there is no bag."""
+    """Find a fleet's units; ThermoCompError if the folder cannot be listed or has no bag."""
     bags = group_files(storage.files())
     if not bags:
         raise ThermoCompError(
@@ -136,7 +136,7 @@ def folders_of_tables(storage: Storage) -> tuple[str, ...]:
     """Name the folders that hold tables, which `convert` reads, and no bag."""
     stored = storage.files()
     with_bags = [f'{_folder(name)}/' for name in group_files(stored)]
-    # A result of an earlier run, fleet.csv, may be in a folder of the fleet.
+    # fleet.csv, the result of an earlier run, is not a table to convert.
     tables = {
         _folder(file.name)
         for file in stored

@@ -168,7 +168,7 @@ def dask_setup(_worker: object) -> None:
 def _uninterrupted() -> Iterator[None]:
     """Hide Ctrl-C, which a terminal sends to all processes, from workers; raise it afterwards."""
     heard: list[int] = []
-    # Processes inherit the ignored signal from the fork server.
+    # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     forkserver.ensure_running()
     signal.signal(signal.SIGINT, lambda number, _: heard.append(number))

@@ -27,7 +27,7 @@ class Contribution(NamedTuple):
 
     name: str
     evaluation: str
-    standard: float | None  # None if not stated
+    standard: float | None  # None if the uncertainty is not stated
     basis: str
 
 
@@ -189,7 +189,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # Where U is withheld, value and deviation have the digits of the known part of U.
+        # The known part of a withheld expanded uncertainty sets the digits of value and deviation.
         digits = np.where(known * sd > 0.0, known * sd, _four_digits(value))
         sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         for k, table in enumerate(tables):
@@ -238,7 +238,7 @@ def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
 
 
 def conformity(evidence: Evidence) -> tuple[str, str]:
-    """Return the statement of conformity to the specified limit, '' without a limit; the rule."""
+    """Return the statement of conformity ('' if none is made), and its rule or the reason."""
     judgement = evidence.judgement
     if judgement is None:
         return '', 'No recording was judged: no statement of conformity is made.'

@@ -32,9 +32,9 @@ _T = TypeVar('_T')
 #: The compared corrections: the constants at the reference temperature, and the calibration.
 RAW = 'raw'
 CHOSEN = 'calibration'
-#: For each position of a fit: the calibration fitted to the other positions.
+#: The correction of each position of a fit by a calibration fitted to the other positions.
 LEFT_OUT = 'left out'
-# Bags whose fastest heating (cooling) is below this have no heating (cooling) ramps [K/min].
+# Rate of heating (cooling) that bags must reach to hold heating (cooling) ramps [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
 #: Key of a bag's metadata in which the simulator stores the truth.
 _SIMULATED = 'truth'

@@ -242,7 +242,7 @@ def draw_positions(evidence: Evidence) -> Figure:
             place = equal_area(least.up, side)
             axes.plot(*place, 'x', markersize=7.0, color=style.RED, mew=1.6)
             text = '±' + ug_text(least.sd_m_s2).replace('ug', 'µg')
-            # Shift the label towards the middle, as the names of the axes are outside.
+            # Shift the label towards the centre of the disc, as axis names are outside the disc.
             by = (0.0, 6.0 if place[1] < 0.0 else -12.0)
             _note(axes, text, place, by, ha='center', color=style.RED)
         axes.set_title(name, loc='center')

@@ -88,7 +88,7 @@ def table_temperatures(lowest: float, highest: float) -> Floats:
     span = highest - lowest
     step = next((k for k in _STEPS_K if span <= k * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
     within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)
-    # Skip round temperatures within a quarter of a step from an end: such a row would repeat the
-    # row of the end.
+    # Skip round temperatures within a quarter of a step from an end of the range: their rows would
+    # repeat the row of the end.
     kept = within[(within - lowest > 0.25 * step) & (highest - within > 0.25 * step)]
     return np.array([lowest, *kept, highest])

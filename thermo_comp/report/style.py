@@ -78,7 +78,7 @@ def new_figure(height: float) -> Figure:
 
 
 def svg(figure: Figure, name: str, label: str) -> str:
-    """Write a figure as an SVG element; `name` makes its ids unique, `label` is read aloud."""
+    """Write a figure as an SVG element; `name` prefixes all ids, `label` is for screen readers."""
     buffer = io.StringIO()
     nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}
     figure.savefig(buffer, format='svg', metadata=nothing)

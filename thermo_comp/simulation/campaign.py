@@ -20,17 +20,17 @@ _STEP = re.compile(
 )
 _SECONDS = {'h': 3600.0, 'min': 60.0, 's': 1.0}
 _PROGRAMS = {
-    # The temperature range and the style of the paper's Fig. 3: up, down and back, with long
-    # soaks.
+    # A program with the temperature range and the style of the paper's Fig. 3: up, down and back,
+    # with long soaks.
     'paper': '20 60min, 35@0.5 90min, 20 60min, 5 90min, 20 60min, 35 60min',
-    # 4 h 20 min, for one bag of a thermal test: the whole temperature range, ramps in both
-    # directions.
+    # A program of 4 h 20 min for one bag of a thermal test: the whole temperature range, ramps in
+    # both directions.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
     # The shortest program with the whole temperature range, ramps in both directions and short
     # soaks.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',
-    # Nine and a half hours: ramps of 0.3 to 1 K/min in both directions, for the chamber test of 18
-    # positions.
+    # A program of 9.5 h for the chamber test of 18 positions: ramps of 0.3 to 1 K/min in both
+    # directions.
     'long': '20 30min, 35@0.5 60min, 5@1 60min, 25@0.3 40min, 10@0.7 45min, 33@0.9 40min, '
     '15@0.35 40min, 20@0.5 19.92063492063492min',
     # No ramp of 'held-out' (start, end and rate) occurs in a program for a fit.
@@ -44,7 +44,7 @@ _PROGRAMS = {
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Edges of the cube: three of sum 0, one per pair of axes; their opposites; the other edges.
+# Edges of the cube: three that sum to 0, one per pair of axes; their opposites; other edges.
 _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
@@ -126,9 +126,9 @@ def positions(n: int, seed: int = 0) -> Floats:
 
     Six attitudes are the faces of a cube, nine the corners of a three-capped prism, twelve the
     corners of an icosahedron: the best sets of 6, 9 and 12 attitudes to determine bias, scale and
-    misalignment. Other numbers of attitudes take the faces of a cube, then its edges, then its
-    corners; more than 26 attitudes follow a uniform spiral on the sphere. The sets of 6, 9, 12,
-    18, 24 and 26 attitudes are balanced. `seed` tilts each attitude by a small random angle.
+    misalignment. Up to 26 attitudes, except 9 and 12, take the faces of a cube, then its edges,
+    then its corners; more than 26 attitudes follow a uniform spiral on the sphere. Sets of 6, 9,
+    12, 18, 24 and 26 vectors sum to about 0. `seed` tilts each attitude by a small random angle.
     """
     if n == 9:
         # The prism has three corners on the equator, and six between them at elevations of +-44

@@ -37,7 +37,7 @@ class PartHistory:
     step: float
 
     def of(self, part: str) -> Floats:
-        """Return the temperature deviation of one part, shape (m,), K."""
+        """Return a part's temperature deviation from the reference's steady state [K], (m,)."""
         return self.deviation[:, self.nodes.index(part)]
 
 
@@ -87,7 +87,7 @@ class PartEffect(Effect):
 @dataclass(frozen=True)
 class FlowEffect(Effect):
     """
-    Effect of a heat flow in either direction, less its effect at rest.
+    Effect of a heat flow in either direction, less its effect in the reference's steady state.
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent`` times the deviation
     of `cold` to the `power`. The exponent is 1.25 for convection in a gap, 1 for the load of a

@@ -185,7 +185,7 @@ class ThermalResponse:
         state = network.settled(air[0], drive[0])
         before = network.convection(state, air[0])
         for k, lasts in enumerate(length):
-            # Mean convection of the next interval, extrapolated from two values (Adams-Bashforth).
+            # Mean convection of the next interval, from the last two values (Adams-Bashforth).
             now = network.convection(state, air[k])
             self._alpha[k] -= inverse @ (1.5 * now - 0.5 * before)
             self._amplitude[k] = unmix @ (state - self._alpha[k])

@@ -78,7 +78,7 @@ class Specimen:
         )
 
     def triad(self, network: ThermalNetwork, drift: Iterable[Effect], **others: Any) -> UnitModel:
-        """Return a triad of bare heads on a board, with random constants."""
+        """Return a triad of bare sensor heads on a board, with random constants."""
         # Noise of 3 ug/sqrt(Hz) and the converter's rounding at 4 Hz give 60 s means an sd of 0.65
         # ug.
         noise: dict[str, Any] = {'noise_density': (3.0, 3.0, 3.0), 'full_scale_g': 9.975}
@@ -192,7 +192,7 @@ def _demo(draw: Specimen) -> UnitModel:
     links.append(Link('board', 'head', 0.02))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
     drift = PartEffect('board', **tempcos(draw))
-    # The head's lag behind the board causes `stress`, heat flow causes `load`, a large effect.
+    # `stress` follows the head's lag behind the board, `load` the heat flow from case to board.
     stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
     load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
     return draw.triad(network, (drift, *loads(draw), load, stress))
@@ -210,8 +210,8 @@ def tempcos(draw: Specimen) -> dict[str, Any]:
 
 def loads(draw: Specimen) -> list[Effect]:
     """
-    Draw the paper's effect: while the ambient temperature changes, offsets, slopes and curvatures
-    are different, as with a heat pump at the limit of its supply.
+    Draw the paper's effect: while the ambient temperature changes, bias and scale have another
+    offset, slope and curvature than in a soak, as with a heat pump at the limit of its supply.
     """
     knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
     sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))

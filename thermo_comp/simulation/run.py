@@ -50,7 +50,7 @@ class Truth:
 
     @property
     def bias(self) -> Floats:
-        """Bias in each conversion cycle, shape (n, 3)."""
+        """Bias in each conversion cycle [counts], shape (n, 3)."""
         return self.on_cycles(self.bias_grid)
 
     @property
@@ -165,11 +165,11 @@ def _blocks(
     seed: int,
     start_ns: int,
 ) -> Iterator[SimulatedRun]:
-    """Yield a run by blocks; `cycles`: number in all, at most per block, and per second."""
+    """Yield a run by blocks; `cycles`: numbers of cycles in all, per block, and per second."""
     unit, (n_cycles, block_size, rate_hz) = truth.unit, cycles
     K = np.array(unit.scale_factor)
     to_axes = np.asarray(np.linalg.inv(unit.M), np.float64)
-    # Mean of white noise over a cycle: density times the root of the cycle rate.
+    # Sd of white noise averaged over a cycle: density times the root of the cycle rate.
     root = math.sqrt(rate_hz)
     noise_sd = np.array(unit.noise_density) * MICRO_G * K * root
     noise, rate_noise = white(seed, Stream.ACCEL_NOISE), white(seed, Stream.GYRO_NOISE)
