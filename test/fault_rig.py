@@ -129,7 +129,7 @@ def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
 
 
 def counts_of(force, case, board, memory):
-    """Return the counts of the converter for a specific force (Eq. (6) to (9))."""
+    """Return the counts of the converter for a specific force (paper, equations 6 to 9)."""
     t = board - 20.0
     drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
     drift += BY_GRADIENT * (case - board) + BY_MEMORY * memory

@@ -26,7 +26,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the element yy
+    of_y = [27, 29, 32]  # terms 1, y and y^2 of the covariance element yy
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert excess.relative == pytest.approx(2.0)
@@ -176,7 +176,8 @@ def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # Without a lag the sd grows with the 19 half ranges by which the ramp exceeds its range.
+    # Without a lag the sd grows with the 19 half ranges by which the ramp exceeds the range of
+    # rates.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 

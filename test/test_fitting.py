@@ -148,7 +148,7 @@ def test_the_evidence_is_complete(response):
     judged = {(group.part, group.group) for group in calibration.evidence}
     # In the unit OWN_LAGS the bias of each axis is a curve over the temperature of a lagging part.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
-    # A response term with zero weight serves the covariance only, and needs no evidence.
+    # A response term with zero weight serves the covariance only, and needs no row in `evidence`.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
 
@@ -253,7 +253,8 @@ def test_a_switch_of_sets_changes_the_output_by_1_ug_per_second(golovach):
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return corrected.specific_force
 
-    # The three outputs have equal noise, so their differences give the weight of the dynamic set.
+    # The outputs of the blend and of either set have equal noise, so their differences give the
+    # weight of the dynamic set.
     output, static, dynamic = forces(None), forces(0.0), forces(1.0)
     gap = dynamic - static
     size = np.linalg.norm(gap, axis=1)

@@ -444,8 +444,8 @@ def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
 
 
 def test_the_drifts_of_scale_factors_show_how_well_turn_ons_repeat():
-    # WHY: nine constants explain the norms of nine positions. The fit kept an offset sd of 5 ug,
-    # with constants wrong by 75 claimed sd.
+    # WHY: nine constants explain the norms of nine positions, so the fit kept an offset sd of 5 ug
+    # instead of 300 ug, with constants wrong by 75 claimed sd.
     truth = Truth(
         offset_sd=300.0 * MICRO,
         sigma=np.full(3, 0.5 * MICRO),

@@ -232,7 +232,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
 
 @pytest.mark.slow
 def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
-    # Heads lag the board, pendulums lag the heads; the error is the stress board - pendulum.
+    # Heads lag the board, pendulums lag the heads; stress by board - pendulum changes the bias.
     unit = second_simulator.unit_of('products', 2)
     # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
