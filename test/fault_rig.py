@@ -43,7 +43,7 @@ BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^
 SCALE_SLOPE = 7e-5
 BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
 
-#: Residual sd of the static set [m/s^2], as in a ramp not detected yet; part of the covariance.
+#: Residual sd of the static set [m/s^2]; contains the error in a ramp that is not yet detected.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 

@@ -64,8 +64,8 @@ def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
     # 10 m/s^2.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # The bias slope over the range of 30 K has an sd of 0.02 * 30 / sqrt(12) counts/K, larger on a
-    # coarse grid.
+    # Over the range of 30 K the bias slope varies with an sd of 0.02 * 30 / sqrt(12) counts/K,
+    # more on a coarse grid.
     bends = 0.6 / math.sqrt(12.0)
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)

@@ -67,7 +67,7 @@ LAYOUTS = {
 }
 #: Drivers that publish no temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
-#: Drivers whose bags are fitted: one per type of temperature message, and one without.
+#: Drivers whose bags are fitted: one per type of temperature message, one without temperatures.
 FITTED = {'xsens', 'mavros', 'px4', 'phidgets', 'ardupilot'}
 #: Six faces and the first face again, for REST_S each, while the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))

@@ -333,7 +333,7 @@ def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mounting
     # Misalignments of some mrad or mounting offsets of 5 mg explain the norms of nine positions.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
-    # A fit with only those groups that the simulated unit has takes half of the time.
+    # A fit with only the groups of the simulated unit takes half the time of a fit of all groups.
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))
     calibration = fit(sources_of(records), options).calibration
     M = np.array(calibration.misalignment)

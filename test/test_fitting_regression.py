@@ -119,7 +119,7 @@ class Dense:
         return np.concatenate(parts)
 
     def jacobian(self, x):
-        """Return the Jacobian by central differences with steps of 0.1 sd: linear to some 1e-9."""
+        """Return the Jacobian by central differences of 0.1 sd, with an error of some 1e-9."""
         sd = np.sqrt(self.at.variance)
         columns = []
         for k in range(self.n):

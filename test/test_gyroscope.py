@@ -78,7 +78,8 @@ def fitted(unit):
 @pytest.fixture(scope='module')
 def held_out(unit):
     (station, *_) = plan('held-out', 2)
-    # The program has two ramps up and two down, with soaks, and does not return to its start.
+    # The program has two ramps up and two down, with soaks, and ends at another temperature than
+    # at its start.
     whole = station.program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
     return arrays(unit, [replace(station, program=program)], 99, rate_hz=RATE_HZ)[0]

@@ -119,7 +119,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
         (0.01, 0.0, 0.5, 900.0, 0.1, 900.0),
         (0.001, 0.0625, 0.2, 1200.0, 1.0, 3600.0),
         (0.01, 0.0625, 3.0, 300.0, 10.0, 3600.0),
-        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # so slow that it might become the baseline
+        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # a ramp slow enough to become the baseline
         (0.01, 1.0, 0.2, 900.0, 10.0, 7200.0),
         (0.01, 1.0, 3.0, 180.0, 1.0, 2400.0),
     ],
