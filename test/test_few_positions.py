@@ -319,10 +319,10 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # The leverage of the curve at the ends is 5/6 for a line through three equidistant
-        # points, 1 for a parabola; the next turn-on adds its variance. `mounting_sd` may also
-        # be the sd of nine independent mountings: then bias and scale keep a third each of the
-        # variance of a mounting offset.
+        # The leverage of the curve at the ends is 5/6 for a line through three equidistant points,
+        # 1 for a parabola; the next turn-on adds its variance. `mounting_sd` may also be the sd of
+        # nine independent mountings: then bias and scale keep a third each of the variance of a
+        # mounting offset.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()

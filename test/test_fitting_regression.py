@@ -137,8 +137,8 @@ class Dense:
 def solved(request):
     n_positions, pose_of = request.param
     rng = np.random.default_rng(5)
-    # The table draws an initial lag state per position. Positions of one bag share an initial
-    # lag state, so these states are 0 for bags of several positions.
+    # The table draws an initial lag state per position. Positions of one bag share an initial lag
+    # state, so these states are 0 for bags of several positions.
     truth = Truth(
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
@@ -431,8 +431,8 @@ def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
 
 
 def test_inactive_columns_share_the_initial_lag_states_of_the_active_ones(solved):
-    # WHY: the prior on the sum of the initial lag states was left out, and the information S on
-    # an inactive column was too large by a factor of 50 for a scale factor whose bias has the same
+    # WHY: the prior on the sum of the initial lag states was left out, and the information S on an
+    # inactive column was too large by a factor of 50 for a scale factor whose bias has the same
     # lag.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]

@@ -72,11 +72,11 @@ def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
     ],
 )
 def test_rests_on_the_bench_do_not_separate_the_slopes_of_bias_and_scale(draw, unit, is_cold):
-    # WHY: the thermometer's noise in rests at constant temperature looked like temperature
-    # changes without an effect, and the drift of the one ramp went to the scale factors: 470 ppm/K
-    # instead of -36. For warm-ups of a cold unit the fit put a lag of an axis into its scale
-    # factor alone. Lags whose initial states fitted noise in rests of a warm unit separated bias
-    # and scale by chance.
+    # WHY: the thermometer's noise in rests at constant temperature looked like temperature changes
+    # without an effect, and the drift of the one ramp went to the scale factors: 470 ppm/K instead
+    # of -36. For warm-ups of a cold unit the fit put a lag of an axis into its scale factor alone.
+    # Lags whose initial states fitted noise in rests of a warm unit separated bias and scale by
+    # chance.
     rng = rng_of('bench beside a ramp', unit)
     imu = draw(rng)
     bench = program(22.0, 5.0)

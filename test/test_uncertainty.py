@@ -16,9 +16,9 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 def test_a_start_in_a_ramp_is_claimed():
     # WHY: after a restart in a ramp the claimed sd was a third of the error. In a ramp a part lags
-    # the board by rate times time constant, 1 K in this test; after a start at rest the lag has
-    # an sd of 0.4 K. A ramp that ends soon after the start leaves the same error
-    # as a ramp that goes on.
+    # the board by rate times time constant, 1 K in this test; after a start at rest the lag has an
+    # sd of 0.4 K. A ramp that ends soon after the start leaves the same error as a ramp that goes
+    # on.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
