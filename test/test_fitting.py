@@ -174,7 +174,7 @@ def test_the_compensator_does_what_the_fit_promised(response):
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
     variance = after.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
-    # In means of 60 s white noise and rounding average out; the other errors do not.
+    # In means of 60 s white noise and rounding average out, errors of the model do not.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
     error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6

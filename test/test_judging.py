@@ -332,7 +332,7 @@ class TestVerdict:
         # WHY: the message named only temperatures for windows outside the calibrated rates.
         assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
-        # A soak 0.01 K beyond the range counts as inside: the thermometer's noise may cause this.
+        # A soak 0.01 K beyond the range counts as inside: 0.01 K may be the thermometer's noise.
         edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
         assert edge.sections['outside'].n == 0
 
