@@ -45,7 +45,7 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # the scale levels of both sets are tested below, by a change of K
+            continue  # a change of K, at the end of the test, tests the scale levels
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step

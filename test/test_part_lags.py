@@ -273,7 +273,7 @@ def test_soaks_determine_the_curve_by_their_norms(grade):
 @pytest.mark.slow
 def test_six_faces_in_three_soaks():
     # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
-    # unit with drifts of 10 mg left 40 mg. With a stated `mounting_sd` the fit divided by zero.
+    # unit with drifts of 10 mg left 40 mg, and divided by zero if `mounting_sd` was stated.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
