@@ -39,8 +39,8 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Every second parameter is tested: an axis has an odd number of parameters, so each kind is
-    # tested on some axis.
+    # Every second parameter is tested: the block of parameters of a bias or a scale has an odd
+    # length, so each kind of parameter is tested in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
