@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the small calibrations and blocks of samples that tests of the core use."""
+"""Owns small calibrations and blocks of samples for tests of many modules."""
 
 from dataclasses import dataclass, field, replace
 

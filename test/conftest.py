@@ -46,7 +46,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Examples of hypothesis have no deadline, because their duration depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# `make nightly` uses this profile; tests that state a number of examples keep the number.
+# `make nightly` uses the profile 'nightly'; tests that state a number of examples keep the number.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 

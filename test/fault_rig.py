@@ -43,7 +43,7 @@ BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^
 SCALE_SLOPE = 7e-5
 BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
 
-#: Residual sd of the static set [m/s^2], as in a ramp not detected yet; part of the covariance.
+#: Residual sd of the static set [m/s^2]; contains the error in a ramp that is not yet detected.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 
@@ -129,7 +129,7 @@ def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
 
 
 def counts_of(force, case, board, memory):
-    """Return the counts of the converter for a specific force (Eq. (6) to (9))."""
+    """Return the counts of the converter for a specific force (paper, equations 6 to 9)."""
     t = board - 20.0
     drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
     drift += BY_GRADIENT * (case - board) + BY_MEMORY * memory

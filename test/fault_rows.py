@@ -51,7 +51,7 @@ class Row:
     recovered: float = 0.0
     #: Time from which stamps are ahead of the true times, and the difference [s].
     shift: tuple[float, float] = (math.inf, 0.0)
-    #: Messages of the row; None: the bag of `fault_rig`.
+    #: Messages of the row, or None for the bag of `fault_rig`.
     source: list[Event] | None = field(default=None, repr=False)
 
 

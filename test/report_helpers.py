@@ -19,7 +19,7 @@ from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 PROGRAM = '15 12min, 30@1.5 14min, 15@1.5 8min'
-#: Sample rate. At 1 Hz rounding to counts would give a noise of 18 ug/sqrt(Hz) instead of 6.
+#: Sample rate [Hz]: at 1 Hz rounding to counts would give a noise of 18 ug/sqrt(Hz), not 6.
 RATE_HZ = 2.0
 N_POSITIONS = 9
 LEFT_OUT_RMS = [1e-6 * STANDARD_GRAVITY * (1 + k) for k in range(N_POSITIONS - 1)]

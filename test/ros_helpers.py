@@ -40,7 +40,7 @@ def standing(k):
 
 
 class Peer:
-    """A node with a thread of its own; every received message makes `wait_for` test again."""
+    """A node with its own thread; each received message makes `wait_for` test its condition."""
 
     def __init__(self):
         self.context = Context()
@@ -97,7 +97,7 @@ class Peer:
         """Wait until both ends of every topic have discovered each other."""
         topics = {subscription.topic_name for subscription in self.node.subscriptions}
         outputs = [output for output in node.node.publishers if output.topic_name in topics]
-        # Not every test has all thermometers of the unit.
+        # Inputs without a publisher are ignored: some tests lack thermometers of the unit.
         sent = {publisher.topic_name for publisher in self.node.publishers}
         inputs = [input_ for input_ in node.node.subscriptions if input_.topic_name in sent]
         self.poll(

@@ -138,7 +138,7 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
             'reads nothing new for 20[0-2] s$',
         ),
         # WHY: a fit of readings in whole degrees, which first changed after a soak, was refused
-        # with `... the same clock?`.
+        # with the question whether the clocks are the same.
         (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
         (in_kelvins, 'kelvins', r'^temperature/board reads 2\d+\S* .. \d+\S* degC: that looks'),

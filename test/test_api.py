@@ -129,7 +129,8 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # If the board alone decides the regime, `dynamic` begins no earlier than with a case.
+    # If the board alone decides the regime, `dynamic` begins no earlier than with a case
+    # thermometer.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 

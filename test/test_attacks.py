@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks on the core's surroundings: clocks, rates, many clients, links, full disks, logs."""
+"""Attacks on the node's surroundings: clocks, rates, many clients, links, full disks, logs."""
 
 import itertools
 import random

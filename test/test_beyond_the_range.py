@@ -26,7 +26,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))
     assert beyond[:12].tolist() == edge[:12].tolist()
     assert math.sqrt(beyond[12] - edge[12]) == pytest.approx(30.0 / 300.0 * 2.0)
-    of_y = [27, 29, 32]  # coefficients of 1, y and y^2 in the element yy
+    of_y = [27, 29, 32]  # terms 1, y and y^2 of the covariance element yy
     assert beyond[of_y].tolist() == edge[of_y].tolist()
     excess = correction.excess(outside, is_dynamic=False)
     assert excess.relative == pytest.approx(2.0)
@@ -64,8 +64,8 @@ def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
     # 10 m/s^2.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # The bias slope over the range of 30 K has an sd of 0.02 * 30 / sqrt(12) counts/K, larger on a
-    # coarse grid.
+    # Over the range of 30 K the bias slope varies with an sd of 0.02 * 30 / sqrt(12) counts/K,
+    # more on a coarse grid.
     bends = 0.6 / math.sqrt(12.0)
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
@@ -176,7 +176,8 @@ def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # Without a lag the sd grows with the 19 half ranges by which the ramp exceeds its range.
+    # Without a lag the sd grows with the 19 half ranges by which the ramp exceeds the range of
+    # rates.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 

@@ -145,7 +145,8 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
     [
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log of ArduPilot's temperature learning, whose parameter ends at 1, was refused.
+        # WHY: a log of ArduPilot's temperature learning, which sets INS_TCAL1_ENABLE from 2 to 1,
+        # was refused.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )

@@ -237,7 +237,7 @@ def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
     ('comment', 'sign'), [('# t ax ay az temp', ' '), ('#t [s],ax,ay,az,temp', ',')]
 )
 def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
-    # WHY: numpy.savetxt and EuRoC write the headings as a comment, which was left out.
+    # WHY: numpy.savetxt and EuRoC write the headings as a comment, which the reader left out.
     path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
     rows = path.read_text().replace(',', sign).splitlines()[1:]
     path.write_text('\n'.join(['# logger 3', comment, *rows]) + '\n')

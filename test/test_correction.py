@@ -99,7 +99,7 @@ def assert_same(blocks, rows):
 def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    # The run leaves the range 5 .. 35 degC, and leaves -2.5 .. 42.5 degC, where tangents end.
+    # The run leaves the range 5 to 35 degC, and also -2.5 to 42.5 degC, where tangents end.
     events = run_of(rng, seconds=50, swing_k=90.0)
     rows = stream(Compensator(unit, UNCHECKED), events)[0]
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
@@ -120,7 +120,7 @@ def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
 
 
 def states_of(unit, rng, n=5):
-    """Return a tracker in the middle of a run, and states of the run."""
+    """Return a tracker in the middle of a run, and thermal states of the run."""
     tracker = ThermalTracker(unit.detector, Correction(unit).memory)
     collected = []
     for k, (kind, stamp, value) in enumerate(run_of(rng, seconds=1200, rate=1)):
@@ -180,7 +180,8 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
             claimed = np.zeros((3, 3))
             claimed[np.triu_indices(3)] = covariance_at(coefficients, *force.tolist())
             claimed += np.triu(claimed, 1).T
-            # A covariance from n draws has an sd of sqrt(2 / n) times both sds; tolerance: 4 sd.
+            # A covariance from n draws has an sd of at most sqrt(2 / n) times the product of both
+            # sds; tolerance: 4 sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
             # Claimed and drawn variances agree in all directions: the correlations are right.

@@ -60,7 +60,8 @@ def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
     # The printed interval has a probability of 80 %, which 24 rows estimate with an error of 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
-    # The median time of a unit is uncertain by a factor of 1.5, the mean of eight by 1.3.
+    # A unit's median time until it leaves the tolerance is uncertain by a factor of 1.5, the mean
+    # of eight such times by 1.3.
     assert 1.0 / 1.6 < np.exp(np.mean(np.log(ratios))) < 1.6
     assert 0.45 < min(ratios) < max(ratios) < 2.2
 
@@ -88,11 +89,11 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
             (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
         )
         assert ('outside its claim since' in str(result)) == (since is not None)
-        # A day in an attitude along the error has 0.6 * sqrt(3) = 1.04 times the limit.
+        # In an attitude along the error the error is 0.6 * sqrt(3) = 1.04 times the limit.
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.back in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.back is not None)
-        # A unit within its claim has no forecast of the past.
+        # For a unit within its claim the forecast is later than the last day of the log.
         assert since is not None or f'about {result.last}' not in str(result)
 
 

@@ -52,7 +52,7 @@ LAYOUTS = {
     'bno055': {'/bno055/imu_raw': IMU, '/bno055/imu': IMU, '/bno055/temp': TEMPERATURE},
     'witmotion': {'/imu': IMU, '/temperature': TEMPERATURE, '/magnetometer': MAGNETIC},
     'phidgets': {'/imu/data_raw': IMU, '/temperature': FLOAT, '/imu/mag': MAGNETIC},
-    # A node of the user publishes the Imu messages of PX4.
+    # PX4 publishes no Imu messages: a node of the user must publish them.
     'px4': {'/imu/uncompensated': IMU, '/fmu/out/sensor_accel': PX4},
     'mavros': {
         '/mavros/imu/data': IMU,
@@ -67,7 +67,7 @@ LAYOUTS = {
 }
 #: Drivers that publish no temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
-#: Drivers whose bags are fitted: one per type of temperature message, and one without.
+#: Drivers whose bags are fitted: one per type of temperature message, one without temperatures.
 FITTED = {'xsens', 'mavros', 'px4', 'phidgets', 'ardupilot'}
 #: Six faces and the first face again, for REST_S each, while the board warms by WARMING [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))

@@ -59,7 +59,7 @@ def test_no_published_sample_is_wrong_beyond_its_sd(inject):
 
 
 def settling_s():
-    """Return the time until the board's lag has reduced the rate of a ramp, plus the dwell [s]."""
+    """Return the time until the board's lag has reduced the rate of a ramp, plus dwell_s [s]."""
     detector = unit().detector
     ramp = 60.0 * RAMP_K_S
     return BOARD_LAG_S * math.log(ramp / detector.relaxed_rate_k_min) + detector.dwell_s

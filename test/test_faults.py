@@ -88,7 +88,7 @@ def direct(events):
 
 
 def wrong(row, heard):
-    """Return the times of wrong published samples outside the blind span."""
+    """Return the times of wrong published samples outside the span `blind` of the row."""
     seconds = true_seconds(row, heard.stamp_ns)
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     is_wrong = (np.abs(heard.force - force_at(seconds)) > SIGMAS * sd).any(axis=1)

@@ -32,7 +32,7 @@ def minutes(values):
 
 
 def left_by(pair, **options):
-    """Fit two positions; return the drift of each axis in a third position at rest [ug]."""
+    """Fit two positions; return the sd of corrected minute means in a third position [ug]."""
     bags = [BAGS / f'fit/0{number}.mcap' for number in pair]
     calibration = tc.fit(bags, gravity=9.80665, **options)
     held_out = tc.read(BAGS / 'held_out.mcap')
@@ -210,7 +210,7 @@ def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
 
 
 def test_one_tilted_support_is_not_the_scale_of_an_axis_across_gravity():
-    # WHY: a tilt of 17 urad/K gave a scale slope of 817 +- 23 ppm/K, at a prior sd to 200 ppm/K.
+    # WHY: a tilt of 17 urad/K gave a scale slope of 817 +- 23 ppm/K, for prior sd up to 200 ppm/K.
     rng = rng_of('linear tilts', 1)
     unit = replace(consumer_grade(rng), counts=0.0)
     ups = (1.0, 0.0, 0.03), (0.0, 1.0, 0.0)
@@ -319,10 +319,10 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # The leverage of the curve at the ends is 5/6 for a line through three equidistant
-        # points, 1 for a parabola; the next turn-on adds its variance. The stated sd of
-        # turn-ons may also be that of mountings: bias and scale keep a third each of the
-        # variance of nine independent offsets.
+        # The leverage of the curve at the ends is 5/6 for a line through three equidistant points,
+        # 1 for a parabola; the next turn-on adds its variance. `mounting_sd` may also be the sd of
+        # nine independent mountings: then bias and scale keep a third each of the variance of a
+        # mounting offset.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()

@@ -39,12 +39,13 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Every second parameter is tested: blocks of an axis have odd lengths, so each kind occurs.
+    # Every second parameter is tested: the block of parameters of a bias or a scale has an odd
+    # length, so each kind of parameter is tested in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # the scale levels of both sets are tested below, by a change of K
+            continue  # a change of K, at the end of the test, tests the scale levels
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
@@ -293,8 +294,9 @@ def test_a_start_that_contradicts_all_others_is_left_out():
 
 
 def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
-    # A computer without a battery clock starts at the date of its image, and the stamps of the
-    # samples are right. First all starts have a date of the image, then the last start alone.
+    # A computer without a battery clock starts at the date of its disk image, and the stamps of
+    # the samples are right. First all starts have a date of the disk image, then the last start
+    # alone.
     unit = known()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {one.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for one, _ in logged}

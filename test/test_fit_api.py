@@ -49,8 +49,8 @@ def test_a_knee_of_the_bias_is_found():
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # Trial knees are 1 K apart: the fit uses the two trial knees around the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # A mean slope between two trial knees instead of the true knee gives an error of at most
-    # 20 ug/K times 0.25 K, within 1 K of the range of 22 K.
+    # A mean slope between the two trial knees instead of the true knee gives an error of at most
+    # 20 ug/K times 0.25 K = 5 ug, in 1 K of the range of 22 K.
     assert left < 1.5
 
 
@@ -78,7 +78,7 @@ def test_a_thermometer_on_two_topics_counts_once():
 
 
 def columns_of(slopes):
-    """Record one position for each of the given slopes."""
+    """Record one position for each of the given bias slopes [ug/K]."""
     rng = np.random.default_rng(10)
     bags = []
     for k, (up, slope) in enumerate(zip(UPS, slopes, strict=False)):
@@ -107,8 +107,8 @@ def test_a_bag_of_another_environment_is_excluded_and_widens_the_claimed_sd():
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'took no part' in note
-        # The slope of bag r4 exceeds that of the other bags by 100 ug/K over 11 K above the knee,
-        # by half of 100 ug/K on z.
+        # Over 11 K above the knee the slope of bag r4 exceeds that of the other bags by 100 ug/K
+        # on x and y, and by 50 ug/K on z.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
     # A further bag with the slope of the first four bags contradicts no other bag.

@@ -148,7 +148,7 @@ def test_the_evidence_is_complete(response):
     judged = {(group.part, group.group) for group in calibration.evidence}
     # In the unit OWN_LAGS the bias of each axis is a curve over the temperature of a lagging part.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
-    # A response term with zero weight serves the covariance only, and needs no evidence.
+    # A response term with zero weight serves the covariance only, and needs no row in `evidence`.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
 
@@ -174,7 +174,7 @@ def test_the_compensator_does_what_the_fit_promised(response):
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
     variance = after.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
-    # In means of 60 s white noise and rounding average out; the other errors do not.
+    # In means of 60 s white noise and rounding average out, errors of the model do not.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
     error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
@@ -253,7 +253,8 @@ def test_a_switch_of_sets_changes_the_output_by_1_ug_per_second(golovach):
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return corrected.specific_force
 
-    # The three outputs have equal noise, so their differences give the weight of the dynamic set.
+    # The outputs of the blend and of either set have equal noise, so their differences give the
+    # weight of the dynamic set.
     output, static, dynamic = forces(None), forces(0.0), forces(1.0)
     gap = dynamic - static
     size = np.linalg.norm(gap, axis=1)
@@ -332,7 +333,7 @@ def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mounting
     # Misalignments of some mrad or mounting offsets of 5 mg explain the norms of nine positions.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
-    # A fit with only those groups that the simulated unit has takes half of the time.
+    # A fit with only the groups of the simulated unit takes half the time of a fit of all groups.
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))
     calibration = fit(sources_of(records), options).calibration
     M = np.array(calibration.misalignment)

@@ -56,7 +56,8 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # 5000 readings (noise 3 mK) give the rest gradient to 0.1 mK; averaged rates add an error.
+    # 5000 readings (noise 3 mK) give the rest gradient to 0.1 mK; rates from differences over
+    # 120 s add an error.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (

@@ -21,7 +21,7 @@ from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 #: Temperatures of a bag: soaks long enough for the board to settle.
 PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
-#: Difference of dynamic and static set in each axis [m/s^2], far above the 2 ug of a window.
+#: Difference of dynamic and static set in each axis [m/s^2], far above a window's noise, 2 ug.
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 

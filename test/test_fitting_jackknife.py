@@ -63,7 +63,7 @@ def test_the_claimed_sd_contains_effects_that_the_model_lacks(effect_sd):
 
 
 def ratio(path):
-    """Fit one log; return the jackknife over its positions, in units of the claimed sd."""
+    """Fit one log; return the jackknife's sd over its positions divided by the claimed sd."""
     accel = np.loadtxt(path, usecols=(0, 1, 2))
     stamps = np.arange(len(accel), dtype=np.int64) * 10_000_000
     options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')

@@ -228,7 +228,8 @@ def test_stamps_that_do_not_rise_are_left_out(rng):
 
 @pytest.mark.parametrize('n', [0, 1, 70])
 def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
-    # WHY: `info` reported a clock set back by less than 1 % of the samples, `fit` did not.
+    # WHY: `info` reported a clock set back if less than 1 % of the samples were affected, `fit`
+    # did not.
     whole = block(still(rng, 300.0, (0.0, 0.0, 3000.0)))
     cycle_ns = int(np.median(np.diff(whole.accel_stamp_ns)))
     # The first sample after the clock is set back by n cycles has the stamp of an earlier sample.

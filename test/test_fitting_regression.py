@@ -119,7 +119,7 @@ class Dense:
         return np.concatenate(parts)
 
     def jacobian(self, x):
-        """Return the Jacobian by central differences with steps of 0.1 sd: linear to some 1e-9."""
+        """Return the Jacobian by central differences of 0.1 sd, with an error of some 1e-9."""
         sd = np.sqrt(self.at.variance)
         columns = []
         for k in range(self.n):
@@ -137,8 +137,8 @@ class Dense:
 def solved(request):
     n_positions, pose_of = request.param
     rng = np.random.default_rng(5)
-    # The table draws an initial lag state per position. Positions of one bag share a state, so the
-    # states are 0 for bags of several positions.
+    # The table draws an initial lag state per position. Positions of one bag share an initial lag
+    # state, so these states are 0 for bags of several positions.
     truth = Truth(
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
@@ -193,7 +193,8 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # The prior of the mean initial lag state adds a constant, which is equal for both shares.
+    # The prior of the mean initial lag state adds a constant, equal for both values of
+    # `start_share`.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
@@ -319,7 +320,8 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The score of the drift needs neither bias nor scale; M keeps its prior value and prior sd.
+    # The score of the drift is finite, as it needs neither bias nor scale; M keeps its prior value
+    # and prior sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment
@@ -429,8 +431,9 @@ def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
 
 
 def test_inactive_columns_share_the_initial_lag_states_of_the_active_ones(solved):
-    # WHY: the prior on the sum of the initial lag states was left out, and S was too large by a
-    # factor of 50 for a scale factor whose bias has the same lag.
+    # WHY: the prior on the sum of the initial lag states was left out, and the information S on an
+    # inactive column was too large by a factor of 50 for a scale factor whose bias has the same
+    # lag.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))

@@ -156,8 +156,9 @@ def test_noise_parameters_are_estimated(noisy):
 def test_flicker_noise_has_several_correlation_times():
     # WHY: with a single correlation time the initial lag states and the tilts explained the slower
     # processes, and the errors of the biases were 1.9 claimed sd.
-    # Flicker noise whose shortest time is below the candidates, 3 windows, was taken for noise of
-    # one correlation time: the two noise models were compared before the search of variances.
+    # Flicker noise with a shortest correlation time below that of the candidates, 3 windows, was
+    # taken for noise of one correlation time: the two noise models were compared before the search
+    # of variances.
     errors = []
     for seed, time_s in ((0, 400.0), (5, 400.0), (6, 400.0), (6, 180.0)):
         truth = Truth(noise=Noise(4.0, time_s, 3))
@@ -444,8 +445,8 @@ def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
 
 
 def test_the_drifts_of_scale_factors_show_how_well_turn_ons_repeat():
-    # WHY: nine constants explain the norms of nine positions. The fit kept an offset sd of 5 ug,
-    # with constants wrong by 75 claimed sd.
+    # WHY: nine constants explain the norms of nine positions, so the fit kept an offset sd of 5 ug
+    # instead of 300 ug, with constants wrong by 75 claimed sd.
     truth = Truth(
         offset_sd=300.0 * MICRO,
         sigma=np.full(3, 0.5 * MICRO),

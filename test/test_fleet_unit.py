@@ -131,7 +131,8 @@ class TestRow:
         assert row['chosen'] == '/imu/raw, its only Vector3Stamped, is taken for counts'
 
     def test_a_slope_that_the_positions_do_not_determine_has_no_sd(self, tmp_path):
-        # WHY: a fit of one position gave bias plus scale as the bias, with an sd of 0.06.
+        # WHY: a fit of one position gave the slope of bias plus scale as that of the bias, with an
+        # sd of 0.06 ug/K.
         write_unit(tmp_path / 'u', 1, 1)
         row = processed(tmp_path).row
         assert [row[f'bias_slope_sd_{axis}_ug_k'] for axis in 'xyz'] == [None] * 3

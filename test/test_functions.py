@@ -139,7 +139,7 @@ def test_a_curve_that_is_not_finite_is_refused(bad):
 
 
 def slope_and_lag(variances):
-    """Make a unit with a bias slope and a lag of 600 s; `variances` by index of the parameter."""
+    """Make a unit with a bias slope and a lag of 600 s; `variances`: parameter -> variance."""
     unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
@@ -216,7 +216,7 @@ def test_ramp_states_equal_those_of_the_stepped_memory(rate):
             # In the memory the gradient rises within the first second, in `ramp_states` at once.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # A play on a lag, which is left out, would reach its end only after half an hour.
+            # Plays on lags are left out: they would reach their half-width after half an hour.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

@@ -33,7 +33,7 @@ def test_residual_of_a_good_calibration_is_within_its_sd(rng):
     # The mean of 99 samples has a noise of 0.2 mm/s^2, the mean of 30 such windows 0.04 mm/s^2.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
     assert result.residual_sd == pytest.approx(math.hypot(BIAS_SD, NOISE_SD / math.sqrt(99)))
-    assert result.n_windows == 59  # the first of 60 windows has no predecessor
+    assert result.n_windows == 59  # the first of 60 windows has no predecessor to compare with
     assert result.is_still
 
 
@@ -55,7 +55,7 @@ def test_a_jump_of_time_starts_a_new_window(rng):
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
-    """Run a rest whose |f| changes at `at_s`; return the delay of a refusal [s] and a result."""
+    """Run a rest whose |f| changes at `at_s`; return the delay of a refusal [s] and its result."""
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     for k in range(round((at_s + 10.0) * rate_hz)):

@@ -69,7 +69,8 @@ def unit():
 def fitted(unit):
     """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # The groups of lags and heat flows have half of all columns; their fit takes half as long.
+    # The fitted groups have half of all columns, so the fit takes half the time of a fit of all
+    # groups.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -77,7 +78,8 @@ def fitted(unit):
 @pytest.fixture(scope='module')
 def held_out(unit):
     (station, *_) = plan('held-out', 2)
-    # The program has two ramps up and two down, with soaks, and does not return to its start.
+    # The program has two ramps up and two down, with soaks, and ends at another temperature than
+    # at its start.
     whole = station.program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
     return arrays(unit, [replace(station, program=program)], 99, rate_hz=RATE_HZ)[0]

@@ -43,7 +43,8 @@ def test_levelling_makes_the_force_vertical(rng):
 
 
 def test_the_sigma_is_that_of_white_noise(rng):
-    # Expected sd of the position: Schuler oscillation of the levelling, plus integrated noise.
+    # Expected sd of the position: oscillation of the levelling error (Schuler), plus the noise,
+    # integrated twice.
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)

@@ -27,7 +27,7 @@ from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000
 K = 300.0
-SLOPE = 2.0  # counts per K on the z axis
+SLOPE = 2.0  # drift of the z axis [counts/K]
 
 
 def resting(
@@ -80,7 +80,7 @@ def judged(bag, one, **keys):
 
 
 def made(residual, raw, claimed, n=40, dynamic=10, outside=0):
-    """Make windows of one position, z up, from figures in micro-g."""
+    """Make windows of one position, z up, from residual, raw residual and claimed sd [ug]."""
     force, constant = np.zeros((n, 3)), np.zeros((n, 3))
     force[:, 2] = GRAVITY + residual * MICRO_G
     constant[:, 2] = GRAVITY + raw * MICRO_G
@@ -225,7 +225,8 @@ class TestVerdict:
             (121.0, 1000.0, 60.0, 'recalibrate'),
             (1100.0, 9000.0, 1500.0, 'valid, but it only claims 1.5 mg'),
             (50.0, 100.0, 60.0, 'valid, but it only claims 60 ug'),
-            # A residual no smaller than the raw residual is not valid, whatever the claimed sd.
+            # A calibration whose residual is not below the raw residual is not valid, whatever it
+            # claims.
             (1100.0, 1000.0, 1500.0, 'no better than raw'),
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
@@ -299,7 +300,7 @@ class TestVerdict:
         worse = windows.force.copy()
         worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
         windows = dataclasses.replace(windows, force=worse)
-        # The RMS is 84 ug over all windows, with 60 ug claimed, but 150 ug in the dynamic regime.
+        # RMS of the residual: 84 ug in all windows, 60 ug claimed, 150 ug in the dynamic regime.
         judgement = judge(windows, CLAIMING)
         assert judgement.sections['all'].ratio < 2.0
         assert judgement.verdict == 'recalibrate'
@@ -331,7 +332,7 @@ class TestVerdict:
         # WHY: the message named only temperatures for windows outside the calibrated rates.
         assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
-        # A soak 0.01 K beyond the range counts as inside: the thermometer's noise may cause this.
+        # A soak 0.01 K beyond the range counts as inside: 0.01 K may be the thermometer's noise.
         edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
         assert edge.sections['outside'].n == 0
 
@@ -363,7 +364,7 @@ class TestShifts:
         assert '; shifted: x bias +' in judgement.reason
 
     def test_a_large_shift_is_written_without_an_exponent(self):
-        # WHY: the verdict had an sd with an exponent: `x bias +829 +- 1.3e+02 ug`.
+        # WHY: the verdict had an sd with an exponent, `x bias +829 +- 1.3e+02 ug`.
         one = AxisShift(829.4 * MICRO_G, 129.2 * MICRO_G, 0.0, 1.0)
         small = AxisShift(-1.234 * MICRO_G, 0.0567 * MICRO_G, 0.0, 1.0)
         assert change_texts((one, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')

@@ -57,7 +57,7 @@ HOMES = {
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {
-    'fitting/assembly.py'  # the date of a fit is part of its provenance
+    'fitting/assembly.py'  # reads the date of a fit for its provenance
 }
 
 SOURCES = sorted(PACKAGE.rglob('*.py'))

@@ -147,8 +147,9 @@ def test_plotjuggler_splitters_have_the_right_number_of_panels():
 @pytest.mark.parametrize(
     ('name', 'expected'),
     [
-        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes: the rate is 1.7 K/min at 60 min, and 1.68 as
-        # delayed by two lags of 30 s (sampled at 1 Hz); the second derivative is 0.02.
+        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes: the rate is 1.7 K/min at 60 min, and
+        # 1.68 K/min behind two lags of 30 s (sampled at 1 Hz); the second derivative is
+        # 0.02 K/min^2.
         ('/thermo_comp/board_k_min', 1.68),
         ('/thermo_comp/case_k_min', 1.68),
         ('/thermo_comp/case_k_min2', 0.02),

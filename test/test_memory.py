@@ -178,7 +178,8 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; the step of 6 s is 4 % of 150 s.
+    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; a step of 6 s is 4 % of the stage of
+    # 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -193,7 +194,8 @@ def test_the_error_of_a_second_stage_adds_the_errors_of_two_stages():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # Factor 1.4 = (900 + 150) / (900 - 150): the errors of the two stages may have opposite signs.
+    # Factor 1.4 = (900 s + 150 s) / (900 s - 150 s): the errors of the two stages of 900 s and
+    # 150 s may have opposite signs.
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 
@@ -255,7 +257,8 @@ def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; the step of 6 s is 10 % of 60 s.
+    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; a step of 6 s is 10 % of the lag of
+    # 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 

@@ -121,7 +121,7 @@ def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, mo
     monkeypatch.setenv(VARIABLE, str(other))
     drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's profile there are 50 timed events per second, for 700 samples.
+    # With the node's profile there are 50 timed events per second, at 700 samples per second.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 

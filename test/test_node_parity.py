@@ -39,7 +39,7 @@ def _collected():
 
 
 def thermal_test(path, imu=False, has_case=True):
-    """Write a bag of soak, ramp and soak, temperatures late; return the number of samples."""
+    """Write a bag of soak, ramp, soak, some readings late; return the number of samples."""
     rng = np.random.default_rng(11)
     n = MINUTES * 60 * RATE_HZ
     stamps = START_NS + np.arange(1, n + 1) * (1_000_000_000 // RATE_HZ)

@@ -55,7 +55,7 @@ def test_a_pose_is_an_attitude_to_which_the_unit_was_returned():
 
 
 def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
-    # WHY: the fit of rests in one pose began with a smaller sd than stated, and kept this sd.
+    # WHY: the fit of rests in one pose began with a smaller mounting sd than stated, and kept it.
     study = next(returned(1))
     calibration = strangers.fitted(study, mounting_sd=0.01)
     for axis in calibration.static.axes():
@@ -72,10 +72,11 @@ def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
     ],
 )
 def test_rests_on_the_bench_do_not_separate_the_slopes_of_bias_and_scale(draw, unit, is_cold):
-    # WHY: the thermometer's noise in rests at constant temperature looked like changes without an
-    # effect, and the drift of the one ramp went to the scale factors: 470 ppm/K instead of -36.
-    # The warm-ups of a cold unit put a lag of an axis into its scale factor alone. Lags whose
-    # initial states fitted noise in rests of a warm unit separated bias and scale by chance.
+    # WHY: the thermometer's noise in rests at constant temperature looked like temperature changes
+    # without an effect, and the drift of the one ramp went to the scale factors: 470 ppm/K instead
+    # of -36. For warm-ups of a cold unit the fit put a lag of an axis into its scale factor alone.
+    # Lags whose initial states fitted noise in rests of a warm unit separated bias and scale by
+    # chance.
     rng = rng_of('bench beside a ramp', unit)
     imu = draw(rng)
     bench = program(22.0, 5.0)

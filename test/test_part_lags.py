@@ -232,7 +232,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
 
 @pytest.mark.slow
 def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
-    # Heads lag the board, pendulums lag the heads; the error is the stress board - pendulum.
+    # Heads lag the board, pendulums lag the heads; stress by board - pendulum changes the bias.
     unit = second_simulator.unit_of('products', 2)
     # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
@@ -273,7 +273,7 @@ def test_soaks_determine_the_curve_by_their_norms(grade):
 @pytest.mark.slow
 def test_six_faces_in_three_soaks():
     # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
-    # unit with drifts of 10 mg left 40 mg. With a stated `mounting_sd` the fit divided by zero.
+    # unit with drifts of 10 mg left 40 mg, and divided by zero if `mounting_sd` was stated.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),

@@ -156,7 +156,8 @@ def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
     # The variance is flat near a corner, so the attitude may be the grid point beside the corner.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # Three angles of 1 % (prior of a MEMS) change |f| by g times (xy, xz, yz), and noise adds.
+    # Three angles of 1 % (prior of a MEMS) change |f| by g times xy, xz and yz of the direction
+    # (x, y, z) of gravity; noise adds a little.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
 
 

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""For any input the output is finite, in order, physical; `make nightly` tries 10 000 inputs."""
+"""
+For any input the output of the correction is finite, in order of time, and physical.
+
+Each test tries 10 000 inputs in `make nightly`.
+"""
 
 import base64
 import json
@@ -237,7 +241,7 @@ configs = st.builds(
 def largest(axis, regime, of):
     """Bound the change of an axis' bias, and the relative change of its scale."""
     edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
-    # Curves continue along their tangents for up to a quarter of the union of both ranges.
+    # Curves continue along their tangents for up to a quarter of the ranges of both sets.
     t = max(abs(edge - of.reference_temperature_c) for edge in edges)
     t += 0.25 * (max(edges) - min(edges))
     curves = regime.axes()[axis]

@@ -60,7 +60,8 @@ def test_handheld_units_agree_with_a_direct_solution(unit):
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = calibration.axes
-    # Fit and scipy weight positions differently: results differ by less than 1 mg and 1e-3.
+    # Fit and scipy weight positions differently: biases differ by less than 1 mg, scale factors by
+    # less than 1e-3.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)

@@ -102,7 +102,8 @@ def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
         ((position, length),) = chunk_places(path)
         path.write_bytes(content[: position + length // 2])
         columns = read(path).columns
-        # Numbers do not compress: half of the bytes hold half of the messages, less a block.
+        # Random numbers are incompressible: half of the bytes hold half of the messages, less a
+        # block.
         assert 0.4 * n < len(columns) < 0.6 * n
         assert (columns.accel == xyz[: len(columns)]).all()
 

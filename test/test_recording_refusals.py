@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Other layouts, encodings and topics, and files that are not bags, are refused with a reason."""
+"""Unknown layouts, encodings or topics, and files that are no bags, are refused with a reason."""
 
 import os
 import struct

@@ -65,7 +65,7 @@ def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1
 
 @pytest.fixture(scope='module')
 def headline():
-    """Run the ramp of the requirement: 0.5 K/min, thermal lag 15 min, 1 Hz, after a soak."""
+    """Run the ramps of docs/regime.md: 0.5 K/min, thermal lag 15 min, 1 Hz, after a soak."""
     return {
         name: onsets(*sensor, 0.5, LAG_S, 12, end_s=300.0, soak_s=1800.0)
         for name, sensor in SENSORS.items()
@@ -119,7 +119,7 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
         (0.01, 0.0, 0.5, 900.0, 0.1, 900.0),
         (0.001, 0.0625, 0.2, 1200.0, 1.0, 3600.0),
         (0.01, 0.0625, 3.0, 300.0, 10.0, 3600.0),
-        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # the baseline could not follow faster ramps
+        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # a ramp slow enough to become the baseline
         (0.01, 1.0, 0.2, 900.0, 10.0, 7200.0),
         (0.01, 1.0, 3.0, 180.0, 1.0, 2400.0),
     ],

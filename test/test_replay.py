@@ -29,7 +29,7 @@ SECOND_NS = 1_000_000_000
 
 
 def thermal_test(path, minutes=30.0, rate_hz=5.0, serial='', imu=False):
-    """Write a bag of a ramp between two soaks, with a lagging board, in several write groups."""
+    """Write a bag of a ramp between two soaks, with a lagging board; flush seven times."""
     rng = np.random.default_rng(7)
     n = round(minutes * 60.0 * rate_hz)
     stamps = START_NS + np.rint((np.arange(n) + 1.0) * (1e9 / rate_hz)).astype(np.int64)

@@ -104,7 +104,7 @@ def test_windows_are_means_of_ten_seconds_at_rest():
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
     # Two minutes of rest in two attitudes, with scattered stamps. Up to `RATE_HZ` the noise of a
-    # sample is constant, at higher rates its density.
+    # sample is constant, at higher rates the noise density.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid samples (stuck, zero, too fast) are treated alike in streams and in blocks."""
+"""Invalid samples (stuck, zero, at too high a rate) are treated alike in streams and in blocks."""
 
 import math
 
@@ -96,7 +96,7 @@ def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_v
         begin = end
     assert collected == expected
     assert many.n_same == one.n_same
-    np.testing.assert_array_equal(many.run, one.run)  # NaN before the first sample
+    np.testing.assert_array_equal(many.run, one.run)  # `run` is NaN before the first sample
 
 
 def test_a_user_may_switch_checks_of_samples_off():
@@ -137,7 +137,8 @@ def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
-        # Tolerance: noise of 1.4 mm/s^2 over some 110 probes, plus rounding errors of 0.05 counts.
+        # Tolerance: noise of 1.4 mm/s^2 in each of some 110 samples, plus rounding errors of 0.05
+        # counts.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
 
 

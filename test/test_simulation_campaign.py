@@ -44,7 +44,7 @@ def test_a_record_is_the_run_of_a_bag(kind):
 
 @pytest.mark.parametrize('kind', TRIAD_NAMES)
 def test_a_perfect_model_leaves_the_noise(kind):
-    """The floor of every accuracy table: 0.65 ug of |g| over 60 s, 1.12 ug of the vector."""
+    """The noise in means over 60 s, floor of every accuracy: 0.65 ug in |f|, 1.12 ug in f."""
     unit = triad(kind, 2)
     errors, norms = [], []
     for record in arrays(unit, plan('held-out', 2), 7):
@@ -53,7 +53,8 @@ def test_a_perfect_model_leaves_the_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # The bias walk has a mean square of 9 * 7.3 / 2 ug^2 per axis in 7.3 h; 3 runs scatter.
+        # The bias walk has a mean square of 9 * 7.3 / 2 ug^2 per axis in 7.3 h; the wide limits
+        # allow for the scatter of 3 runs.
         assert 4.0 < vector < 20.0
     else:
         # The RMS of 1311 means scatters by 2 % (norm) and 1.2 % (vector); the limits are 5 sd.

@@ -113,7 +113,7 @@ def test_white_noise_has_its_density(unit):
         power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
     )
     means = accel.reshape(-1, 3000, 3).mean(axis=1)
-    # The standard deviation of 240 means scatters by 4.6 %; the limit is three times this.
+    # The standard deviation of 240 means scatters by 4.6 %; the limit is three times 4.6 %.
     np.testing.assert_allclose(
         means.std(axis=0), np.array(unit.noise_density) / np.sqrt(60.0), rtol=0.15
     )

@@ -39,7 +39,7 @@ def unit(**given):
 
 
 def ramp(given, rate, hours, environment=units.CHAMBER):
-    """Integrate a ramp of the air [K/s] from rest; returns times and states."""
+    """Integrate a ramp of the air [K/s] from rest; return times [s] and temperatures of nodes."""
     A, b, h = units.network(given, environment)
     at = np.arange(0.0, 3600.0 * hours, 10.0)
     return at, units.integrate(A, b, h, rate * at, 10.0, np.linalg.solve(A, -h))

@@ -52,7 +52,7 @@ def errors():
     collected = {}
     for name, (noise, quantum, dt) in SENSORS.items():
         runs = []
-        # A run at 10 Hz has as many readings as ten runs at 1 Hz.
+        # One run at 10 Hz suffices: it has as many readings as ten runs at 1 Hz.
         for seed in range(1 if dt < 1.0 else 3):
             rng = np.random.default_rng([seed, 1])
             t = np.arange(-SOAK_S, RAMP_S + 3600.0, dt)
@@ -247,8 +247,8 @@ def test_a_gap_widens_and_a_long_gap_starts_anew():
 
 def test_noise_declared_too_small_is_learnt():
     # WHY: real die sensors scatter by 0.1 K; with 5 mK declared every reading was an outlier.
-    # WHAT: the noise ratio is estimated within 20 % (chi-square of some 400 readings: 4 %, and the
-    # mode of changing rates takes a share), and the variance is right.
+    # WHAT: the noise ratio is estimated within 20 % (chi-square of some 400 readings: 4 %; the
+    # estimator takes a part of the noise for changes of the rate), and the variance is right.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))

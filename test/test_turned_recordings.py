@@ -83,7 +83,7 @@ def test_a_single_turn_on_is_claimed_with_the_repeatability_of_its_grade():
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
     # The noise of 0.25 mg in 1 Hz is that of a MEMS, whose turn-ons repeat within 0.1 to 1 mg:
-    # the claim is at least the geometric mean, 0.3 mg, and at most half more than the largest.
+    # the claim is at least their geometric mean, 0.3 mg, and at most 1.5 times their largest.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
 
 
@@ -98,7 +98,7 @@ def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
     first = tc.fit(bags[:1], **options)
     for both in (tc.fit(bags[1:], prior=first, **options), tc.fit(bags, **options)):
         share = (bias_of(both) - bias_of(first)) / change
-        # The noise of 13 rests of 400 s in each recording is 2 % of the change.
+        # The noise of 13 rests of 400 s in each recording is 2 % of the change of the turn-on.
         assert np.abs(share - 0.5).max() < 0.05
 
 

@@ -16,15 +16,16 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 def test_a_start_in_a_ramp_is_claimed():
     # WHY: after a restart in a ramp the claimed sd was a third of the error. In a ramp a part lags
-    # the board by rate times time constant, 1 K in this test; after a start at rest the lag has
-    # an sd of 0.4 K. If the ramp ends soon after the start, the error remains.
+    # the board by rate times time constant, 1 K in this test; after a start at rest the lag has an
+    # sd of 0.4 K. A ramp that ends soon after the start leaves the same error as a ramp that goes
+    # on.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
         compensator = Compensator(unit, UNCHECKED)
         for second in range(61):
             stamp, risen = 10**12 + second * SECOND_NS, rate * min(second, end)
-            # Without flicker both thermometers would count as faulty.
+            # Exactly constant readings would make both thermometers count as faulty.
             flicker = 1e-5 * (-1) ** second
             compensator.push('board', stamp, 10.0 + risen + flicker)
             compensator.push('case', stamp, 10.0 + risen - flicker)
