@@ -207,9 +207,9 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The mean over half an hour has little noise of the thermometers, which is in the claim of a
-    # sample: subtract the claim of a calibration whose parameters have no errors.
-    exact = corrected(without_errors(calibration), bag, config)
+    # The bound is that of parameters: subtract the claim of a calibration whose parameters have no
+    # errors, that is, the claim for the thermometers' noise and for another turn-on.
+    exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
         vector=float(np.linalg.norm(error)) / UG,
@@ -217,19 +217,6 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
         claim=float(np.linalg.norm(sd)) / UG,
         bound_ratio=rms(error / study.bound.sd),
     )
-
-
-def without_errors(calibration: thermo_comp.Calibration) -> thermo_comp.Calibration:
-    """Return a calibration that claims no errors of its parameters, mountings and turn-ons."""
-    static, dynamic = (
-        replace(
-            regime,
-            lack_of_fit=(),
-            **{axis: replace(getattr(regime, axis), residual_sd_m_s2=0.0) for axis in 'xyz'},
-        )
-        for regime in calibration.regime_sets()
-    )
-    return replace(calibration, static=static, dynamic=dynamic, posterior=None)
 
 
 def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calibration:

@@ -16,7 +16,8 @@ from strangers_limits import LIMITS, Limit, Result, Score, best_baseline, misses
 from strangers_recorded import blocks_of, part, rests_of
 from strangers_units import GRAVITY, UG, Bag, record, rng_of, spread
 
-from thermo_comp.unit.calibration import Axes, AxisReference
+from thermo_comp.unit.calibration import Axes, AxisReference, parameter_layout
+from thermo_comp.unit.posterior import posterior_of
 
 ZEROS = np.zeros((1, 3))
 LEVEL = np.array([0.0, 0.0, 1.0])
@@ -241,10 +242,15 @@ def test_a_bias_at_the_reference_is_held_against_its_bound():
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
     study = cases.Study('', (), {}, bound=bound)
-    # The calibration claims an sd of 2e-3 m/s^2 in addition to its white noise.
-    claimed = axis_set(residual_sd_m_s2=2e-3)
-    known = regime_set(x=claimed, y=claimed, z=claimed)
-    score = strangers.bias_score(calibration(axes=axes, static=known, dynamic=known), study)
+    # The calibration claims a bias sd of 2e-3 m/s^2, and 5e-3 m/s^2 for another turn-on.
+    again = axis_set(residual_sd_m_s2=5e-3)
+    known = regime_set(x=again, y=again, z=again)
+    unknown = calibration(axes=axes, static=known, dynamic=known)
+    layout = parameter_layout(unknown)
+    variances = np.zeros(layout.n_parameters)
+    variances[[block.static for block in layout.bias]] = (300.0 * 2e-3) ** 2
+    posterior = posterior_of(np.diag(variances))
+    score = strangers.bias_score(replace(unknown, posterior=posterior), study)
     assert score.ratio == pytest.approx(1 / 0.6 / np.sqrt(3.0))
     assert score.vector == pytest.approx(1 / 300.0 / UG)
     assert score.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
