@@ -110,8 +110,23 @@ def test_other_recordings_are_not_joined(rng):
     assert len(joined(reduced(cut(whole, (200.0,), pause_s=60.0)))) == 2
     known = KnownForce('part', parse_sections('0 400 2.0'))
     assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
+    # Of two recordings with the same stamps each is continued by its own part.
+    other = replace(whole, accel=-whole.accel)
+    parts = [*cut(whole, (200.0,)), *cut(other, (200.0,))[::-1]]
+    first, second = joined(reduced(parts))
+    assert len(first.intervals) == len(second.intervals) == 1
     before, after = cut(whole, (200.0,))
     assert len(joined(reduced([before], serial='a') + reduced([after], serial='b'))) == 2
+
+
+def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
+    before, after = cut(recorded(rng, 600.0), (300.0,))
+    shaken = replace(after, accel=1e3 * rng.standard_normal(after.accel.shape))
+    parts = reduced([before, shaken])
+    assert not parts[1].intervals
+    (bag,) = joined(parts)
+    assert len(bag.intervals) == 1
+    assert bag.n_samples == 60_000
 
 
 @pytest.fixture(scope='module')
@@ -153,7 +168,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording(tests):
         assert np.nanstd(difference, axis=0).max() < 1.2 * MICRO_G
 
 
-def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng):
+def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng, cli):
     paths, topics = [], Topics()
     for number, part in enumerate(cut(recorded(rng, 900.0), (450.0,))):
         paths.append(tmp_path / f'part{number}.mcap')
@@ -168,3 +183,7 @@ def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng):
     assert bag.source.name == 'part0.mcap .. part1.mcap'
     # 900 s hold 15 windows of 60 s, of which two may be lost around the end of the first part.
     assert len(result.judgements['unit'].windows) >= 13
+    # The command line states which bags were joined.
+    thermo_comp.save(calibration, tmp_path / 'unit.yaml')
+    errors = cli('evaluate', *paths, '-c', tmp_path / 'unit.yaml').stderr
+    assert 'part0.mcap .. part1.mcap: 2 bags of one recording, joined' in errors

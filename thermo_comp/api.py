@@ -225,7 +225,8 @@ def fit(
     Returns
     -------
     Calibration
-        Calibration of the unit; its method `save` writes a file, its method `correct` applies it.
+        Calibration of the unit; `thermo_comp.save` writes its file, its method `correct` applies
+        it.
 
     Raises
     ------

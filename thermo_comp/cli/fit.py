@@ -130,7 +130,7 @@ def fit(
         )
     with out.progress('fitting') as done:
         result = run(sources, wanted, done)
-    out.sources((bag.source.name, bag.info.chosen, bag.info.truncated) for bag in result.bags)
+    out.recordings(result.bags)
     save_calibration(result.calibration, output, overwrite=force)
     if report is not None:
         from ..report.evidence import evidence_of_fit

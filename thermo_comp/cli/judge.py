@@ -7,7 +7,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..files import CSV, PAGE, check_output, shown_name
+from ..files import CSV, PAGE, check_output
 from ..unit.gravity import STANDARD_GRAVITY
 from . import shared_options as options
 from .field import evaluate_rests
@@ -71,11 +71,11 @@ def evaluate(
     models = list(zip(names, map(load_calibration, calibration), strict=True))
     with out.progress('evaluating') as done:
         result = run(bags, models, **judging, topics=topics, force=known_force, progress=done)
-    out.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in result.bags)
+    out.recordings(result.bags)
     judged = result.judgements[models[0][0]]
     if csv is not None:
         with table_writer(csv, {}, overwrite=force) as write:
-            write(columns_of(judged.windows, list(map(shown_name, bags))))
+            write(columns_of(judged.windows, [bag.source.name for bag in result.bags]))
     drifts = drifts_of(history_of([model for _, model in models]))
     print_sections(out, result.judgements)
     _print_axes(out, judged)
@@ -225,7 +225,7 @@ def report(
         )
     with options.usage_of():
         evidence = evidence_of_bags(opened, loaded, **judging, others=known[1:])
-    out.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in opened)
+    out.recordings(opened)
     write_report(evidence, output, info=info, figures=figures, overwrite=force)
     out.points(evidence.findings)
     judgement = evidence.judgement

@@ -8,6 +8,8 @@ carries results only. All output goes through `_print`: text from outside (seria
 metadata, file names) can neither forge a line nor move the cursor, and any terminal can show it.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import math
@@ -15,12 +17,15 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
 from ..text import one_line
 from ..unit.gravity import MICRO_G
+
+if TYPE_CHECKING:
+    from ..fitting.reduction import ReducedBag
 
 Cell = str | int | float | None
 # A number, or a dash for none.
@@ -57,6 +62,13 @@ class Output:
         for chosen, names in alike.items():
             more = f' and {len(names) - 1} more' if len(names) > 1 else ''
             self.note(f'{names[0]}{more}: {chosen}')
+
+    def recordings(self, bags: Sequence[ReducedBag]) -> None:
+        """Print the topics chosen in bags, the missing parts, and which bags were joined."""
+        self.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in bags)
+        for bag in bags:
+            if bag.parts:
+                self.note(f'{bag.source.name}: {len(bag.parts)} bags of one recording, joined')
 
     def end(self, code: int = 0, /, **data: Any) -> None:
         """End a command: print JSON if requested; exit with `code`, or 1 if a bag lacks parts."""

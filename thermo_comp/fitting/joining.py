@@ -31,10 +31,10 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     """Join each bag that begins where another bag ends with that bag; keep the order."""
     recordings: list[list[ReducedBag]] = []
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
-        for recording in recordings:
-            if _continues(recording[-1], bag):
-                recording.append(bag)
-                break
+        before = [recording for recording in recordings if _continues(recording[-1], bag)]
+        if before:
+            # Simulated recordings may have the same stamps: the parts have the nearest readings.
+            min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
     number = {id(bag): k for k, bag in enumerate(bags)}
@@ -51,6 +51,16 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     is_of_unit = bag.source.serial == part.source.serial
     is_next = abs(gap_s) < max(CONTINUED_S, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)
+
+
+def _step(part: ReducedBag, bag: ReducedBag) -> float:
+    """
+    Return the change of the readings from the last window of a part to the first of a bag; 0 if
+    one of them has no rest.
+    """
+    if not (part.intervals and bag.intervals):
+        return 0.0
+    return float(np.linalg.norm(bag.intervals[0].mean[0] - part.intervals[-1].mean[-1]))
 
 
 def _is_alike(before_s: float, after_s: float) -> bool:
@@ -76,7 +86,7 @@ def _whole(parts: Sequence[ReducedBag]) -> ReducedBag:
         reader=sources[-1].reader,
     )
     rates = {part.angular_rate for part in parts}
-    torn = [part.info.truncated for part in parts if part.info.truncated]
+    torn = [f'{part.info.path}: {part.info.truncated}' for part in parts if part.info.truncated]
     return replace(
         first,
         source=source,
