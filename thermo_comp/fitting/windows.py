@@ -225,10 +225,13 @@ def thermal_windows(
     has_rate = all(interval.angular_rate is not None for bag in bags for interval in bag.intervals)
     for number, (bag, track) in enumerate(zip(bags, tracks, strict=True)):
         grid, states = _with_memory(track, spec)
+        # `np.interp` would copy a strided or boolean series at each call.
+        known, all_series = track.is_known.astype(np.float64), np.ascontiguousarray(states.T)
         for interval in bag.intervals:
-            use = np.interp(interval.time, grid, track.is_known, left=0.0) == 1.0
+            use = np.interp(interval.time, grid, known, left=0.0) == 1.0
             if use.any():
-                at = np.array([np.interp(interval.time[use], grid, series) for series in states.T])
+                time = interval.time[use]
+                at = np.array([np.interp(time, grid, series) for series in all_series])
                 parts.append(_rows(interval, has_rate, use, at, grid[0], model, table))
                 rests.append((bag, interval))
                 numbers.append(number)
