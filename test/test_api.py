@@ -203,7 +203,9 @@ def test_tc_read_reads_a_table_by_its_headings(tmp_path):
     np.testing.assert_allclose(np.diff(content.time_s), 0.02, atol=1e-9)
     np.testing.assert_allclose(content.counts[1], [0.01, 0.02, 9.81], rtol=1e-12)
     assert content.temperatures['board'][1].tolist() == [20.0, 21.0, 22.0]
-    with pytest.raises(ValueError, match='a table needs no `imu`; it has `columns`, `rate_hz`'):
+    with pytest.raises(
+        ValueError, match='`imu` does not apply to a table, which takes `columns`, `rate_hz`'
+    ):
         read_log(table, imu=1)
 
 

@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``convert`` (logs into bags), and ``export`` and ``import`` of calibrations."""
 
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -23,10 +20,10 @@ Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
 #: Texts of the findings of a conversion.
 _FINDINGS = {
-    'short_rows': 'rows left out, too short',
-    'non_numeric': 'rows left out, no number',
+    'short_rows': 'rows left out, fewer cells than columns needed',
+    'non_numeric': 'rows left out, a time or a sample is not a finite number',
     'out_of_range': 'rows left out, stamp before 1970 or after 2038',
-    'clipped': 'rows clipped, kept',
+    'clipped': 'rows with an axis at or beyond the limits `clip` of the column map, kept',
     'impossible': 'temperatures left out, below -90 or above 200 degC',
     'continued': 'rows at which a 32-bit time overflowed to 0, times continued',
     'backwards': 'rows whose time goes back, kept',
@@ -83,7 +80,7 @@ def convert(
         'unit': None if unit == 'm/s^2' else unit,
     }
     with out.progress('converting') as done:
-        with flags_named():
+        with options.usage_of():
             read = read_log(log, **given)
         print_guess(out, read, {})
         report = write_log(read, output, force, done)
@@ -133,17 +130,6 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
             begin, end = ((stamp_ns - int(log.stamp_ns[0])) * 1e-9 for stamp_ns in stretch)
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
     out.sources([(log.path, log.chosen, log.missing)])
-
-
-@contextmanager
-def flags_named() -> Iterator[None]:
-    """Turn a ValueError of a `with` block into a usage error, with `names` turned into --names."""
-    with options.usage_of():
-        try:
-            yield
-        except ValueError as mistake:
-            flag = re.sub(r'`(\w+)`', lambda name: f'--{name[1].replace("_", "-")}', str(mistake))
-            raise ValueError(flag) from mistake
 
 
 def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:

@@ -14,7 +14,7 @@ from ..files import CALIBRATION, PAGE, check_output
 from ..text import counted
 from . import shared_options as options
 from .bags import print_nonlinearity
-from .convert import flags_named, print_guess
+from .convert import print_guess
 from .output import Cell, Output, micro_g, millidegrees, picked
 from .shared_options import argument, option
 
@@ -56,6 +56,7 @@ def fit(
         'bags if this is 0 without --ageing-bias.',
         0.0,
         metavar='PPM',
+        min=0.0,
     ),
     report: Path | None = option('Certificate to write (HTML).', metavar='HTML'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
@@ -105,7 +106,7 @@ def fit(
         print_guess(out, log, shown)
         out.sources([(log.path, log.chosen, None)])
 
-    with flags_named():
+    with options.usage_of():
         # The temporary bags exist until the command ends.
         bags = context.with_resource(as_bags(bags, print_log, columns=columns, rate_hz=rate_hz))
     sources, kind = fit_sources(bags, topics, known_force)
