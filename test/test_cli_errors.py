@@ -149,7 +149,9 @@ class TestFits:
     def test_unknown_groups_and_models_are_refused(self, cli, tmp_path):
         arguments = ('fit', bag(tmp_path / 'a.mcap'), '-o', tmp_path / 'new.yaml')
         arguments += ('--gravity', '9.80665')
-        refused(cli, 2, r'--groups must be of curve, .*memory', *arguments, '--groups', 'memory')
+        refused(
+            cli, 2, r'--groups must be one of curve, .*memory', *arguments, '--groups', 'memory'
+        )
         refused(cli, 2, r'quadratic', *arguments, '--model', 'quadratic')
         assert not (tmp_path / 'new.yaml').exists()
 

@@ -93,7 +93,7 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
         fewest_windows=FEWEST_WINDOWS,
     )
     if not bag.n_samples:
-        raise FitError(f'{source.name}: no accelerometer samples')
+        raise FitError(f'{source.name}: no accelerometer samples in the part that is read')
     if bag.restless:
         raise FitError(f'{source.name}: {bag.restless}')
     return bag
@@ -116,7 +116,10 @@ def _fit_about_offset(
         return _fit_one_environment(bags, options, progress)
     codes = ' '.join(f'{code:g}' for code in offset)
     finding = Finding(
-        'offset', 'advice', f'zero force reads {codes} counts: the samples use an offset code'
+        'offset',
+        'advice',
+        f'zero force reads {codes} counts (x y z), the offset of the samples, which the fit '
+        'subtracts; if it is wrong, state --offset',
     )
     prior = options.prior and about(options.prior, -offset)
     centred_bags = [centred(bag, offset) for bag in bags]
@@ -281,7 +284,10 @@ def _judged(
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name
-        raise FitError(f'{name}: no board temperature, which the other bags have')
+        raise FitError(
+            f'{name}: no board temperature, which the other bags have: leave out this bag, or '
+            'name its topic with --topic board=TOPIC'
+        )
     serial = check_serial([bag.source for bag in bags], options)
     findings = enforce(raw_checks.judge_prior(serial, options.prior), options)
     findings += enforce(raw_checks.judge_bags(bags, options), options)
@@ -295,11 +301,11 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
         # If the positions determine a misalignment out of range, the sensor is no accelerometer.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
-            'the angle between two of its axes is less than 60 degrees, which no accelerometer '
-            'has: is the topic the right one, did the axes stay the same in all positions, and '
-            'are there at least 9 positions?'
+            'by the fit the angle between two of its axes is less than 60 degrees, which no '
+            'accelerometer has: is the topic that of the accelerometer, did the axes stay the '
+            'same in all positions, and are there at least 9 positions?'
         )
-    return FitError(f'these data give no calibration that can be used: {error}')
+    return FitError(f'the bags give a calibration with an impossible value: {error}')
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
@@ -307,7 +313,10 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     serials = {source.serial: source.name for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         names = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))
-        raise FitError(f'the bags are of different units: {names}')
+        raise FitError(
+            f'the bags are of different units: {names}; fit the bags of each unit alone or, if it '
+            'is one unit, state --serial'
+        )
     try:
         return valid_serial(options.serial or next(iter(serials), 'unknown'))
     except ValueError as mistake:

@@ -158,7 +158,8 @@ class _Pass:
         for name, n in n_impossible.items():
             if n > len(self.temperatures[name].value):
                 raise FitError(
-                    f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC'
+                    f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC: is the '
+                    'topic a temperature in degC?'
                 )
 
 
@@ -324,7 +325,7 @@ def _max_abs(cells: Cells) -> float:
 def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
     if 2 * cells.n_saturated > n_samples:
         share = 100.0 * cells.n_saturated / n_samples
-        return f'{share:.0f} % of its samples are at the full scale, see --full-scale'
+        return f'{share:.0f} % of its samples are at the full scale: is --full-scale right?'
     return stillness.why_restless(cells, still_sd)
 
 
