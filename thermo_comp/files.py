@@ -109,10 +109,10 @@ def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> by
             raise PermissionError(errno.EPERM, 'outside of its folder', str(path))
         size = os.fstat(file.fileno()).st_size
         if size > limit:
-            raise ValueError(f'{size} bytes, at most {limit} are accepted')
+            raise ValueError(f'the file has {size} bytes, at most {limit} are accepted')
         content = file.read(limit + 1)
     if len(content) > limit:
-        raise ValueError(f'more than {limit} bytes')
+        raise ValueError(f'the file has more than {limit} bytes, the most that are accepted')
     return content
 
 

@@ -184,7 +184,7 @@ def _reading(
 
     with usage_of('--from, --to: '):
         part = Part(begin, end)
-    with usage_of('--topic: '):
+    with usage_of('--topic, --topics: '):
         return Topics.named(names, part=part, input=input_)
 
 

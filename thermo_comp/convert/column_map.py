@@ -251,7 +251,10 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = inferred_unit(still.magnitude)
         if unit == 'unknown':
-            raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
+            raise RecordingError(
+                f'the unit of the accelerometer cannot be guessed, {reason}: {_GIVE_MAP}',
+                path=path,
+            )
     gyro = None
     if named.gyro is not None and unit != 'counts':
         is_fast = np.nanquantile(np.abs(values(named.gyro)), 0.999) > _FASTEST_RAD_S

@@ -115,11 +115,11 @@ def _fit_about_offset(
     if not offset.any():
         return _fit_one_environment(bags, options, progress)
     codes = ' '.join(f'{code:g}' for code in offset)
+    how = 'by the readings; --offset can state it' if options.offset is None else 'by --offset'
     finding = Finding(
         'offset',
         'advice',
-        f'zero force reads {codes} counts (x y z), the offset of the samples, which the fit '
-        'subtracts; if it is wrong, state --offset',
+        f'zero force reads {codes} counts (x y z), {how}: the fit subtracts this offset',
     )
     prior = options.prior and about(options.prior, -offset)
     centred_bags = [centred(bag, offset) for bag in bags]

@@ -200,7 +200,11 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     """Read |f| as a value with unit, or from a table whose lines may begin with a bag's name."""
     table = Path(text)
     if not table.is_file():
-        return (_section(0.0, math.inf, parse_acceleration(text)),)
+        try:
+            return (_section(0.0, math.inf, parse_acceleration(text)),)
+        except ValueError as mistake:
+            reason = f'--specific-force: {mistake}; nor is there a file of this name'
+            raise FitError(reason) from mistake
     try:
         content = read_bounded(table, 1 << 20).decode('utf-8')
     except (OSError, ValueError) as error:

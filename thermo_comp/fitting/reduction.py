@@ -227,6 +227,8 @@ def _reduced(
     restless = reading.causes.cause(cells, still_sd)
     if not ranges and not restless:
         restless = f'no still interval: {_why_restless(cells, reading.n_samples, still_sd)}'
+        if min_rest_s is not None:
+            restless += f'; --min-rest accepts rests of {min_rest_s:g} s or more only'
     per_window = max(1, round(window_s / cells.cell_s)) if cells.cell_s else 1
     sizes = [min(per_window, max(1, (b - a) // fewest_windows)) for a, b in ranges]
     bag = ReducedBag(

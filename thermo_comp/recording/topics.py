@@ -363,6 +363,8 @@ def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -
         listed += f' and {len(present) - len(names)} more'
     if corrected and not {'counts', 'imu'}.isdisjoint(wanted):
         listed += f'; {_text_of_corrected(corrected)}'
+    if wanted.keys() == {'imu'} and any(is_called(name, _USUAL.counts) for name in present):
+        listed += '; an Imu in m/s^2 is wanted, by the calibration or --input, not counts'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',
