@@ -156,10 +156,11 @@ def _unexpected(failure: Exception) -> int:
         descriptor, name = tempfile.mkstemp(prefix='thermo_comp-', suffix='.log')
         with os.fdopen(descriptor, 'w', encoding='utf-8', errors='backslashreplace') as log:
             log.writelines(lines)
+        where = f'in {name}'
     except OSError as error:
-        name = f'not written ({error.strerror})'
+        where = f'not written ({error.strerror})'
     reason = f'{type(failure).__name__}: {failure}'
     output.error(
-        f'unexpected {reason:.300}; this is a bug of the program, its traceback is {name}'
+        f'unexpected {reason:.300}; this is a bug of thermo_comp, its traceback is {where}'
     )
     return 70  # EX_SOFTWARE of sysexits.h

@@ -56,10 +56,11 @@ def convert(
 
     A column map names the columns and their units; the readings at rest must
     agree with it. config/columns has examples. If no map is given, it is
-    guessed from the headings and printed; a table of [t] ax ay az [wx wy wz]
-    needs no headings. The board temperature is the IMU's in a PX4 or ArduPilot log, and the
-    reading of the thermometer in the Imu topic's namespace in a bag; the case temperature is that
-    of the barometer.
+    guessed from the headings and printed; a table whose columns are, in this
+    order, t ax ay az wx wy wz, or the same without t or without wx wy wz,
+    needs no headings. The board temperature is the IMU's in a PX4 or
+    ArduPilot log, and the reading of the thermometer in the Imu topic's
+    namespace in a bag; the case temperature is that of the barometer.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42

@@ -108,7 +108,7 @@ def usage_of(what: str = '', **flags: str) -> Iterator[None]:
 def check_serial(serial: str | None) -> str | None:
     """Refuse an invalid serial; an empty serial is passed on."""
     if serial:
-        with usage_of():
+        with usage_of(serial='the serial'):
             valid_serial(serial)
     return serial
 
@@ -173,12 +173,15 @@ def _reading(
     input_: Input = INPUT,
     names: dict[str, str] = names,
     begin: float | None = option(
-        'Begin of the part to read: seconds from the first sample, or a stamp.',
+        'Begin of the part to read: seconds from the first sample, or a stamp (seconds since '
+        '1970).',
         None,
         '--from',
         metavar='S',
     ),
-    end: float | None = option('End of the part to read.', None, '--to', metavar='S'),
+    end: float | None = option(
+        'End of the part to read, in the form of --from.', None, '--to', metavar='S'
+    ),
 ) -> Any:
     from ..recording.topics import Part, Topics
 

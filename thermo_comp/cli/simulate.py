@@ -40,7 +40,8 @@ def simulate(
         'tumble, tumble-3, tumble-1, held-out; on a rotation: centrifuge or rate-table.'
     ),
     profile: str | None = option(
-        "Chamber program: a name (default: chamber), or steps as '20 30min, 35@0.5 1h, 5@1 1h'."
+        'Chamber program: a name (default: chamber), or steps of a temperature in degC, @ a rate '
+        "in K/min, and a soak, as '20 30min, 35@0.5 1h, 5@1 1h'."
     ),
     positions: int | None = option('Number of positions, a bag each; default: 1.', min=1, max=999),
     position_seed: int = option('Seed of the set of positions.', 0, min=0),
