@@ -320,7 +320,8 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     try:
         return valid_serial(options.serial or next(iter(serials), 'unknown'))
     except ValueError as mistake:
-        raise FitError(str(mistake)) from mistake
+        advice = '' if options.serial else '; it is that of the bags, --serial can replace it'
+        raise FitError(f'{mistake}{advice}') from mistake
 
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
