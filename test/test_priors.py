@@ -299,7 +299,7 @@ def test_the_calibration_of_another_unit_is_no_prior():
     # WHY: the constants of a sibling have small sd, and were taken for those of the new unit.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)
-    with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit-9'):
+    with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit unit-9'):
         fit(all_twelve, options)
     allowed = fit(all_twelve, replace(options, allow=('prior',)))
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']

@@ -118,6 +118,7 @@ def run(arguments: list[str]) -> int:
 def _plain(message: str, arguments: list[str]) -> str:
     """Rewrite a message of typer about a value, and add the value."""
     message = message.replace('Value error, ', '').replace('Input should be', 'must be')
+    message = message.removeprefix('Invalid value: ')  # the message itself names the option
     option = _NO_NUMBER.search(message)
     if option is None:
         return message
