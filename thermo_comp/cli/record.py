@@ -255,7 +255,7 @@ def _next(account: 'Account') -> str:
 def _accuracy(account: 'Account') -> str:
     bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     parts = (
-        f'|f| in the worst attitude {ug_text(account.worst_sd_g * STANDARD_GRAVITY)}',
+        f'specific force in the worst attitude {ug_text(account.worst_sd_g * STANDARD_GRAVITY)}',
         f'bias of x y z {" ".join(ug_text(value * STANDARD_GRAVITY) for value in bias)}',
         f'scale {" ".join(micro(1e6 * value) for value in scale)} ppm',
         f'misalignment {" ".join(micro(1e6 * value) for value in misalignment)} urad',
