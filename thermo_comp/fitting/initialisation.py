@@ -341,8 +341,7 @@ def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalib
     gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
-        is_read = means.any(axis=0).tolist()
-        axes = ', '.join(axis for axis, reads in zip('xyz', is_read, strict=True) if not reads)
+        axes = ', '.join('xyz'[k] for k in np.flatnonzero(~np.any(means, axis=0)))
         raise FitError(
             f'an axis is exactly zero at rest ({axes or "all axes in a position"}): is the axis '
             'dead, or the topic wrong?'
