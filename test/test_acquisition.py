@@ -97,9 +97,9 @@ def test_a_position_grows_until_it_is_good(stream):
         account = test.account()
         collected.append((account.positions[-1].reason, account.is_still))
     words = list(dict.fromkeys(reason for reason, _ in collected))
-    assert words == ['not at rest yet', 'rests until 30 s', '']
+    assert words == ['not at rest yet', 'keep at rest for 30 s', '']
     assert collected[-1] == ('', True)
-    assert 'positions are missing' in account.findings[0]
+    assert 'positions missing: ' in account.findings[0]
     assert not account.is_complete
     assert account.next_deg == pytest.approx(np.degrees(np.arccos(account.next_up @ account.now)))
 
@@ -152,7 +152,7 @@ def test_a_dead_sensor_has_no_direction():
     log_ns = {'accel': stamp_ns}
     assert test.add(Block(stamp_ns, np.zeros((3000, 3)), '', None, {}, log_ns)) == []
     account = test.account()
-    assert [position.reason for position in account.positions] == ['reads zero']
+    assert [position.reason for position in account.positions] == ['all axes read zero']
     assert (account.n_good, account.farthest_deg) == (0, 180.0)
 
 
@@ -174,5 +174,5 @@ def test_without_samples_all_positions_are_missing():
     account = Acquisition(18, 60.0).account()
     assert not account.is_still
     assert np.isnan(account.now).all()
-    assert account.findings[0] == '18 of 18 positions are missing'
+    assert account.findings[0] == 'positions missing: 18 of 18'
     assert [position.n_rests for position in account.positions] == [0]

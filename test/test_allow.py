@@ -78,7 +78,7 @@ def test_an_allowed_refusal_ends_in_a_calibration(rng, name, spoil, options, n):
 def test_a_saturated_bag_is_refused_with_the_share_of_samples(rng):
     rest = Rest(rng)
     rest.accel[:] = -40000.0
-    with pytest.raises(FitError, match='100 % of its samples are at the full scale, see --full'):
+    with pytest.raises(FitError, match='100 % of its samples are at the full scale: is --full'):
         fit([rest.source()], replace(COUNTS, allow=('saturation',)))
 
 
@@ -116,7 +116,7 @@ def in_whole_degrees(rest):
     ('spoil', 'text'),
     [
         (late_by(18000.0), r'^bag0: no temperatures .* two clocks\?$'),
-        (in_thousandths, r'^bag0: 600 readings of board are beyond 1000 degC$'),
+        (in_thousandths, r'^bag0: 600 readings of board are beyond 1000 degC: is the topic'),
         (dead, 'an axis is exactly zero at rest'),
     ],
 )

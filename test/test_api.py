@@ -150,16 +150,22 @@ def test_empty_arrays_give_empty_arrays():
     ('change', 'text'),
     [
         ({'time_s': [[0.0, 1.0]]}, r'`time_s` must have one dimension, got the shape \(1, 2\)'),
-        ({'time_s': [0.0, 1.0, 1.0]}, r'`time_s` must rise, got 1.0 at 1 and then 1.0'),
-        ({'time_s': [0.0, np.nan, 2.0]}, r'must be finite seconds, or datetime64, got nan at 1'),
-        ({'time_s': [0, 10**18, 2 * 10**18]}, r'must be finite seconds, .* got 1e\+18 at 1'),
+        ({'time_s': [0.0, 1.0, 1.0]}, r'`time_s` must rise, got 1.0 at index 1 and then 1.0'),
+        (
+            {'time_s': [0.0, np.nan, 2.0]},
+            r'must be finite seconds, or datetime64, got nan at index 1',
+        ),
+        ({'time_s': [0, 10**18, 2 * 10**18]}, r'must be finite seconds, .* got 1e\+18 at index 1'),
         ({'time_s': ['a', 'b', 'c']}, r'`time_s` must be numbers: could not convert'),
-        ({'time_s': np.array(['2026-01-01', 'NaT', '2026-01-03'], 'M8[ns]')}, 'got NaT at 1'),
+        (
+            {'time_s': np.array(['2026-01-01', 'NaT', '2026-01-03'], 'M8[ns]')},
+            'got NaT at index 1',
+        ),
         ({'counts': np.zeros((2, 3))}, r'`counts` must have the shape \(3, 3\), .* got \(2, 3\)'),
         ({'counts': np.zeros((3, 2))}, r'`counts` must have the shape \(3, 3\), .* got \(3, 2\)'),
         ({'board': [20.0, 20.0]}, r'`board` must have a value for each of the 3 times'),
         ({'board': ([0.0, 1.0], [20.0])}, r'`board` must have as many values as times, 2'),
-        ({'board': ([1.0, 0.0], [20.0, 20.0])}, r'`board time_s` must rise, got 1.0 at 0'),
+        ({'board': ([1.0, 0.0], [20.0, 20.0])}, r'`board time_s` must rise, got 1.0 at index 0'),
         ({'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])}, 'be seconds or datetime64, as'),
         ({'lid': [20.0] * 3}, r'`lid` is not a thermometer of the calibration: it has board'),
     ],
@@ -179,7 +185,7 @@ def test_a_fit_of_arrays_is_the_fit_of_their_bags(root, tmp_path, fitted):
     tc.save(again, tmp_path / 'unit.yaml')
     assert tc.load(tmp_path / 'unit.yaml') == again
     recordings[0].time_s[2] = recordings[0].time_s[1]
-    with pytest.raises(ValueError, match=r'`time_s` must rise, got 3.0 at 1 and then 3.0'):
+    with pytest.raises(ValueError, match=r'`time_s` must rise, got 3.0 at index 1 and then 3.0'):
         tc.fit(recordings, gravity=9.80665)
 
 
@@ -204,7 +210,9 @@ def test_tc_read_reads_a_table_by_its_headings(tmp_path):
     np.testing.assert_allclose(np.diff(content.time_s), 0.02, atol=1e-9)
     np.testing.assert_allclose(content.counts[1], [0.01, 0.02, 9.81], rtol=1e-12)
     assert content.temperatures['board'][1].tolist() == [20.0, 21.0, 22.0]
-    with pytest.raises(ValueError, match='a table needs no `imu`; it has `columns`, `rate_hz`'):
+    with pytest.raises(
+        ValueError, match='`imu` does not apply to a table, which takes `columns`, `rate_hz`'
+    ):
         read_log(table, imu=1)
 
 

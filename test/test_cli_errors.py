@@ -56,14 +56,14 @@ class TestUsage:
             (('replay', 'a', '-o', 'b', '-c', 'c', '--spin'), r'No such option.*--spin'),
             (('replay', 'a', '-o', 'b', '-c', 'c', '--input', 'gps'), r"'gps' is not one of"),
             (('replay', 'a', '-o', 'b', '-c', 'c', '--temperature-timeout', '0'),
-             r'`temperature_timeout_s` must be greater than 0'),
+             r'--temperature-timeout must be greater than 0'),
             (('fit', 'a', '-o', 'b'), r'give --gravity, or --latitude and --height'),
             (
                 ('fit', 'a', '-o', 'b', '--gravity', '9.81', '--latitude', '48'),
                 r'give --gravity, or --latitude and --height, not both',
             ),
             (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', 'nan'),
-             r'--reference-temperature: must be at least -273.15, got nan'),
+             r'--reference-temperature: must be at least -273.15 degC, got nan'),
             (('play', 'a', '--rate', 'inf'),
              r'--rate must be finite; 0 is as fast as subscribers'),
             (('fit', 'a', '-o', 'b', '--latitude', '60'), r'--latitude and --height'),
@@ -86,7 +86,7 @@ class TestUsage:
             (('fit', 'a', '-o', 'b', '--gravity', '9.8,1'),
              r"--gravity: expected a number with a point, like 9\.8154, got '9\.8,1'"),
             (('fit', 'a', '-o', 'b', '--gravity', '9.81', '--reference-temperature', '1e4'),
-             r'--reference-temperature: must be less than 1000, got 10000'),
+             r'--reference-temperature: must be less than 1000 degC, got 10000'),
             (('export', 'a', '--to', 'ardupilot', '--device-id', '7', '-o', 'b'), r'is for PX4'),
             (('export', 'a', '--to', 'imu_tk', '--up', '0', '0', '1', '-o', 'b'),
              r'--up is for'),
@@ -139,7 +139,9 @@ class TestBags:
 
     def test_a_bag_of_another_unit_is_refused(self, cli, unit, tmp_path):
         path = bag(tmp_path / 'bag', serial='T-2')
-        self.replayed(cli, unit, path, r'unit.serial: this calibration is of unit T-1.*of T-2')
+        self.replayed(
+            cli, unit, path, r'unit.serial: this calibration is of unit T-1.*of unit T-2'
+        )
         refused(cli, 1, r'is of unit T-1', 'evaluate', path, '-c', unit)
 
 
@@ -147,7 +149,9 @@ class TestFits:
     def test_unknown_groups_and_models_are_refused(self, cli, tmp_path):
         arguments = ('fit', bag(tmp_path / 'a.mcap'), '-o', tmp_path / 'new.yaml')
         arguments += ('--gravity', '9.80665')
-        refused(cli, 2, r'`groups` must be of curve, .*memory', *arguments, '--groups', 'memory')
+        refused(
+            cli, 2, r'--groups must be one of curve, .*memory', *arguments, '--groups', 'memory'
+        )
         refused(cli, 2, r'quadratic', *arguments, '--model', 'quadratic')
         assert not (tmp_path / 'new.yaml').exists()
 

@@ -69,7 +69,7 @@ def test_a_complete_thermal_test_has_only_good_findings(good):
 @pytest.mark.parametrize(
     ('name', 'changed', 'message'),
     [
-        ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 advised\): run the'),
+        ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 degC advised\): run the'),
         # WHY: the thermometer of a room was taken for the thermometer of the board.
         ('span', lambda w: {'temperature': 0.01 * w.temperature}, 'is the thermometer on'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
@@ -189,7 +189,7 @@ def test_the_residual_of_the_fit_is_reported():
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
         # Temperatures of another clock, an hour late: residual 878 ug left out, raw 692 ug.
-        ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw error'),
+        ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw residual'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
         # WHY: noise, a span of 0.3 K, and different turn-ons each gave false advice.
         ((1.1, 1.0, 0.1, 1.0, 0.3), 'residual', '1.1 ug RMS raw'),
@@ -208,8 +208,8 @@ def test_residuals_too_large_for_a_good_fit_are_reported(given, name, message):
     [
         ({'full_scale': -5.0}, '`full_scale` must be positive, got -5.0'),
         ({'min_rest_s': 0.0}, '`min_rest_s` must be positive, got 0.0'),
-        ({'input': 'g'}, '`input` must be of counts, m/s'),
-        ({'allow': ('span',)}, r'`allow` must be of prior, saturation, .* got .span.'),
+        ({'input': 'g'}, '`input` must be one of counts, m/s'),
+        ({'allow': ('span',)}, r'`allow` must be one of prior, saturation, .* got .span.'),
     ],
 )
 def test_options_out_of_range_are_refused(change, message):

@@ -153,7 +153,7 @@ def test_a_table_of_sections_states_the_force_of_each_rest():
     assert parse_sections('49.05') == (Section(0.0, math.inf, 49.05, 0.0),)
     for wrong, said in (
         ('fast', 'expected numbers'),
-        ('1 2', 'with a smaller sd'),
+        ('1 2', 'and its sd smaller'),
         ('5 3 10', 'must end after its begin'),
         ('1 2 3 4 5', 'one number in m/s'),
         ('nan', 'finite'),
@@ -192,13 +192,13 @@ def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
     fast = turning.of(10**18 + 11 * 10**9, 10**18 + 19 * 10**9, 10**18)
     assert fast.norm(10.0) == pytest.approx(math.hypot(10.0, 50.0))
     assert turning.radius_part(fast, 10.0) == pytest.approx(2500.0 / math.hypot(10, 50) * 0.005)
-    with pytest.raises(FitError, match='need 3'):
+    with pytest.raises(FitError, match='a rest needs 3'):
         turning.of(10**18 + 30 * 10**9, 10**18 + 31 * 10**9, 10**18)
     with pytest.raises(FitError, match='need a positive rotation_radius_m'):
         read('c')
     with pytest.raises(FitError, match='0 topics are called spin'):
         read('a', ForceOptions(None, 'spin', 2.0))
-    with pytest.raises(ValueError, match='a rotation topic needs a radius'):
+    with pytest.raises(ValueError, match='`rotation` needs `radius`'):
         ForceOptions(None, 'spin')
     (tmp_path / 'bad.txt').write_text('a.mcap 0 5\n')
     with pytest.raises(ThermoCompError, match=r'bad\.txt: a specific force must be'):

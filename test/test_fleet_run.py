@@ -242,7 +242,7 @@ class _Future:
             'the worker of its task died 4 times: too little memory?',
         ),
         (_Future('error', MemoryError('no\n room')), 'MemoryError: no room'),
-        (_Future('lost'), 'the scheduler was lost'),
+        (_Future('lost'), 'the connection to the Dask scheduler was lost'),
     ],
 )
 def test_a_failed_task_is_a_row_that_the_next_run_repeats(future, problem, fleet, tmp_path):
@@ -290,7 +290,10 @@ def test_a_unit_without_a_calibration_gives_exit_code_1(client, tmp_path, capsys
     assert '0 of 1 test calibrated; 0 tests done in this run, 1 in an earlier run' in text.out
     assert text.err == ''
     assert command(*arguments, '--with-prior') == 1
-    text = '- fitted without a prior: 0 units with complete data, 3 are needed'
+    text = (
+        '- fitted without a prior: 0 units with a valid calibration from complete data, '
+        '3 are needed'
+    )
     assert text in capsys.readouterr().out
     assert command(*arguments, '--json') == 1
     data = json.loads(capsys.readouterr().out)

@@ -46,9 +46,9 @@ def arguments(*overrides):
          '`transition_time` must be between'),
         (['calibration_file:={unit}',
          'qos_overrides./accel/counts.subscription.reliability:=good'],
-         'a topic cannot be opened: '),
+         'the topic accel/counts cannot be opened: '),
         (['calibration_file:={unit}', 'qos_overrides./accel/counts.subscription.depth:=deep'],
-         "a topic cannot be opened: Trying to set parameter 'qos_overrides./accel/counts"),
+         "accel/counts cannot be opened: Trying to set parameter 'qos_overrides./accel/counts"),
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
     ],
 )  # fmt: skip
@@ -72,7 +72,7 @@ def test_one_topic_for_two_thermometers_ends_the_start(unit, capfd):
     assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
     assert capfd.readouterr().err == (
         'thermo_comp_node: /imu/temperature: one topic for both board and case: a single '
-        'thermometer is the board, leave the other out\n'
+        'thermometer is the board, leave the other input out\n'
     )
 
 

@@ -85,9 +85,9 @@ def test_a_part_without_samples_is_refused(bag):
 @pytest.mark.parametrize(
     ('begin', 'end', 'reason'),
     [
-        (5.0, 5.0, 'must end after 5, got 5'),
-        (-1.0, None, '0 or a positive time'),
-        (float('nan'), None, '0 or a positive time'),
+        (5.0, 5.0, 'must end after its begin 5 s, got 5 s'),
+        (-1.0, None, '0 s or a positive time'),
+        (float('nan'), None, '0 s or a positive time'),
         (5.0, 1.7e9, 'or both as stamps'),
     ],
 )

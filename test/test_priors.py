@@ -259,7 +259,7 @@ def left_by(calibration, record):
 @pytest.mark.slow
 def test_population_refuses_too_few_equal_or_different_units():
     first, second, third = siblings()
-    with pytest.raises(FitError, match='need 3 for a population'):
+    with pytest.raises(FitError, match='calibrations of at least 3 units, got 2'):
         population([first, second])
     with pytest.raises(FitError, match='two of the calibrations are of one unit'):
         population([first, second, second])
@@ -299,7 +299,7 @@ def test_the_calibration_of_another_unit_is_no_prior():
     # WHY: the constants of a sibling have small sd, and were taken for those of the new unit.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)
-    with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit-9'):
+    with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit unit-9'):
         fit(all_twelve, options)
     allowed = fit(all_twelve, replace(options, allow=('prior',)))
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
@@ -328,4 +328,4 @@ def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
     expected = f'prior from 3 units, {len(prior.response)} columns'
     assert expected in capsys.readouterr().out
     assert run(['prior', *map(str, files[:2]), '-o', str(target), '--force']) == 1
-    assert 'need 3 for a population' in capsys.readouterr().err
+    assert 'calibrations of at least 3 units, got 2' in capsys.readouterr().err

@@ -280,7 +280,7 @@ class TestLive:
         recording.wait_for('position 1: good')
         code, result, printed = recording.end(signal.SIGTERM)
         assert (code, result['n_good'], result['is_complete']) == (0, 1, False), printed
-        assert result['findings'][0] == '17 of 18 positions are missing'
+        assert result['findings'][0] == 'positions missing: 17 of 18'
         assert contents(numbered_bags(bags)) == contents([bag])
         assert sorted(bags.iterdir()) == numbered_bags(bags)
 

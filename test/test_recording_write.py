@@ -228,7 +228,7 @@ def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path):
     (tmp_path / 'folder.mcap').mkdir()
     for name, reason in (
         *(('home', r'it holds thesis\.tex'), ('file', 'it is a file')),
-        *(('fit', r'it has no metadata\.yaml'), ('folder.mcap', 'it is a folder')),
+        *(('fit', r'it is no bag: it has no metadata\.yaml'), ('folder.mcap', 'it is a folder')),
     ):
         with pytest.raises(OutputError, match=f'is not replaced: {reason}'):
             BagWriter(tmp_path / name, overwrite=True)

@@ -200,7 +200,9 @@ def test_another_unit_is_refused_unless_the_user_says_so(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, serial='T-2')
     calibration = rich_calibration()
     for serial in (None, 'T-2'):
-        with pytest.raises(CalibrationError, match=r'calibration is of unit T-1.* is of T-2'):
+        with pytest.raises(
+            CalibrationError, match=r'calibration is of unit T-1.* is (of unit )?T-2 '
+        ):
             replay(bag, calibration, tmp_path / 'out', serial=serial)
     assert not (tmp_path / 'out').exists()
     assert isinstance(replay(bag, calibration, tmp_path / 'a', serial=''), ReplayResult)
@@ -209,7 +211,7 @@ def test_another_unit_is_refused_unless_the_user_says_so(tmp_path):
 
 def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, imu=True)
-    with pytest.raises(CalibrationError, match=r'takes counts.*holds sensor_msgs/Imu'):
+    with pytest.raises(CalibrationError, match=r'takes samples in counts.*are sensor_msgs/Imu'):
         replay(bag, rich_calibration(), tmp_path / 'out', topics=Topics(input='imu'))
     with pytest.raises(RecordingError, match='accel/counts'):
         replay(bag, rich_calibration(), tmp_path / 'out')

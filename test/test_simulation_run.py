@@ -163,7 +163,7 @@ def test_a_run_refuses_impossible_arguments(unit):
         simulate(unit, SHORT, UP, rate_hz=0.0)
     with pytest.raises(ValueError, match='`temperature_rate_hz` must be positive, got 0'):
         simulate(unit, SHORT, UP, temperature_rate_hz=0.0)
-    with pytest.raises(ValueError, match='shorter than one cycle'):
+    with pytest.raises(ValueError, match='shorter than one conversion cycle of 1 s'):
         simulate(unit, Cyclogram((0.0, 0.5), (20.0, 20.0)), UP, rate_hz=1.0)
     with pytest.raises(ValueError, match='`gravity` must be positive, got nan'):
         simulate(unit, SHORT, UP, gravity=float('nan'))
@@ -271,5 +271,5 @@ def test_thermostat_holds_its_part_and_spends_what_leaks():
 
 def test_an_oven_refuses_air_that_it_cannot_hold_off():
     network = unit_preset('thermostatted', 0).network
-    with pytest.raises(ValueError, match=r'air of 5\.\.90 degC needs -.* W of a thermostat'):
+    with pytest.raises(ValueError, match=r'air of 5\.\.90 degC needs -.* W of the thermostat'):
         response_of(network, [0.0, 60.0], [5.0, 90.0])

@@ -88,7 +88,7 @@ def test_an_impossible_serial_as_an_option_is_refused(command, capsys):
     assert run([*command, '--serial', FORGED]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('thermo_comp: error: ')
-    assert '`serial` must be one printable line' in line
+    assert 'the serial must be one printable line' in line
 
 
 @pytest.fixture

@@ -307,13 +307,15 @@ def _stamps(name: str, value: npt.ArrayLike) -> Ints:
     if wrong.any():
         raise ValueError(
             f'`{name}` must be finite seconds, or datetime64, got {given[wrong][0]} '
-            f'at {wrong.argmax()}'
+            f'at index {wrong.argmax()}'
         )
     stamps: Ints = nanoseconds.astype(np.int64)
     falls = np.flatnonzero(np.diff(stamps) <= 0)
     if len(falls):
         at = int(falls[0])
-        raise ValueError(f'`{name}` must rise, got {given[at]} at {at} and then {given[at + 1]}')
+        raise ValueError(
+            f'`{name}` must rise, got {given[at]} at index {at} and then {given[at + 1]}'
+        )
     return stamps
 
 

@@ -38,14 +38,14 @@ class Kind:
     def refusal(self, path: Path) -> str:
         """Return why an existing file or folder is not of this kind; an empty text if it is."""
         if path.is_dir() != self.is_folder:
-            return f'it is a {"folder" if path.is_dir() else "file"}'
+            return f'it is a {"folder" if path.is_dir() else "file"}, not a {self.name}'
         if self.is_folder:
             entries = sorted(path.iterdir())
             for entry in entries:
                 if not (entry.is_file() and re.search(self.mark, os.fsencode(entry.name))):
                     return f'it holds {entry.name}, which belongs to no bag'
             is_whole = not entries or (path / _INDEX).is_file()
-            return '' if is_whole else f'it has no {_INDEX}'
+            return '' if is_whole else f'it is no bag: it has no {_INDEX}'
         head = b''
         if path.is_file():
             with path.open('rb') as file:
@@ -73,7 +73,9 @@ def bag_kind(path: str | Path, others: str = '') -> Kind:
         return MCAP
     if suffix[1:2].isalpha():
         raise OutputError(
-            f'cannot be written: {suffix} is none of *.mcap{others} and a folder', path
+            f'cannot be written: {suffix} is none of the endings *.mcap{others}; a name without '
+            'an ending makes a folder',
+            path,
         )
     return BAG
 
@@ -107,10 +109,10 @@ def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> by
             raise PermissionError(errno.EPERM, 'outside of its folder', str(path))
         size = os.fstat(file.fileno()).st_size
         if size > limit:
-            raise ValueError(f'{size} bytes, at most {limit} are accepted')
+            raise ValueError(f'the file has {size} bytes, at most {limit} are accepted')
         content = file.read(limit + 1)
     if len(content) > limit:
-        raise ValueError(f'more than {limit} bytes')
+        raise ValueError(f'the file has more than {limit} bytes, the most that are accepted')
     return content
 
 
@@ -125,18 +127,23 @@ def check_output(
     target = Path(os.path.realpath(path))
     for other in others:
         if _overlaps(target, Path(os.path.realpath(other))):
-            raise OutputError(f'is {other} or a part of it, which the command needs', path)
+            raise OutputError(
+                f'is, contains or lies in {other}, which the command needs: choose another output',
+                path,
+            )
     suffix = target.suffix.lower()
     if kind.suffixes and suffix[1:2].isalpha() and suffix not in kind.suffixes:
         names = ' or '.join(f'*{suffix}' for suffix in kind.suffixes)
-        raise OutputError(f'cannot be written: {suffix} is not {names}', path)
+        raise OutputError(
+            f'cannot be written: its name must end in {names}, not in {suffix}', path
+        )
     if target.exists():
         if not overwrite:
             raise OutputError('exists already; --force overwrites it', path)
         with _output_errors(path):
             refusal = kind.refusal(target)
         if refusal:
-            raise OutputError(f'is not replaced: {refusal}', path)
+            raise OutputError(f'is not replaced: {refusal}; choose another name', path)
         return
     folder = next(above for above in target.parents if above.exists())
     if not folder.is_dir():

@@ -53,7 +53,7 @@ class Bounds:
             limit = getattr(self, name)
             if limit is not None and not is_kept(len(value) if is_sized else value, limit):
                 shown = counted(limit, what) if is_sized else f'{limit:g}'
-                return f'must {rule} {shown}'
+                return 'must be finite' if shown == 'inf' else f'must {rule} {shown}'
         return None
 
 

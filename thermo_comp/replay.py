@@ -65,15 +65,19 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
     """Refuse a calibration of another unit or input; an empty `serial` accepts any unit."""
     expected = info.metadata.get('serial', '') if serial is None else serial
     if expected and expected != calibration.unit.serial:
+        stated = (
+            f'the recording {info.path} is of unit' if serial is None else 'the given serial is'
+        )
         raise CalibrationError(
-            f'this calibration is of unit {calibration.unit.serial}, '
-            f'the recording {info.path} is of {expected}',
+            f'this calibration is of unit {calibration.unit.serial}, {stated} {expected} '
+            "(--serial '' accepts any calibration)",
             key='unit.serial',
         )
     if info.input == 'imu' and calibration.unit.input != 'm/s^2':
         raise CalibrationError(
-            f'this calibration takes {calibration.unit.input}, '
-            f'the recording {info.path} holds sensor_msgs/Imu in m/s^2',
+            f'this calibration takes samples in {calibration.unit.input}, but those read from '
+            f'{info.path} are sensor_msgs/Imu in m/s^2: if it has counts, too, choose them with '
+            '--input counts',
             key='unit.input',
         )
 

@@ -254,7 +254,7 @@ class Acquisition:
         n_good = sum(not position.reason for position in positions)
         thermometers = _combined_surveys([rest.surveys for rest in rests])
         missing = self._n_wanted - n_good
-        findings = [f'{missing} of {self._n_wanted} positions are missing'] * (missing > 0)
+        findings = [f'positions missing: {missing} of {self._n_wanted}'] * (missing > 0)
         return Account(
             tuple(positions),
             n_good,
@@ -276,7 +276,7 @@ class Acquisition:
         if not rest.n_rests:
             return 'not at rest yet'
         if np.isnan(up).any():
-            return 'reads zero'
+            return 'all axes read zero'
         if noise > _RESTLESS:
             return 'restless'
         near = math.cos(math.radians(coverage.SAME_DIRECTION_DEG))
@@ -288,7 +288,7 @@ class Acquisition:
             soak = (
                 f'{self._soak_s / 60.0:.4g} min' if self._soak_s > 90.0 else f'{self._soak_s:g} s'
             )
-            return f'rests until {soak}' if is_last else f'left before {soak}'
+            return f'keep at rest for {soak}' if is_last else f'left before {soak}'
         return ''
 
     def _now(self, cells: Cells) -> tuple[Floats, bool]:

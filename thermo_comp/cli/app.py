@@ -118,6 +118,7 @@ def run(arguments: list[str]) -> int:
 def _plain(message: str, arguments: list[str]) -> str:
     """Rewrite a message of typer about a value, and add the value."""
     message = message.replace('Value error, ', '').replace('Input should be', 'must be')
+    message = message.removeprefix('Invalid value: ')  # the message itself names the option
     option = _NO_NUMBER.search(message)
     if option is None:
         return message
@@ -156,10 +157,11 @@ def _unexpected(failure: Exception) -> int:
         descriptor, name = tempfile.mkstemp(prefix='thermo_comp-', suffix='.log')
         with os.fdopen(descriptor, 'w', encoding='utf-8', errors='backslashreplace') as log:
             log.writelines(lines)
+        where = f'in {name}'
     except OSError as error:
-        name = f'not written ({error.strerror})'
+        where = f'not written ({error.strerror})'
     reason = f'{type(failure).__name__}: {failure}'
     output.error(
-        f'unexpected {reason:.300}; this is a bug of the program, its traceback is {name}'
+        f'unexpected {reason:.300}; this is a bug of thermo_comp, its traceback is {where}'
     )
     return 70  # EX_SOFTWARE of sysexits.h

@@ -19,8 +19,19 @@ from .shared_options import argument, option
 if TYPE_CHECKING:
     from ..unit.calibration import Calibration
 
-_BAG = argument('rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
-_AS_THE_NODE = "Value of the node's parameter of this name, in s."
+_BAG = argument('Recording: rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
+#: Reasons for which a sample is left out, by the counters of the compensator.
+_LEFT_OUT = {
+    'n_not_finite': 'samples that are not finite',
+    'n_saturated': 'samples at the full scale of the calibration',
+    'n_out_of_order': 'samples with a stamp not later than that of the sample before',
+    'n_no_temperature': 'samples before the first board temperature',
+    'n_stale': 'samples with a board temperature older than --temperature-timeout',
+    'n_stuck': 'samples that repeat one reading, or are 0 on all axes',
+    'n_too_fast': 'samples faster than the conversion cycle of the calibration',
+    'n_refuted': 'samples while |f| at rest differs too much from gravity',
+    'n_unsound': 'samples whose correction is not finite',
+}
 
 
 def info(
@@ -160,14 +171,32 @@ def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
 def replay(
     bag: Path = _BAG,
     calibration: Path = option('Calibration of the unit (YAML).', ..., '--calibration', '-c'),
-    output: Path = option('*.mcap, a folder, *.csv or *.parquet.', ..., '--output', '-o'),
+    output: Path = option(
+        'Output: *.mcap or a folder for a bag, *.csv or *.parquet for a table.',
+        ...,
+        '--output',
+        '-o',
+    ),
     keep_inputs: bool = option('Also copy the input messages.', False, '--keep-inputs'),
     all_topics: bool = option('Also copy all other topics.', False, '--all-topics'),
     serial: str | None = options.SERIAL,
     frame_id: str = option("Frame of the output; empty keeps the input's.", ''),
-    transition_time: float = option(_AS_THE_NODE, CompensatorConfig.transition_time_s, min=0.0),
-    temperature_timeout: float = option(_AS_THE_NODE, CompensatorConfig.temperature_timeout_s),
-    case_timeout: float = option(_AS_THE_NODE, CompensatorConfig.case_timeout_s),
+    transition_time: float = option(
+        'Time in s over which the two sets are blended after a switch of the regime, as the '
+        "node's parameter; 0 switches at once.",
+        CompensatorConfig.transition_time_s,
+        min=0.0,
+    ),
+    temperature_timeout: float = option(
+        "Age of the board temperature, in s, from which no sample is corrected, as the node's "
+        'parameter.',
+        CompensatorConfig.temperature_timeout_s,
+    ),
+    case_timeout: float = option(
+        'Age of the case temperature, in s, from which the board temperature decides the regime, '
+        "as the node's parameter.",
+        CompensatorConfig.case_timeout_s,
+    ),
     topics: Any = options.reading,
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -190,7 +219,9 @@ def replay(
         config = CompensatorConfig(transition_time, temperature_timeout, case_timeout)
     kind = TABLES.get(output.suffix) or bag_kind(output, ', *.csv, *.parquet')
     if output.suffix in TABLES and (keep_inputs or all_topics):
-        raise options.usage('--keep-inputs and --all-topics are for bags')
+        raise options.usage(
+            f'--keep-inputs and --all-topics need a bag as --output, got the table {output}'
+        )
     check_output(output, kind, overwrite=force, others=[bag, calibration])
     with out.progress('replaying') as done:
         result = run(
@@ -214,7 +245,7 @@ def replay(
     out.line(f'{output}: {counters.n_out} of {counters.n_in} samples corrected')
     for name, count in counts.items():
         if name in DROPPED and count:
-            out.line(f'  left out, {name.removeprefix("n_").replace("_", " ")}: {count}')
+            out.line(f'  left out, {_LEFT_OUT[name]}: {count}')
     out.line(f'  regime flags: {result.n_flags}, switches: {max(len(result.switches) - 1, 0)}')
     for at, flag in result.switches:
         regime = 'dynamic' if flag else 'static'
@@ -264,9 +295,9 @@ def play(
             bag, rate=rate, wait_s=wait, topics=topics, ros_args=context.obj, progress=done
         )
     for name in report.unheard:
-        out.note(f'{name} had no subscriber')
+        out.note(f'the topic {name} had no subscriber: its messages were not received')
     for name in report.lossy:
-        out.note(f'{name} has a best-effort subscriber, which can lose messages')
+        out.note(f'the topic {name} has a best-effort subscriber, which may have lost messages')
     out.sources([(bag, report.info.chosen, report.info.truncated)])
     out.table(('topic', 'messages'), sorted(report.n_messages.items()))
     out.line(f'played in {report.duration_s:.1f} s')

@@ -2,9 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns ``convert`` (logs into bags), and ``export`` and ``import`` of calibrations."""
 
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -23,10 +20,10 @@ Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
 #: Texts of the findings of a conversion.
 _FINDINGS = {
-    'short_rows': 'rows left out, too short',
-    'non_numeric': 'rows left out, no number',
+    'short_rows': 'rows left out, fewer cells than columns needed',
+    'non_numeric': 'rows left out, a time or a sample is not a finite number',
     'out_of_range': 'rows left out, stamp before 1970 or after 2038',
-    'clipped': 'rows clipped, kept',
+    'clipped': 'rows with an axis at or beyond the limits `clip` of the column map, kept',
     'impossible': 'temperatures left out, below -90 or above 200 degC',
     'continued': 'rows at which a 32-bit time overflowed to 0, times continued',
     'backwards': 'rows whose time goes back, kept',
@@ -59,10 +56,11 @@ def convert(
 
     A column map names the columns and their units; the readings at rest must
     agree with it. config/columns has examples. If no map is given, it is
-    guessed from the headings and printed; a table of [t] ax ay az [wx wy wz]
-    needs no headings. The board temperature is the IMU's in a PX4 or ArduPilot log, and the
-    reading of the thermometer in the Imu topic's namespace in a bag; the case temperature is that
-    of the barometer.
+    guessed from the headings and printed; a table whose columns are, in this
+    order, t ax ay az wx wy wz, or the same without t or without wx wy wz,
+    needs no headings. The board temperature is the IMU's in a PX4 or
+    ArduPilot log, and the reading of the thermometer in the Imu topic's
+    namespace in a bag; the case temperature is that of the barometer.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -83,7 +81,7 @@ def convert(
         'unit': None if unit == 'm/s^2' else unit,
     }
     with out.progress('converting') as done:
-        with flags_named():
+        with options.usage_of():
             read = read_log(log, **given)
         print_guess(out, read, {})
         report = write_log(read, output, force, done)
@@ -133,17 +131,6 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
             begin, end = ((stamp_ns - int(log.stamp_ns[0])) * 1e-9 for stamp_ns in stretch)
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
     out.sources([(log.path, log.chosen, log.missing)])
-
-
-@contextmanager
-def flags_named() -> Iterator[None]:
-    """Turn a ValueError of a `with` block into a usage error, with `names` turned into --names."""
-    with options.usage_of():
-        try:
-            yield
-        except ValueError as mistake:
-            flag = re.sub(r'`(\w+)`', lambda name: f'--{name[1].replace("_", "-")}', str(mistake))
-            raise ValueError(flag) from mistake
 
 
 def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:

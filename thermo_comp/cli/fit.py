@@ -14,7 +14,7 @@ from ..files import CALIBRATION, PAGE, check_output
 from ..text import counted
 from . import shared_options as options
 from .bags import print_nonlinearity
-from .convert import flags_named, print_guess
+from .convert import print_guess
 from .output import Cell, Output, micro_g, millidegrees, picked
 from .shared_options import argument, option
 
@@ -39,13 +39,19 @@ def fit(
     output: Path = options.NEW_CALIBRATION,
     settings: dict[str, Any] = options.fitting,
     static_curve: Curve | None = option(
-        "Curve of bias and scale over temperature; default: the model's.", metavar='CURVE'
+        'Curve of bias and scale over temperature: linear, quadratic, cubic, spline or '
+        "exponential; default: the model's.",
+        metavar='CURVE',
     ),
-    dynamic_curve: Curve | None = option('Curve of the dynamic set alone.', metavar='CURVE'),
+    dynamic_curve: Curve | None = option(
+        'Curve of the dynamic set alone, of the same choices.', metavar='CURVE'
+    ),
     groups: str | None = option('Groups of columns allowed in the fit.', metavar='A,B'),
     force_groups: str = option('Groups kept regardless of the evidence.', '', metavar='A,B'),
     prior: Path | None = option(
-        'Prior: a calibration of the type, or an old calibration of the unit.', metavar='YAML'
+        'Prior: the output of thermo_comp prior for this type of unit, or an old calibration of '
+        'this unit.',
+        metavar='YAML',
     ),
     ageing_bias: str | None = option(
         'Assumed bias change (1 sd) since the prior calibration, e.g. 50ug; default: estimated '
@@ -56,10 +62,13 @@ def fit(
         'bags if this is 0 without --ageing-bias.',
         0.0,
         metavar='PPM',
+        min=0.0,
     ),
     report: Path | None = option('Certificate to write (HTML).', metavar='HTML'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
-    serial: str | None = option("Serial, instead of the bags'.", callback=options.check_serial),
+    serial: str | None = option(
+        'Serial of the unit, instead of that in the bags.', callback=options.check_serial
+    ),
     offset: float | None = options.OFFSET,
     known_force: Any = options.force,
     columns: Path | None = option('Column map of the tables, as for convert.', metavar='YAML'),
@@ -105,7 +114,7 @@ def fit(
         print_guess(out, log, shown)
         out.sources([(log.path, log.chosen, None)])
 
-    with flags_named():
+    with options.usage_of():
         # The temporary bags exist until the command ends.
         bags = context.with_resource(as_bags(bags, print_log, columns=columns, rate_hz=rate_hz))
     sources, kind = fit_sources(bags, topics, known_force)

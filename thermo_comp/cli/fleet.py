@@ -105,7 +105,7 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
             )
             for row in result.rows
         ],
-        title='|f| - g at rest, RMS',
+        title='|f| - g at rest, RMS; bags: found, less those left out',
     )
     out.sources((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
@@ -127,7 +127,9 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
         if retest.is_significant
     )
     if result.prior is not None:
-        out.line(f'{result.prior}: prior of the type, from the valid units')
+        out.line(
+            f'{result.prior}: prior of the type of unit, from the units with a valid calibration'
+        )
     elif with_prior:
         out.line(f'- fitted without a prior: {result.no_prior}')
     out.line(

@@ -29,7 +29,7 @@ def evaluate(
     judging: dict[str, Any] = options.judging,
     known_force: Any = options.force,
     csv: Path | None = option(
-        'Table of the windows to write, one window per line.', metavar='FILE'
+        'Table of the windows to write (*.csv or *.parquet), one window per line.', metavar='FILE'
     ),
     topics: Any = options.reading_part,
     force: bool = options.FORCE,

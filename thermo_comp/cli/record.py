@@ -92,7 +92,7 @@ def record(
                 lines = [*problems(), _now(account), *_lines(account)]
                 show(_COLUMNS, _rows(account.positions), lines)
     if bag is None and live.n_lost:
-        out.note(f'{live.n_lost} messages from the drivers were lost')
+        out.note(f'messages from the drivers that were lost: {live.n_lost}')
     _end(out, test.account(), output, [*known, *bags.written], offset, over.is_set())
 
 
@@ -107,7 +107,10 @@ def _read_earlier(
             with open_recording(path, require=()) as reader:
                 of_bag = reader.info.metadata.get('serial')
                 if serial is not None and of_bag not in (serial, None):
-                    raise ThermoCompError(f'{path} is of unit {of_bag}, not {serial}')
+                    raise ThermoCompError(
+                        f'{path} is of unit {of_bag}, not {serial}: record each unit into another '
+                        'folder'
+                    )
                 serial = serial or of_bag
                 for block in reader.blocks():
                     test.add(block)
@@ -246,14 +249,14 @@ def _next(account: 'Account') -> str:
     from ..fitting.coverage import direction_text
 
     by = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from here'
-    return f'next: {direction_text(account.next_up)}{by}'
+    return f'next position: {direction_text(account.next_up)}{by}'
 
 
 def _accuracy(account: 'Account') -> str:
     bias, scale, misalignment = account.constants_sd.reshape(3, 3)
     parts = (
-        f'{ug_text(account.worst_sd_g * STANDARD_GRAVITY)} in the worst attitude',
-        f'bias {" ".join(ug_text(value * STANDARD_GRAVITY) for value in bias)}',
+        f'specific force in the worst attitude {ug_text(account.worst_sd_g * STANDARD_GRAVITY)}',
+        f'bias of x y z {" ".join(ug_text(value * STANDARD_GRAVITY) for value in bias)}',
         f'scale {" ".join(micro(1e6 * value) for value in scale)} ppm',
         f'misalignment {" ".join(micro(1e6 * value) for value in misalignment)} urad',
     )

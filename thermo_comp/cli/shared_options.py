@@ -8,6 +8,8 @@ several options; `expanded` passes all options to typer.
 """
 
 import inspect
+import math
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,6 +34,17 @@ _VALUES: dict[Any, str] = {
     **dict.fromkeys((float, float | None), 'X'),
     **dict.fromkeys((str, str | None, list[str] | None), 'TEXT'),
     **dict.fromkeys((Path, Path | None, list[Path], list[Path] | None), 'PATH'),
+}
+
+#: Options whose name differs from that of the library's argument.
+_FLAGS = {
+    'case_timeout_s': '--case-timeout',
+    'forced': '--force-groups',
+    'height_m': '--height',
+    'latitude_deg': '--latitude',
+    'min_rest_s': '--min-rest',
+    'temperature_timeout_s': '--temperature-timeout',
+    'transition_time_s': '--transition-time',
 }
 
 usage = typer.BadParameter  # error in the command line: exit code 2
@@ -75,18 +88,27 @@ def expanded(command: Callable[..., Any]) -> Any:
 
 
 @contextmanager
-def usage_of(what: str = '') -> Iterator[None]:
-    """Turn a ValueError of a `with` block into a usage error."""
+def usage_of(what: str = '', **flags: str) -> Iterator[None]:
+    """
+    Turn a ValueError of a `with` block into a usage error, which begins with `what` or names the
+    options of the command, not the library's arguments; `flags`: options of some arguments.
+    """
     try:
         yield
     except ValueError as mistake:
-        raise usage(f'{what}{mistake}') from mistake
+        known = _FLAGS | flags
+
+        def flag_of(name: re.Match[str]) -> str:
+            return known.get(name[1], f'--{name[1].replace("_", "-")}')
+
+        text = str(mistake) if what else re.sub(r'`(\w+)`', flag_of, str(mistake))
+        raise usage(f'{what}{text}') from mistake
 
 
 def check_serial(serial: str | None) -> str | None:
     """Refuse an invalid serial; an empty serial is passed on."""
     if serial:
-        with usage_of():
+        with usage_of(serial='the serial'):
             valid_serial(serial)
     return serial
 
@@ -94,7 +116,7 @@ def check_serial(serial: str | None) -> str | None:
 def check_rate(rate_hz: float | None) -> float | None:
     """Refuse a sampling rate above 1 MHz, beyond that of any accelerometer."""
     if rate_hz is not None and rate_hz > 1e6:
-        raise usage(f'expected at most 1e6 Hz, got {rate_hz:g}')
+        raise usage(f'expected at most 1e6 Hz, got {rate_hz:g} Hz')
     return rate_hz
 
 
@@ -102,13 +124,16 @@ FORCE = option('Overwrite an output of the same kind.', False, '--force', '-f')
 QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
 JUDGED_BAGS = argument('Bags to judge the calibration on.', None, metavar='[BAG]...')
-CERTIFICATE_INFO = option('Statements of the laboratory: number, customer, ... (YAML).')
+CERTIFICATE_INFO = option(
+    'Statements of the laboratory for the certificate: number, customer, ... (YAML).'
+)
 TABLE_RATE = option('Samples per second of a table without times.', min=0.01, callback=check_rate)
 SERIAL = option(
     "Serial of the unit, instead of the bag's; '' accepts any calibration.", callback=check_serial
 )
 OFFSET = option(
-    'Reading of raw samples at zero force, e.g. 32768; default: detected.', metavar='WORD'
+    'Reading of raw samples at zero force, in counts, e.g. 32768; default: detected.',
+    metavar='COUNTS',
 )
 INPUT = option(
     'Input to read from the bag: counts, imu, or auto (whichever it holds).',
@@ -148,18 +173,21 @@ def _reading(
     input_: Input = INPUT,
     names: dict[str, str] = names,
     begin: float | None = option(
-        'Begin of the part to read: seconds from the first sample, or a stamp.',
+        'Begin of the part to read: seconds from the first sample, or a stamp (seconds since '
+        '1970).',
         None,
         '--from',
         metavar='S',
     ),
-    end: float | None = option('End of the part to read.', None, '--to', metavar='S'),
+    end: float | None = option(
+        'End of the part to read, in the form of --from.', None, '--to', metavar='S'
+    ),
 ) -> Any:
     from ..recording.topics import Part, Topics
 
     with usage_of('--from, --to: '):
         part = Part(begin, end)
-    with usage_of('--topic: '):
+    with usage_of('--topic, --topics: '):
         return Topics.named(names, part=part, input=input_)
 
 
@@ -288,14 +316,17 @@ def fitting(
         min=1e-6,
     ),
     k3_sd: float | None = option(
-        'Bound (1 sd) of the cubic nonlinearity, in ug/g^3; default: 10.', min=1e-6
+        'Data-sheet bound (1 sd) of the cubic nonlinearity, in ug/g^3; default: 10.', min=1e-6
     ),
     allow: list[str] | None = option('Name of a refusal to override, as in its message.'),
 ) -> dict[str, Any]:
     """Return the keywords of FitOptions."""
     given = locals()
     if fault := QUANTITIES['temperature'].fault(reference_temperature):
-        raise usage(f'--reference-temperature: {fault}, got {reference_temperature:g}')
+        raise usage(f'--reference-temperature: {fault} degC, got {reference_temperature:g}')
+    for name, value, unit in (('--k2-sd', k2_sd, 'ug/g^2'), ('--k3-sd', k3_sd, 'ug/g^3')):
+        if value is not None and value > 1e6 * (QUANTITIES['nonlinearity'].at_most or math.inf):
+            raise usage(f'{name}: must be at most 1e6 {unit}, got {value:g}')
     return (
         {name: value for name, value in given.items() if name != 'where'}
         | where
@@ -319,6 +350,6 @@ def require_ros() -> None:
     """Raise ThermoCompError, with advice, if ROS is not installed."""
     if find_spec('rclpy') is None:
         raise ThermoCompError(
-            f'this command needs ROS 2 for {sys.executable}: source its setup file, or '
-            "pip install 'thermo_comp[ros]'"
+            f'this command needs ROS 2, whose package rclpy is missing for {sys.executable}: '
+            "source the setup file of ROS 2, or pip install 'thermo_comp[ros]'"
         )

@@ -40,7 +40,8 @@ def simulate(
         'tumble, tumble-3, tumble-1, held-out; on a rotation: centrifuge or rate-table.'
     ),
     profile: str | None = option(
-        "Chamber program: a name (default: chamber), or steps as '20 30min, 35@0.5 1h, 5@1 1h'."
+        'Chamber program: a name (default: chamber), or steps of a temperature in degC, @ a rate '
+        "in K/min, and a soak, as '20 30min, 35@0.5 1h, 5@1 1h'."
     ),
     positions: int | None = option('Number of positions, a bag each; default: 1.', min=1, max=999),
     position_seed: int = option('Seed of the set of positions.', 0, min=0),
@@ -53,9 +54,16 @@ def simulate(
     imu: bool = option(
         'Write sensor_msgs/Imu, with the angular rate if the unit has a gyroscope.', False, '--imu'
     ),
-    level: int = option('zstd level, 1 fast to 19 small.', 3, min=1, max=19),
-    k2: float = option('K2 of all axes in ug/g^2; it changes by 1 %/K.', 0.0),
-    k3: float = option('K3 of all axes in ug/g^3; it changes by 1 %/K.', 0.0),
+    level: int = option(
+        'Compression of the bags (zstd level): 1 is fast, 19 gives the smallest files.',
+        3,
+        min=1,
+        max=19,
+    ),
+    k2: float = option(
+        'Quadratic nonlinearity K2 of all axes in ug/g^2; it changes by 1 %/K.', 0.0
+    ),
+    k3: float = option('Cubic nonlinearity K3 of all axes in ug/g^3; it changes by 1 %/K.', 0.0),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -73,11 +81,13 @@ def simulate(
     from ..simulation import campaign, presets, run
     from ..simulation.spin import Bend
 
-    with options.usage_of():
+    with options.usage_of(name='--unit'):
         specimen = presets.unit_preset(unit, unit_seed)
+    with options.usage_of(name='--plan'):
         if plan is None:
             profile = profile or 'chamber'
-            program = campaign.parse_cyclogram(profile)
+            with options.usage_of('--profile: '):
+                program = campaign.parse_cyclogram(profile)
             ups = campaign.positions(positions or 1, position_seed)
             stations = tuple(campaign.Position(program, up) for up in ups)
         elif profile or positions:

@@ -113,7 +113,10 @@ def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
     reason = 'the autopilot has already corrected the thermal drift of these samples'
     if is_corrected.all():
-        raise RecordingError(f'{name} was 1: {reason}; {advice}', path=rows.path)
+        raise RecordingError(
+            f'{name} was 1: {reason}; {advice}; or accept these samples with --allow-compensated',
+            path=rows.path,
+        )
     if not is_corrected.any():
         return rows
     share = 100.0 * float(is_corrected.mean())
@@ -147,7 +150,10 @@ def _ulog(path: Path) -> _Held:
     if not accels:
         both = {number: _combined(pair) for number, pair in by_topic['sensor_combined'].items()}
         accels, gyros = ({number: pair[part] for number, pair in both.items()} for part in (0, 1))
-        hint = f'sensor_accel is missing, sensor_combined is after CAL_ACC*; {_PROFILE}'
+        hint = (
+            'the log has no sensor_accel: its samples are those of sensor_combined, which PX4 has '
+            f'corrected by CAL_ACC*; to record raw samples, {_PROFILE}'
+        )
         name = 'TC_A_ENABLE'
         changes = [parameter for parameter in log.changed_parameters if parameter[1] == name]
         correction = _Correction(
@@ -223,7 +229,9 @@ def _dataflash(path: Path) -> _Held:
     with open_regular(path) as file:
         magic = file.read(2)
     if magic != b'\xa3\x95':
-        raise RecordingError('not a DataFlash log: it does not begin with a3 95', path=path)
+        raise RecordingError(
+            'not a DataFlash log of ArduPilot: it does not begin with the bytes a3 95', path=path
+        )
     reader = _read(
         'pymavlink.DFReader', 'DFReader_binary', 'ardupilot', 'a DataFlash log', path, str(path)
     )

@@ -70,7 +70,10 @@ def find_topics(
     """Find the topics of ``imu``, ``board`` and ``case``; None for a missing thermometer."""
     imu = imu or _most(_of_type(present, IMU), 'Imu')
     if imu is None:
-        raise RecordingError('the bag holds no Imu messages')
+        raise RecordingError(
+            'the bag holds no sensor_msgs/msg/Imu, which convert needs; a bag with accel/counts '
+            'needs no conversion'
+        )
 
     def free() -> list[str]:
         return [name for name in _of_type(present, TEMPERATURE) if name not in (board, case)]

@@ -72,11 +72,15 @@ class Accel:
 
     def __post_init__(self) -> None:
         if self.unit == 'counts' and self.output == 'imu' and self.counts_per_g is None:
-            raise ValueError('counts become an Imu only with `counts_per_g`')
+            raise ValueError(
+                '`counts_per_g` must be given if `unit` is counts and `output` is imu'
+            )
         if self.unit != 'counts' and self.output == 'counts':
-            raise ValueError(f'{self.unit} cannot become counts: output must be imu')
+            raise ValueError(f'`output` must be imu if `unit` is {self.unit}, got counts')
         if self.clip is not None and not self.clip[0] < self.clip[1]:
-            raise ValueError('`clip` must be [lowest, highest]')
+            raise ValueError(
+                f'`clip` must be [lowest, highest] with lowest < highest, got {list(self.clip)}'
+            )
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,9 @@ class Thermometer:
     def __post_init__(self) -> None:
         for name in ('degc_per_count', 'degc_at_zero'):
             if (self.unit == 'raw') != (getattr(self, name) is not None):
-                raise ValueError(f'unit raw needs `{name}`, the other units forbid it')
+                raise ValueError(
+                    f'`{name}` must be given if `unit` is raw, and only then; `unit`: {self.unit}'
+                )
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,10 @@ class ColumnMap:
         if twice := {str(name) for name in given if given.count(name) > 1}:
             raise ValueError(f'column {min(twice)!r} is given twice')
         if self.gyro is not None and self.accel.output == 'counts':
-            raise ValueError('a gyro is part of an Imu message: accel output must be imu')
+            raise ValueError(
+                '`accel.output` must be imu if `gyro` is given: messages of counts have no '
+                'angular rate'
+            )
 
 
 def load_column_map(path: Path) -> ColumnMap:
@@ -242,7 +251,10 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = inferred_unit(still.magnitude)
         if unit == 'unknown':
-            raise RecordingError(f'{reason}: {_GIVE_MAP}', path=path)
+            raise RecordingError(
+                f'the unit of the accelerometer cannot be guessed, {reason}: {_GIVE_MAP}',
+                path=path,
+            )
     gyro = None
     if named.gyro is not None and unit != 'counts':
         is_fast = np.nanquantile(np.abs(values(named.gyro)), 0.999) > _FASTEST_RAD_S
@@ -270,7 +282,9 @@ def _unnamed(path: Path, width: int) -> Headings:
     """Return the columns ``[t] ax ay az [wx wy wz]``, by their numbers."""
     if width not in (3, 4, 6, 7):
         raise RecordingError(
-            f'{width} columns without headings cannot be identified: {_GIVE_MAP}', path=path
+            f'{width} columns without headings cannot be identified, only 3, 4, 6 or 7 columns '
+            f'[t] ax ay az [wx wy wz] can: {_GIVE_MAP}',
+            path=path,
         )
     x = int(width in (4, 7))
     gyro = (x + 3, x + 4, x + 5) if width > 4 else None
@@ -321,7 +335,10 @@ def _stamp(
     if times is None:
         return Stamp(rate_hz=rate_hz)
     if rate_hz is not None:
-        raise RecordingError(f'--rate-hz: its column {named.time!r} has the times', path=path)
+        raise RecordingError(
+            f'its column {named.time!r} has the times of the samples: leave out --rate-hz',
+            path=path,
+        )
     times = times[np.isfinite(times)]
     if not len(times):
         return Stamp(named.time, 'iso')

@@ -56,10 +56,14 @@ def export_calibration(
         own_reference_c = calibration.reference_temperature_c
         reference_c = own_reference_c if tool.reference_c is None else tool.reference_c
         content = _thermal(calibration, curves, reference_c, up)
-        of_counts = 'offsets are counts divided by K: the driver must scale by these K'
+        K = ' '.join(f'{factor:.6g}' for factor in curves.K)
+        of_counts = (
+            f'offsets are counts divided by K: the driver must scale counts with K of x y z {K} '
+            'counts per m/s^2'
+        )
     else:
         content = _constant(calibration, curves)
-        of_counts = 'the file is for counts, like the calibration'
+        of_counts = 'the file corrects samples in counts, as the calibration does, not in m/s^2'
     of_type = 'the calibration is the mean of a type of unit, without the deviations of this unit'
     notes = [
         *[of_type] * (calibration.provenance.model == unit.POPULATION),
@@ -120,10 +124,10 @@ def _thermal(
     offset = gain[:, None] * offset + ((gain - 1.0) * loads)[:, None]
     cubics, misfit = _cubics(d, offset)
     if misfit > 0.01 * MICRO_G:
-        notes.append(f'bias functions replaced by cubics, off by {ug_text(misfit)}')
+        notes.append(f'the bias functions are replaced by cubics: error up to {ug_text(misfit)}')
     folded = 'folded into the offset at one attitude'
     if curves.scale_drift > 1e-8:
-        lost = _ppm(curves.scale_drift)
+        lost = f'{_millionths(curves.scale_drift)} ppm'
         notes.append(f'scale over temperature is {folded if up else "lost"}: up to {lost}')
     constant = float(np.max(np.abs(gain - 1.0)))
     if constant > 1e-8:
@@ -131,23 +135,23 @@ def _thermal(
         notes.append(f'the constant scale is {rest}: up to {1e6 * constant:.4g} ppm')
     worst = float(np.max(np.abs(np.array(calibration.misalignment) - np.eye(3))))
     if worst:
-        notes.append(f'misalignment is lost: up to {1e6 * worst:.3g} urad')
+        notes.append(f'misalignment is lost: up to {_millionths(worst)} urad')
     rate_bias = None
     if calibration.gyroscope is not None:
         triad = rate_triad(calibration)
         rate, _ = bias_and_scale(triad, ramp_states(triad, curves.temperature))
         rate_bias, misfit = _cubics(d, rate.T)
-        off = f'replaced by cubics, off by {misfit / MILLIDEGREE:.2g} mdeg/s'
+        off = f'bias functions replaced by cubics: error up to {misfit / MILLIDEGREE:.2g} mdeg/s'
         of_rate = [*[off] * (misfit > 1e-3 * MILLIDEGREE), *_losses(triad)]
         notes += [f'angular rate: {note}' for note in of_rate]
     range_c = calibration.static.temperature_range_c
     return Content(np.eye(3), cubics, reference_c, range_c, notes, rate_bias=rate_bias)
 
 
-def _ppm(part: float) -> str:
-    """Format a ratio in ppm, with two digits or as a whole number."""
+def _millionths(part: float) -> str:
+    """Format a ratio in millionths, with two digits or as a whole number."""
     value = 1e6 * part
-    return f'{value:.2g} ppm' if value < 99.5 else f'{value:.0f} ppm'
+    return f'{value:.2g}' if value < 99.5 else f'{value:.0f}'
 
 
 def _constant(calibration: Calibration, curves: _Curves) -> Content:
@@ -157,10 +161,10 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
         drift = (
             f'over the calibrated range the bias moves by up to '
             f'{ug_text(float(np.max(np.abs(curves.bias))))}, the scale by '
-            f'{_ppm(curves.scale_drift)}'
+            f'{_millionths(curves.scale_drift)} ppm'
         )
     reference_c = calibration.reference_temperature_c
-    notes = [f'the file holds at {reference_c:g} degC: {drift}']
+    notes = [f'the values of the file hold at {reference_c:g} degC: {drift}']
     notes += ['the bias of the angular rate is lost'] * (calibration.gyroscope is not None)
     cubics = np.pad(curves.level[:, None], ((0, 0), (0, 3)))
     matrix = np.array(calibration.misalignment) / curves.K
@@ -225,8 +229,9 @@ def import_calibration(
     is_si = bool((K < _NEAR_ONE).all() and (K > 1.0 / _NEAR_ONE).all())
     if not is_si and float(K.min()) < 10.0 / STANDARD_GRAVITY:
         raise CalibrationError(
-            f'the scale is {K.min():.3g} units per m/s^2: neither m/s^2 nor counts; convert the '
-            'readings first'
+            f'the smallest scale factor of the file is {K.min():.3g} units per m/s^2, so its '
+            'samples are neither in m/s^2 nor in counts: convert the samples to m/s^2 and make '
+            'the file again'
         )
     (_, _, _), (yx, _, _), (zx, zy, _) = (matrix * K).tolist()
     if not is_si:

@@ -318,7 +318,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
 def inferred_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
     """Infer the unit (or ``counts``, ``unknown``) from |a| at rest; return it and the reason."""
     if not np.isfinite(magnitude):
-        return 'unknown', 'the sensor never rests, so its unit was not checked'
+        return 'unknown', 'the sensor never rests, so its readings do not show their unit'
     reading = f'|a| at rest is {magnitude:.4g}'
     for unit, gravity in PER_G.items():
         if abs(magnitude / gravity - 1.0) <= _TOLERANCE:

@@ -45,17 +45,20 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
     for name in keywords:
         if name not in KEYWORDS[kind]:
             has = ', '.join(f'`{keyword}`' for keyword in KEYWORDS[kind])
-            raise ValueError(f'a {kind} needs no `{name}`; it has {has}')
+            raise ValueError(f'`{name}` does not apply to a {kind}, which takes {has}')
     if kind == 'bag':
         names = keywords.pop('topic', {})
         if not names.keys() <= {'imu', 'board', 'case'}:
-            raise ValueError('`topic`: only imu, board and case of a bag are converted')
+            raise ValueError(
+                '`topic` takes imu, board and case, which are converted, got '
+                + ', '.join(sorted(names.keys() - {'imu', 'board', 'case'}))
+            )
         return bag.bag_log(path, **names, **keywords)
     if kind == 'log':
         return autopilot.read_autopilot(path, **keywords)
     columns, rate_hz = keywords.get('columns'), keywords.get('rate_hz')
     if columns is not None and rate_hz is not None:
-        raise ValueError('`rate_hz`: the column map holds the rate')
+        raise ValueError('`rate_hz` does not apply if `columns` is given: the map states the rate')
     if columns is not None:
         return column_map.table_log(path, column_map.load_column_map(columns))
     guessed = column_map.guess_columns(path, rate_hz)
@@ -70,7 +73,7 @@ def as_bags(
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
     if any(given.values()) and not others:
         flags = ' and '.join(f'`{name}`' for name in given)
-        raise ValueError(f'{flags} are for tables, but no table is given')
+        raise ValueError(f'{flags} are for tables and logs, but all given files are bags')
     with TemporaryDirectory(prefix='thermo_comp-') as folder:
         bags = {}
         for number, path in enumerate(others):

@@ -80,7 +80,8 @@ def _write_px4(content: Content, number: int | None, device_id: int) -> str:
         lines += [f'1\t1\t{prefix}{name}\t{value:.9g}\t9' for name, value in values.items()]
         if not known_id:
             content.notes.append(
-                f'{prefix}ID is 0: set it to the device id of the sensor, by which PX4 matches'
+                f'{prefix}ID is 0: set it to the device id of the sensor, by which PX4 finds the '
+                'parameters of a sensor' + ' (--device-id)' * (letter == 'A')
             )
     return '\n'.join(lines) + '\n'
 
@@ -90,8 +91,9 @@ def _write_ardupilot(content: Content, number: int | None, _device_id: int) -> s
     imu = _within(number, 1)
     lower, upper = content.range_c
     content.notes.append(
-        'the offset itself is not written: calibrate the accelerometer as usual afterwards '
-        f'(ArduPilot keeps its temperature in INS_ACC{imu}_CALTEMP)'
+        'the file has the changes of the offset with temperature, not the offset: calibrate the '
+        'accelerometer in ArduPilot as usual afterwards (ArduPilot keeps the temperature of that '
+        f'calibration in INS_ACC{imu}_CALTEMP)'
     )
     values = {'ENABLE': 1.0, 'TMIN': lower, 'TMAX': upper}
     for sensor, bias in (('ACC', content.bias), ('GYR', content.rate_bias)):
@@ -191,10 +193,14 @@ def _choose(numbers: set[int], number: int | None, is_in_use: Callable[[int], bo
     if number is None:
         live = [n for n in sorted(numbers) if is_in_use(n)] or sorted(numbers)
         if len(live) > 1:
-            raise CalibrationError(f'several sets of parameters {live}: choose one by its number')
+            raise CalibrationError(
+                f'several sets of parameters, numbers {live}: choose one with --number'
+            )
         return live[0]
     if number not in numbers:
-        raise CalibrationError(f'no set of parameters {number}, there is {sorted(numbers)}')
+        raise CalibrationError(
+            f'no set of parameters {number} (--number); the file has the numbers {sorted(numbers)}'
+        )
     return number
 
 
@@ -221,7 +227,10 @@ def turned(rotation: Floats) -> list[str]:
     pitch = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     angles = f'{roll:.6g} {pitch:.6g} {yaw:.6g}'
-    return [f'the frames differ: tf from theirs to ours has roll, pitch, yaw {angles} rad']
+    return [
+        "the axes of the other tool's frame differ from those of thermo_comp's: the tf from the "
+        f"other tool's frame to thermo_comp's has roll, pitch, yaw {angles} rad"
+    ]
 
 
 def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str:
@@ -246,7 +255,7 @@ def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
     white, walk, rate = content.noise
     rows = ''.join(f'    - {row}\n' for row in np.linalg.inv(content.matrix).tolist())
     content.notes.append('Kalibr estimates the bias each time and ignores the key `bias`')
-    content.notes.append('topic and gyroscope must be added')
+    content.notes.append('the file lacks rostopic and gyroscope of the IMU: add them for Kalibr')
     return (
         f'imu{number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
         f'  accelerometer_noise_density: {white!r}\n'
@@ -289,7 +298,9 @@ def _read_kalibr(text: str, number: int | None) -> Content | None:
         return None
     name = next(iter(imus)) if number is None else f'imu{number}'
     if name not in imus or (number is None and len(imus) > 1):
-        raise CalibrationError(f'choose one of the IMUs: there are {", ".join(imus)}')
+        raise CalibrationError(
+            f'choose one of the IMUs with --number: there are {", ".join(imus)}'
+        )
     part = imus[name]
     matrix = _regular(_array(part['M'], f'{name}.accelerometers.M', 9).reshape(3, 3))
     bias = _array(part.get('bias', [0, 0, 0]), f'{name}.accelerometers.bias', 3)
@@ -299,7 +310,10 @@ def _read_kalibr(text: str, number: int | None) -> Content | None:
 
 def _regular(matrix: Floats) -> Floats:
     if not 0.0 < np.linalg.det(matrix) < np.inf:
-        raise CalibrationError('its matrix is singular or mirrors: it cannot correct a triad')
+        raise CalibrationError(
+            'the matrix is singular or mirrors the axes (its determinant must be above 0), so it '
+            'cannot correct an accelerometer'
+        )
     return matrix
 
 

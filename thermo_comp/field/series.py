@@ -116,7 +116,11 @@ def read_rests(
     for path in paths:
         matching = sorted(path.glob(f'*{SUFFIX}')) if path.is_dir() else [path]
         if not matching or not path.exists():
-            raise RecordingError(f'no rest log: expected a folder of *{SUFFIX} files', path)
+            raise RecordingError(
+                f'no rest log: expected a folder of *{SUFFIX} files, which the node writes '
+                '(parameter rest_log)',
+                path,
+            )
         files += matching
     others: set[str] = set()
     unit, wanted = calibration.unit, f'{calibration.unit.serial} ({calibration.unit.input})'
@@ -134,11 +138,13 @@ def read_rests(
         reason = getattr(error, 'strerror', None) or str(error)
         raise RecordingError(f'cannot be read: {reason}', str(paths[0])) from error
     rests, n_damaged = rests_of(contents, is_wanted)
-    notes = [f'{counted(n_damaged, "damaged line")} skipped'] if n_damaged else []
+    notes = [f'{counted(n_damaged, "damaged line")} of the rest logs skipped'] if n_damaged else []
     if others:
         notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
     if not rests:
-        found = f': the rests are of {", ".join(sorted(others))}' if others else ''
+        found = ': no rest at all, is it a rest log?'
+        if others:
+            found = f': the rests are of {", ".join(sorted(others))}'
         raise RecordingError(f'no rest of unit {wanted}{found}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
     # The time in the name of an update's source is rounded down to a second.
@@ -147,10 +153,17 @@ def read_rests(
     if is_update and not is_for_update:
         notes.append(f'{counted(len(rests) - len(later), "window")} took part in the last update')
     elif is_update and not later:
-        raise RecordingError('the calibration has been updated with all of these rests', paths[0])
+        raise RecordingError(
+            'the calibration has been updated with all of these rests: update it again once the '
+            'node has logged more',
+            paths[0],
+        )
     elif later and len(later) < len(rests):
         day = np.datetime64(int(begin * 86400.0), 's')
-        notes.append(f'{counted(len(rests) - len(later), "window")} before {day}: left out')
+        notes.append(
+            f'{counted(len(rests) - len(later), "window")} before {day}, the date of the '
+            'calibration: left out'
+        )
         rests = later
     digest = hashlib.sha256(b''.join(contents)).hexdigest()
     return rests, source_of(rests, digest, ahead), notes
@@ -262,7 +275,8 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
     except ValueError as error:
         raise RecordingError(
             'the rests were logged with a calibration that has other columns; their thermal state '
-            'does not contain the lags of this calibration'
+            'does not contain the lags of this calibration: log rests while the node uses this '
+            'calibration'
         ) from error
 
 

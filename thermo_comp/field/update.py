@@ -133,8 +133,8 @@ def update(
     n_starts = int(series.start.max()) + 1
     if n_starts < 3:
         raise FitError(
-            f'rests of {counted(n_starts, "start")}, need 3 at least: each start has a bias '
-            'offset, and the update is judged on left-out starts'
+            f'the logs hold rests of {counted(n_starts, "start")} of the node, need 3 at least: '
+            'each start has a bias offset, and the update is judged on left-out starts'
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time.min()), float(series.time.max())
@@ -336,11 +336,11 @@ def _gravity_texts(result: Update) -> Iterator[str]:
         time = change.time or 0.0
         stated = result.series.gravity[np.argmin(np.abs(result.series.time - time))]
         yield (
-            f'another gravity than the stated {stated:.5f} m/s^2 from '
-            f'{np.datetime64(int(time * 86400.0), "s")} on, '
+            f'from {np.datetime64(int(time * 86400.0), "s")} on |f| is '
             f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} in '
-            'all attitudes: no scale was changed for it; state the gravity of the place '
-            '(local_gravity, --gravity), or override with --allow gravity if the stated is right'
+            f'all attitudes, as by another gravity than the stated {stated:.5f} m/s^2: no scale '
+            'was changed for it; state the gravity of the place (--gravity; parameter '
+            'local_gravity of the node) or, if the stated gravity is right, use --allow gravity'
         )
 
 
@@ -350,20 +350,24 @@ def change_texts(result: Update) -> list[str]:
     lines = [
         f'random walk of the bias {ug_text(ageing.bias)}, of the scale '
         f'{1e6 * ageing.scale / result.calibration.gravity_m_s2:.2g} ppm per root day; '
-        f'scatter of starts {ug_text(ageing.turn_on)}, of rests {ug_text(ageing.rest)}'
+        f'sd of the bias offset of a start {ug_text(ageing.turn_on)}, of a rest '
+        f'{ug_text(ageing.rest)}'
     ]
     if result.series.by_start.any():
-        lines[0] += f'; lags at a start {ageing.lags:.2g} of the sd that the calibration assumes'
+        lines[0] += f'; sd of the lags at a start {ageing.lags:.2g} times that of the calibration'
     for change in result.changes:
         if change.time is None:
-            lines.append('the curves of the bias have changed')
+            lines.append(
+                'the curves of the bias over temperature have changed, not only its level'
+            )
         elif change.kind == 'levels':
             day = np.datetime64(int(change.time * 86400.0), 's')
             text = f'the bias jumped before {day}: a shock, not ageing'
             if change.may_be_gravity:
                 text += (
                     '; or another gravity, which the attitudes do not distinguish: if the unit '
-                    'was moved, state the gravity of the place (local_gravity, --gravity)'
+                    'was moved, state the gravity of the place (--gravity; parameter '
+                    'local_gravity of the node)'
                 )
             lines.append(text)
     lines += _gravity_texts(result)
@@ -374,5 +378,7 @@ def change_texts(result: Update) -> list[str]:
             'with an aged uncertainty; rests in other attitudes would determine them'
         )
     if result.n_outliers:
-        lines.append(f'{result.n_outliers} rests contradict all other rests and are left out')
+        lines.append(
+            f'left out, as they contradict all other rests: {counted(result.n_outliers, "rest")}'
+        )
     return lines

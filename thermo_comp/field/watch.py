@@ -87,24 +87,29 @@ class Watch:
 
     def __str__(self) -> str:
         n_out = sum(not row.is_within for row in self.week)
-        week = f'RMS {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} days'
+        week = (
+            f'RMS of |f| - g {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} days'
+        )
         week += f', {n_out} of {counted(len(self.week), "day")} outside'
         if self.left and self.recent <= 1.0:
             week += ', above the limit at the last rest by the ageing model'
         if self.left:
-            text = f'outside its claim since {self.left} ({week}): update or recalibrate it'
+            text = (
+                f'the unit is outside its claim since {self.left} ({week}): update its '
+                'calibration by rests, or recalibrate the unit'
+            )
         else:
-            text = f'again within its claim since {self.back}' if self.back else 'within its claim'
-            text += f' up to {self.last} ({week}); '
+            how = f'again within its claim since {self.back}' if self.back else 'within its claim'
+            text = f'the unit is {how} up to {self.last} ({week}); '
             if self.forecast:
                 when = 'on any day' if self.forecast[1] < 1.0 else f'about {self._date(1)}'
-                text += f'will leave it {when}'
+                text += f'forecast: it will leave its claim {when}'
                 text += f' (10 to 90 %: {self._date(0)} .. {self._date(2)})'
             else:
-                text += 'a forecast needs 3 starts'
+                text += 'a forecast needs rests of 3 starts of the node'
         if self.interval:
             low, middle, high = (f'{min(days, _HORIZON):.0f}' for days in self.interval)
-            text += f'; recalibration interval {middle} days ({low} .. {high})'
+            text += f'; recalibration interval {middle} days (10 to 90 %: {low} .. {high})'
         return text
 
     def _date(self, k: int) -> str:

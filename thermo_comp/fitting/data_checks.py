@@ -105,8 +105,9 @@ def judge_windows(
             yield Finding(
                 'swapped',
                 'refusal',
-                f'the board temperature leads the case (correlation {correlation:.2f} of gradient '
-                'and rate): are the two sensors exchanged, or is the case thermometer loose?',
+                f'the board temperature leads the case in ramps (correlation {correlation:.2f} of '
+                'T_case - T_board and the rate of T_board): are the two topics exchanged, or is '
+                'the case thermometer loose?',
             )
 
 
@@ -115,10 +116,10 @@ def _judge_span(windows: ThermalWindows) -> Finding:
     text = f'temperature span {span:.1f} degC'
     if span >= ADVISED_SPAN_K:
         return Finding('span', 'good', text)
-    why = 'run the chamber over the whole range of use'
+    why = 'run the chamber over the whole range of temperatures in use'
     if span < LEAST_SPAN_K and _has_drift(windows):
         why = 'readings hardly change while the bias does: is the thermometer on the board?'
-    return advice('span', f'{text} ({ADVISED_SPAN_K:g} advised): {why}')
+    return advice('span', f'{text} ({ADVISED_SPAN_K:g} degC advised): {why}')
 
 
 def _judge_beyond(temperature: Floats, prior: Calibration) -> Finding:
@@ -214,7 +215,11 @@ def _judge_positions(up: Floats) -> Finding:
         )
     advised = 18  # number of positions: two for each of the nine constants
     if n < advised:
-        return advice('positions', f'{n} positions; {advised} would reduce the uncertainty')
+        return advice(
+            'positions',
+            f'{n} positions; {advised} would reduce the uncertainty of bias, scale and '
+            'misalignment',
+        )
     return Finding('positions', 'good', f'{n} positions')
 
 
@@ -223,9 +228,9 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',
-            f'{least.away_deg:.0f} deg away from every position the sd of |f| is '
-            f'{ug_text(least.sd_m_s2)}, in the positions {ug_text(least.seen_sd_m_s2)}: record a '
-            f'position with {direction_text(np.array(least.up))}',
+            f'{least.away_deg:.0f} deg away from every position the standard deviation of |f| is '
+            f'{ug_text(least.sd_m_s2)}, against {ug_text(least.seen_sd_m_s2)} in the positions: '
+            f'record a position with {direction_text(np.array(least.up))}',
         )
 
 
@@ -322,7 +327,7 @@ def judge_result(
         row.rms / MICRO_G for row in (overall.raw, overall.fitted, overall.left_out)
     )
     others = f'{left_out:.1f} ug on data left out, ' if overall.left_out.n else ''
-    text = f'|g| error {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
+    text = f'|f| - g: {raw:.1f} ug RMS raw, {others}{fitted:.1f} ug in sample'
     is_slow = slow / MICRO_G > max(0.3 * raw, 0.5 * fitted)
     # Noise explains a residual of up to twice the white noise.
     if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:
@@ -334,11 +339,14 @@ def judge_result(
             )
         yield advice('misfit', f'{text}: {why}')
     elif raw < 1.2 * fitted and span >= LEAST_SPAN_K:
-        why = ': no temperature drift above the noise; already compensated?'
+        why = (
+            ': the correction gains little, as there is no temperature drift above the noise; are '
+            'the samples already compensated?'
+        )
         yield advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
         why = 'each position is predicted badly by the other positions; record more positions'
-        yield advice('left out', f'{text}: left-out positions exceed the raw error: {why}')
+        yield advice('left out', f'{text}: left-out positions exceed the raw residual: {why}')
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
@@ -347,12 +355,12 @@ def judge_result(
         yield advice(
             'prior',
             f'the bags contradict the prior: |f| - g is {ug_text(overall.fitted.rms)} RMS with '
-            f'the prior, {ug_text(alone)} with two sets fitted without it: was the prior made for '
-            'this unit, or for its type?',
+            f'the prior, {ug_text(alone)} with two sets fitted without it; check that the '
+            'calibration in --prior is one of this unit, or of its type',
         )
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
         yield advice(
             'units',
             f'the scale factors are {K.min():.3g}..{K.max():.3g}, expected near 1 for m/s^2: is '
-            'the unit, or --gravity, right?',
+            'the unit of the samples right, and --gravity?',
         )

@@ -94,7 +94,7 @@ def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
         fewest_windows=FEWEST_WINDOWS,
     )
     if not bag.n_samples:
-        raise FitError(f'{source.name}: no accelerometer samples')
+        raise FitError(f'{source.name}: no accelerometer samples in the part that is read')
     if bag.restless:
         raise FitError(f'{source.name}: {bag.restless}')
     return bag
@@ -116,8 +116,11 @@ def _fit_about_offset(
     if not offset.any():
         return _fit_one_environment(bags, options, progress)
     codes = ' '.join(f'{code:g}' for code in offset)
+    how = 'by the readings; --offset can state it' if options.offset is None else 'by --offset'
     finding = Finding(
-        'offset', 'advice', f'zero force reads {codes} counts: the samples use an offset code'
+        'offset',
+        'advice',
+        f'zero force reads {codes} counts (x y z), {how}: the fit subtracts this offset',
     )
     prior = options.prior and about(options.prior, -offset)
     centred_bags = [centred(bag, offset) for bag in bags]
@@ -282,7 +285,10 @@ def _judged(
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name
-        raise FitError(f'{name}: no board temperature, which the other bags have')
+        raise FitError(
+            f'{name}: no board temperature, which the other bags have: leave out this bag, or '
+            'name its topic with --topic board=TOPIC'
+        )
     serial = check_serial([bag.source for bag in bags], options)
     findings = enforce(raw_checks.judge_prior(serial, options.prior), options)
     findings += enforce(raw_checks.judge_bags(bags, options), options)
@@ -296,11 +302,11 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
         # If the positions determine a misalignment out of range, the sensor is no accelerometer.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
-            'the angle between two of its axes is less than 60 degrees, which no accelerometer '
-            'has: is the topic the right one, did the axes stay the same in all positions, and '
-            'are there at least 9 positions?'
+            'by the fit the angle between two of its axes is less than 60 degrees, which no '
+            'accelerometer has: is the topic that of the accelerometer, did the axes stay the '
+            'same in all positions, and are there at least 9 positions?'
         )
-    return FitError(f'these data give no calibration that can be used: {error}')
+    return FitError(f'the bags give a calibration with an impossible value: {error}')
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
@@ -308,11 +314,15 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     serials = {source.serial: source.name for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         names = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))
-        raise FitError(f'the bags are of different units: {names}')
+        raise FitError(
+            f'the bags are of different units: {names}; fit the bags of each unit alone or, if it '
+            'is one unit, state --serial'
+        )
     try:
         return valid_serial(options.serial or next(iter(serials), 'unknown'))
     except ValueError as mistake:
-        raise FitError(str(mistake)) from mistake
+        advice = '' if options.serial else '; it is that of the bags, --serial can replace it'
+        raise FitError(f'{mistake}{advice}') from mistake
 
 
 def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:

@@ -56,12 +56,21 @@ def constant_calibration(
         scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
         calibration, rms = _refine(means, gravity, np.zeros(3), scale, misalignment_sd)
         if not np.all(calibration.scale > 0.0) or not rms < largest_rms:
-            raise FitError('the readings contradict the stated |f|: are its values right?')
+            raise FitError(
+                'the readings at rest contradict the stated |f|: are the values right, in '
+                '--specific-force, --radius or the metadata of the bags?'
+            )
         return calibration
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
     half = 0.5 * (means.max(axis=0) - means.min(axis=0))
     if not np.all(half > 0.0):
-        raise FitError('an axis reads the same in all positions: it is dead or was never turned')
+        axes = ', '.join(
+            axis for axis, size in zip('xyz', half.tolist(), strict=True) if size == 0.0
+        )
+        raise FitError(
+            f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
+            'never turned about another axis'
+        )
     tried = []
     for spread in (1.0, 1.3):
         scale = np.full(3, float(np.max(half)) * spread / gravity)
@@ -73,8 +82,9 @@ def constant_calibration(
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(
-            'the positions do not lie on an ellipsoid: is every one of them at rest, and is it an '
-            'accelerometer, with one unit for three axes at right angles?'
+            'the mean readings of the positions do not lie on an ellipsoid: was the unit at rest '
+            'in every position, and are these the readings of an accelerometer, with three axes '
+            'at right angles and in one unit of measurement?'
         )
     return calibration
 

@@ -341,7 +341,11 @@ def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalib
     gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)
     if not norms.all() or (len(means) > 1 and not means.any(axis=0).all()):
-        raise FitError('an axis is exactly zero at rest: is the axis dead, or the topic wrong?')
+        axes = ', '.join('xyz'[k] for k in np.flatnonzero(~np.any(means, axis=0)))
+        raise FitError(
+            f'an axis is exactly zero at rest ({axes or "all axes in a position"}): is the axis '
+            'dead, or the topic wrong?'
+        )
     scale = float(np.median(norms / gravity))
     if len(distinct_directions(means / norms[:, None])) >= POSITIONS_NEEDED:
         known = options.gravity if windows.data.forces is None else gravity
@@ -351,7 +355,7 @@ def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalib
         if abs(scale - 1.0) > 0.2:
             raise FitError(
                 f'the samples at rest have norm {scale * options.gravity:.3g}, expected '
-                f'{options.gravity:.3g} m/s^2: is the unit right?'
+                f'{options.gravity:.3g}: are the samples in m/s^2?'
             )
         scale = 1.0
     return ConstantCalibration(np.zeros(3), np.full(3, scale), np.eye(3))

@@ -94,7 +94,7 @@ class KnownForce:
             since_s = (start_ns - first_ns) * 1e-9
             raise FitError(
                 f'{self.name}: {n} readings of the rotation rate in the rest that begins at '
-                f'{since_s:.1f} s, need {needed}'
+                f'{since_s:.1f} s; a rest needs {needed} to give |f|'
             )
         spin = self.rate[inside] ** 2 * self.radius
         mean, sd = float(spin.mean()), float(spin.std(ddof=1)) / math.sqrt(len(spin))
@@ -119,7 +119,7 @@ class ForceOptions:
 
     def __post_init__(self) -> None:
         if self.rotation is not None and (self.radius is None or self.magnitude is not None):
-            raise ValueError('a rotation topic needs a radius, and no other specific force')
+            raise ValueError('`rotation` needs `radius`, and excludes `specific_force`')
 
 
 #: The options without any entry: the bags' metadata about |f| apply.
@@ -143,7 +143,10 @@ def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownFo
         if ROTATION in metadata:
             radius, sd = float(metadata.get(RADIUS, 'nan')), float(metadata.get(RADIUS_SD, '0'))
             if not (0.0 < radius < math.inf and 0.0 <= sd < math.inf):
-                raise ValueError(f'metadata with {ROTATION} need a positive {RADIUS}')
+                raise ValueError(
+                    f'metadata with {ROTATION} need a positive {RADIUS}, and a {RADIUS_SD} of 0 '
+                    'or more, if any [m]'
+                )
             return _rotating(path, info, ForceOptions(None, metadata[ROTATION], radius, sd))
         if MAGNITUDE in metadata:
             return KnownForce(str(path), parse_sections(metadata[MAGNITUDE]))
@@ -171,11 +174,13 @@ def parse_sections(text: str) -> tuple[Section, ...]:
 
 def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Section:
     if not begin_s < end_s:
-        raise ValueError(f'a section must end after its begin {begin_s:g} s, got {end_s:g} s')
+        raise ValueError(
+            f'a line of |f| must end after its begin {begin_s:g} s, got the end {end_s:g} s'
+        )
     # The limit 1e7 m/s^2 is above the acceleration of a launch from a gun.
     if not (0.0 < size < 1e7 and 0.0 <= sd < size):
         raise ValueError(
-            f'a specific force must be above 0 with a smaller sd, got {size:g} +- {sd:g} m/s^2'
+            f'a specific force must be above 0 and its sd smaller, got {size:g} +- {sd:g} m/s^2'
         )
     return Section(begin_s, end_s, size, sd)
 
@@ -185,9 +190,9 @@ def _numbers(words: list[str]) -> list[float]:
     try:
         values = [float(word) for word in words]
     except ValueError as error:
-        raise ValueError(f'expected numbers, got {text}') from error
+        raise ValueError(f'|f|: expected numbers, got {text}') from error
     if not all(map(math.isfinite, values)):
-        raise ValueError(f'expected finite numbers, got {text}')
+        raise ValueError(f'|f|: expected finite numbers, got {text}')
     return values
 
 
@@ -195,7 +200,11 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     """Read |f| as a value with unit, or from a table whose lines may begin with a bag's name."""
     table = Path(text)
     if not table.is_file():
-        return (_section(0.0, math.inf, parse_acceleration(text)),)
+        try:
+            return (_section(0.0, math.inf, parse_acceleration(text)),)
+        except ValueError as mistake:
+            reason = f'--specific-force: {mistake}; nor is there a file of this name'
+            raise FitError(reason) from mistake
     try:
         content = read_bounded(table, 1 << 20).decode('utf-8')
     except (OSError, ValueError) as error:
@@ -220,7 +229,9 @@ def _rotating(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForc
     wanted, field = split_field(asked.rotation or '')
     names = [name for name in info.topics if is_called(name, wanted)]
     if len(names) != 1:
-        raise ValueError(f'{len(names)} topics are called {wanted}, expected one with the rate')
+        raise ValueError(
+            f'{len(names)} topics are called {wanted}, expected one with the rotation rate'
+        )
     stamps, rates = [np.empty(0, np.int64)], [np.empty(0)]
     with open_recording(path, require=()) as reader:
         kind = info.topics[names[0]][0]
@@ -232,6 +243,9 @@ def _rotating(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForc
             rates.append(rate)
     stamp_ns, rate = np.concatenate(stamps), np.concatenate(rates)
     if not len(rate) or not np.isfinite(rate).all():
-        raise ValueError(f'{names[0]} has no messages, or a rate that is not finite')
+        raise ValueError(
+            f'{names[0]}, the topic of the rotation rate, has no messages, or a rate that is not '
+            'finite'
+        )
     radius, radius_sd = asked.radius or 0.0, asked.radius_sd or 0.0
     return KnownForce(str(path), (), stamp_ns, rate, radius, radius_sd)

@@ -125,10 +125,14 @@ def with_forces(
     rotating = [bag.source.force for bag in bags if bag.source.force and bag.source.force.radius]
     radii = {(force.radius, force.radius_sd) for force in rotating}
     if len(radii) > 1:
-        raise FitError(f'the bags state different radii: {sorted(radii)}')
+        stated = ', '.join(f'{radius:g} +- {sd:g} m' for radius, sd in sorted(radii))
+        raise FitError(f'the bags state different distances from the axis of rotation: {stated}')
     radius, radius_sd = next(iter(radii), (1.0, 0.0))
     if radius_sd and options.prior is not None:
-        raise FitError('a fit with a prior takes the radius as given: leave out --radius-sd')
+        raise FitError(
+            'a fit with --prior does not estimate the radius: leave out --radius-sd, or set the '
+            'rotation_radius_sd_m in the metadata of the bags to 0'
+        )
     kinds = tuple(POWERS) if prior is None else tuple(term.kind for term in prior.terms)
     t = windows.temperature - windows.model.reference_temperature
     forces = Forces(kinds, t, still, spin, sd, radius_sd / radius)
@@ -315,6 +319,6 @@ def judge_terms(calibration: Calibration) -> Iterator[Finding]:
     if undetermined:
         yield advice(
             'nonlinearity',
-            f'the positions do not determine the nonlinearity: {undetermined} stays near its '
-            'prior; positions at several |f| above 1 g determine it',
+            'the positions do not determine these terms of the nonlinearity, which stay near '
+            f'their prior: {undetermined}; positions at several |f| above 1 g determine them',
         )

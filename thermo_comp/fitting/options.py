@@ -127,7 +127,10 @@ class FitOptions:
                 raise ValueError(f'`prior` must be a Calibration, see `load`, got {self.prior!r}')
             if self.prior.unit.input != self.input:
                 known = self.prior.unit.input
-                raise ValueError(f'`prior` is in {known}, the samples are in {self.input}')
+                raise ValueError(
+                    f'`prior` is in {known}, the samples are in {self.input}: it cannot be used '
+                    'for them'
+                )
         allowed: dict[str, tuple[str, ...]] = {
             'input': ('counts', 'm/s^2'),
             'model': ('response', 'golovach'),
@@ -143,7 +146,7 @@ class FitOptions:
                 raise ValueError(f'`{name}` must be a list of names, got {given!r}')
             for word in given if isinstance(given, tuple | list) else (given,):
                 if word is not None and word not in words:
-                    raise ValueError(f'`{name}` must be of {", ".join(words)}, got {word!r}')
+                    raise ValueError(f'`{name}` must be one of {", ".join(words)}, got {word!r}')
 
     def nonlinear_sd(self, kind: Kind) -> float:
         """

@@ -50,26 +50,34 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     temperature, sensors or curves.
     """
     if len(calibrations) < UNITS_NEEDED:
-        raise FitError(f'{len(calibrations)} calibrations, need {UNITS_NEEDED} for a population')
+        raise FitError(
+            f'the prior of a type needs the calibrations of at least {UNITS_NEEDED} units, got '
+            f'{len(calibrations)}'
+        )
     # Nonlinear terms are left out: most units have none, because a centrifuge is needed to
     # determine them.
     calibrations = [
         each if each.nonlinearity is None else without_terms(each) for each in calibrations
     ]
     first = calibrations[0]
-    if len({calibration.unit.serial for calibration in calibrations}) < len(calibrations):
-        raise FitError('two of the calibrations are of one unit: give one of each unit')
+    serials = [calibration.unit.serial for calibration in calibrations]
+    if twice := sorted(serial for serial in set(serials) if serials.count(serial) > 1):
+        raise FitError(
+            f'two of the calibrations are of one unit, {twice[0]}: give one of each unit'
+        )
     for calibration in calibrations:
         serial, unit = calibration.unit.serial, calibration.unit
         alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
         if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
             raise FitError(
-                f'{serial} differs from {first.unit.serial} in its input, reference temperature '
-                'or sensors: they are not of one type'
+                f'unit {serial} differs from unit {first.unit.serial} in the key unit.input, '
+                'reference_temperature_c or sensors: they are not of one type'
             )
         if _shape(calibration) != _shape(first):
             raise FitError(
-                f'{serial} has other curves than {first.unit.serial}: fit both with the same model'
+                f'the curves over temperature of unit {serial} have another form than those of '
+                f'unit {first.unit.serial}: fit both with the same --model, --static-curve and '
+                '--dynamic-curve'
             )
     keys: dict[Column, list[Column]] = {}
     for calibration in calibrations:
@@ -223,8 +231,8 @@ def _relative_to(
     """Return a unit's parameters and covariance in `template`'s layout, relative to `mean_K`."""
     if calibration.posterior is None:
         raise FitError(
-            f'{calibration.unit.serial} has no covariance: an imported calibration cannot be part '
-            'of a population'
+            f'the calibration of unit {calibration.unit.serial} has no covariance, so it cannot '
+            'be part of a prior: fit it to bags; an imported calibration is not sufficient'
         )
     common_columns = [_without_range(column) for column in prior_columns(template)]
     unit_columns = prior_columns(calibration)

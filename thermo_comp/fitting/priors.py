@@ -37,8 +37,8 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
-                f'the prior has a response of the {term.during} regime alone: only columns of '
-                'both regimes can serve as a prior'
+                f'the prior has a thermal response of the {term.during} regime alone, as files of '
+                'format_version 1 have: fit the bags of the prior again'
             )
     names = [field.name for field in fields(Column)]
     return tuple(
@@ -78,7 +78,10 @@ def with_calibration(calibration: Calibration, regression: Regression, state: St
     """Set bias and weights of a state to those of a calibration with the nominal scale."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
-        raise FitError('the curves of the prior differ from axis to axis, or from bias to scale')
+        raise FitError(
+            'the curves of the prior differ from axis to axis, or from bias to scale: a prior '
+            'needs curves of one form, as a fit writes them'
+        )
     # Replace the level of the dynamic set by its difference from the level of the static set.
     both = np.array([[values[block.rows] for block in part] for part in layout[:2]])
     both[..., layout.bias[0].dynamic] -= both[..., 0]
@@ -100,7 +103,10 @@ def informative_priors(
     has no covariance.
     """
     if calibration.posterior is None:
-        raise FitError('the prior has no covariance: an imported calibration cannot be a prior')
+        raise FitError(
+            'the prior has no covariance: use a calibration that was fitted to bags; an imported '
+            'calibration cannot be a prior'
+        )
     K = constants_of(calibration).scale
     covariance = calibration.posterior.covariance()
     places = parameter_layout(calibration)

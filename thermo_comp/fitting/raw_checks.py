@@ -27,8 +27,9 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
         yield Finding(
             'prior',
             'refusal',
-            f'the prior is the calibration of unit {prior.unit.serial}, the bags are of {serial}: '
-            'make a prior of their type from three units or more with thermo_comp prior',
+            f'the prior is the calibration of unit {prior.unit.serial}, the bags are of unit '
+            f'{serial}: make a prior of their type from the calibrations of three units or more '
+            'with thermo_comp prior',
         )
 
 
@@ -67,7 +68,10 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             'handling in the other time was cut out',
         )
     if not any(interval.sample_sd.any() for bag in bags for interval in bag.intervals):
-        text = 'at rest all samples are equal: does the sensor repeat one reading?'
+        text = (
+            'at rest all samples are equal, without any noise: does the driver repeat '
+            'one reading, or is the resolution of the sensor too coarse?'
+        )
         yield advice('stuck', text)
     if dead := list(_dead_axes(bags)):
         text = '; '.join(axis.text for axis in dead)
@@ -105,7 +109,7 @@ def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
         celsius = np.concatenate(read)
         if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
             reads = f'temperature/{name} reads {np.min(celsius):.4g} .. {np.max(celsius):.4g} degC'
-            yield advice('kelvins', f'{reads}: that looks like kelvins')
+            yield advice('kelvins', f'{reads}: that looks like kelvins; record degC')
 
 
 def _judge_units(

@@ -167,7 +167,8 @@ class _Pass:
         for name, n in n_impossible.items():
             if n > len(self.temperatures[name].value):
                 raise FitError(
-                    f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC'
+                    f'{source.name}: {n} readings of {name} are beyond {HOTTEST:g} degC: is the '
+                    'topic a temperature in degC?'
                 )
 
 
@@ -235,6 +236,8 @@ def _reduced(
     restless = reading.causes.cause(cells, still_sd)
     if not ranges and not restless:
         restless = f'no still interval: {_why_restless(cells, reading.n_samples, still_sd)}'
+        if min_rest_s is not None:
+            restless += f'; --min-rest accepts rests of {min_rest_s:g} s or more only'
     per_window = max(1, round(window_s / cells.cell_s)) if cells.cell_s else 1
     sizes = [min(per_window, max(1, (b - a) // fewest_windows)) for a, b in ranges]
     bag = ReducedBag(
@@ -333,7 +336,7 @@ def _max_abs(cells: Cells) -> float:
 def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
     if 2 * cells.n_saturated > n_samples:
         share = 100.0 * cells.n_saturated / n_samples
-        return f'{share:.0f} % of its samples are at the full scale, see --full-scale'
+        return f'{share:.0f} % of its samples are at the full scale: is --full-scale right?'
     return stillness.why_restless(cells, still_sd)
 
 

@@ -236,7 +236,10 @@ def thermal_windows(
                 rests.append((bag, interval))
                 numbers.append(number)
         if not rests or rests[-1][0] is not bag:
-            raise FitError(f'{bag.source.name}: no temperatures during its rests: two clocks?')
+            raise FitError(
+                f'{bag.source.name}: no temperatures during its rests: are the stamps of '
+                'thermometer and accelerometer of two clocks?'
+            )
     sizes = [len(part.time) for part in parts]
     rows = _Rows(*(np.concatenate(values) for values in zip(*parts, strict=True)))
     position, bag_of = np.repeat(np.arange(len(parts)), sizes), np.repeat(numbers, sizes)

@@ -21,6 +21,7 @@ from .. import files
 from ..errors import FitError, ThermoCompError
 from ..fitting.population import UNITS_NEEDED, population
 from ..judging.verdicts import Verdict
+from ..text import counted
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import load_calibration, save_calibration
 from .summary import Summary, summarise
@@ -155,7 +156,10 @@ def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, 
     tests = sorted((row for row in rows if _in_prior(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
-        return None, f'{len(latest)} units with complete data, {UNITS_NEEDED} are needed'
+        return None, (
+            f'{counted(len(latest), "unit")} with a valid calibration from complete data, '
+            f'{UNITS_NEEDED} are needed'
+        )
     units = [load_calibration(results.folder_of(name) / CALIBRATION) for name in latest.values()]
     try:
         prior = population(sorted(units, key=lambda unit: unit.unit.serial))

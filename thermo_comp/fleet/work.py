@@ -119,7 +119,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         if len(serials) > 1:
             raise FitError(f'the bags are of different units: {", ".join(serials)}')
         if not bags:
-            raise ThermoCompError('none of its bags can be used')
+            raise ThermoCompError('none of the bags of this test can be used')
         kinds = {_UNIT_OF[bag.info.input]: name for name, bag in bags.items()}
         if len(kinds) > 1:
             contents = ', '.join(f'{name} holds {kind}' for kind, name in sorted(kinds.items()))
@@ -252,7 +252,7 @@ def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
         return result
     error = future.exception() if future.status == 'error' else None
     if error is None:
-        problem = 'the scheduler was lost'
+        problem = 'the connection to the Dask scheduler was lost'
     elif isinstance(error, KilledWorker):
         n_died = error.allowed_failures + 1
         problem = f'the worker of its task died {n_died} times: too little memory?'

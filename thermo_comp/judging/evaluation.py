@@ -82,7 +82,11 @@ def open_bags(
                 raise RecordingError(f'is {twin} once more (same content): give it once', path)
         bag = reduce_source(source, window_s=sum_length(window_s), **(usual | known))
         if 'board' in require and not len(bag.board.value):
-            raise RecordingError('no board temperature in it', path=str(path))
+            raise RecordingError(
+                'no reading of the board temperature, which the calibration needs: name the topic '
+                'with --topic board=TOPIC',
+                path=str(path),
+            )
         bags.append(bag)
     return joined(bags)
 
@@ -139,7 +143,8 @@ def evaluate(
         )
         if judgement is None:
             raise RecordingError(
-                f'no window of {window_s:g} s at rest was corrected: nothing to judge',
+                f'no window of {window_s:g} s at rest was corrected: nothing to judge; rests '
+                'longer than a window (--window), with temperatures, are needed',
                 path=', '.join(map(str, paths)),
             )
         judgements[name] = judgement

@@ -170,7 +170,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
             np.ravel([each_set.temperature_range_c for each_set in sets]),
             np.ravel([each_set.rate_range_k_min for each_set in sets]),
         )
-        text = f'all {_windows(outside.n, windows)} lie there, at {judged}; calibrated at {known}'
+        text = f'{_windows(outside.n, windows)}, all outside, at {judged}; calibrated at {known}'
         return Verdict.OUTSIDE, f'{text}; {_numbers(outside)}'
     worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
@@ -195,9 +195,13 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
         where = 'on positions left out' if worst == left_out else 'in the worse regime'
         parts.append(f'{ug_text(worst)} {where}, {ug_text(tolerance)} tolerated')
     elif claims:
-        parts.append(f'largest ratio of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}')
+        parts.append(
+            f'largest RMS / claimed of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}'
+        )
     else:
-        parts.append('the calibration states no uncertainty: give a tolerance')
+        parts.append(
+            'the calibration states no uncertainty: give the largest RMS with --tolerance'
+        )
     if kind is Verdict.SWAPPED:
         parts.insert(0, SWAPPED)
     if judgement.moved:

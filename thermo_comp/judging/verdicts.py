@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..text import counted
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration, rate_triad
 from ..unit.correction import Correction
@@ -190,16 +191,16 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
 def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict, str]:
     total, outside = sections['all'], sections['outside']
     if not total.n:
-        return Verdict.OUTSIDE, f'{outside.n} windows of {window_s:g} s lie there'
+        return Verdict.OUTSIDE, f'{counted(outside.n, "window")} of {window_s:g} s, all outside'
     text = f'{_mdeg(total.rms)} RMS of its changes at rest, {_mdeg(total.raw_rms)} raw'
-    over = f'over {total.n} windows of {window_s:g} s'
+    over = f'over {counted(total.n, "window")} of {window_s:g} s'
     if not claims:
         kind = Verdict.NO_BETTER if total.rms > total.raw_rms else Verdict.NO_CLAIM
         return kind, f'{text} {over}; the calibration states no uncertainty'
     ratio = sections.worst_ratio
     text = (
         f'{text}, {_mdeg(total.claimed_rms)} claimed {over}; '
-        f'largest ratio of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
+        f'largest RMS / claimed of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
     # At constant temperature the correction is constant, so a residual as large as the raw
     # residual is not a fault.

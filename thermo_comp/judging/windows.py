@@ -209,7 +209,7 @@ def _table(
         if abs(per * bag.window_s - window_s) > 1e-6 * window_s:
             raise RecordingError(
                 f'its samples are too slow for windows of {window_s:g} s: {bag.window_s:g} s or '
-                'a multiple of it are needed',
+                'a multiple of it are needed (--window)',
                 path=bag.source.name,
             )
         sums: list[_Table] = [np.zeros(0, kind)]

@@ -297,7 +297,10 @@ def clocks_apart(block: Block) -> str:
         edges = block.accel_stamp_ns[after - 1], block.accel_stamp_ns[after]
         apart_s = (stamp_ns - np.clip(stamp_ns, *edges)) * 1e-9
         if len(apart_s) >= _FEWEST_READINGS and abs(middle := np.median(apart_s)) > _APART_S:
-            return f'{name} is stamped {middle:+.0f} s from the samples around it: two clocks?'
+            return (
+                f'{name} is stamped {middle:+.0f} s from the samples around it: are the stamps of '
+                'thermometer and accelerometer of two clocks?'
+            )
     return ''
 
 

@@ -77,11 +77,13 @@ def thermal_findings(
         span = board.highest - board.lowest
         if span < ADVISED_SPAN_K:
             findings.append(
-                f'board temperature spans {span:.1f} K: {ADVISED_SPAN_K:g} are advised'
+                f'board temperature spans {span:.1f} K: {ADVISED_SPAN_K:g} K or more are advised'
             )
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
-                findings.append(f'no {name} ramp: the dynamic set would be extrapolated to {name}')
+                findings.append(
+                    f'no {name} ramp: record one, else the correction in it is extrapolated'
+                )
     for name, thermometer in thermometers.items():
         reads = f'{name} reads {thermometer.lowest:.4g} .. {thermometer.highest:.4g}'
         if thermometer.lowest < COLDEST or thermometer.highest > HOTTEST:
@@ -145,7 +147,7 @@ def survey_recording(
     thermometers = {name: survey for name, survey in surveys if survey is not None}
     findings = [
         (info.truncated, f'cut off: {info.truncated}'),
-        (reader.apart, 'a fit needs one clock for all'),
+        (reader.apart, 'a fit needs one clock for the stamps of all topics'),
         (not n, _NO_SAMPLES),
         *((True, finding) for finding in thermal_findings(thermometers, candidates)),
         (cause, cause),
@@ -153,13 +155,20 @@ def survey_recording(
             n and not still and not cause,
             f'the unit never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
         ),
-        (clock.n_backwards, f'{clock.n_backwards} stamps do not rise: those samples are left out'),
+        (
+            clock.n_backwards,
+            f'stamps not later than that of the sample before: {clock.n_backwards}; those samples '
+            'are left out',
+        ),
         (
             clock.n_restarts,
             f'the time goes back by more than an hour ({clock.n_restarts} times): a fit takes it '
             'for a pause of an hour',
         ),
-        (clock.n_gaps, f'{clock.n_gaps} gaps, the longest {clock.longest_gap_s:.3g} s'),
+        (
+            clock.n_gaps,
+            f'gaps between samples: {clock.n_gaps}, the longest {clock.longest_gap_s:.3g} s',
+        ),
     ]
     duration_s = (clock.last_ns - clock.first_ns) * 1e-9
     # The first and the last cell may extend beyond the samples: limit the time at rest.

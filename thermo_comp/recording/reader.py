@@ -231,8 +231,9 @@ class RecordingReader(ExitStack):
                 yield left
         if not n_kept and first_ns < inf:
             raise RecordingError(
-                f'no sample is in {self._part}: they are stamped from {first_ns * 1e-9:.3f} '
-                f'to {last_ns * 1e-9:.3f}, which is {(last_ns - first_ns) * 1e-9:.1f} s',
+                f'no sample is in {self._part} (--from, --to): the samples are stamped from '
+                f'{first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s, which is '
+                f'{(last_ns - first_ns) * 1e-9:.1f} s',
                 self.info.path,
             )
 

@@ -354,8 +354,9 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     edges = np.diff(np.r_[0, (full & under).astype(np.int8), 0])
     runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
     longest_s = float(np.max(runs, initial=0)) * cells.cell_s
+    longest = f'{longest_s:.3g}' if longest_s < 999.5 else f'{longest_s:.0f}'
     return (
-        f'it is quiet for {longest_s:.3g} s at most, as if worn or driven: the unit must rest in '
+        f'it is quiet for {longest} s at most, as if worn or driven: the unit must rest in '
         'each position'
     )
 

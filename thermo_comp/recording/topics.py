@@ -31,7 +31,9 @@ _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 #: Names of further thermometers; the names of roles are reserved.
 _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
 #: Message for a topic used for two inputs, offline and live.
-TWINS = 'one topic for both {} and {}: a single thermometer is the board, leave the other out'
+TWINS = (
+    'one topic for both {} and {}: a single thermometer is the board, leave the other input out'
+)
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
@@ -51,11 +53,17 @@ class Part:
     def __post_init__(self) -> None:
         limits = [limit for limit in (self.begin, self.end) if limit is not None]
         if not all(isfinite(limit) and limit >= 0.0 for limit in limits):
-            raise ValueError('the part of a bag must begin and end at 0 or a positive time')
+            raise ValueError('the part of a bag must begin and end at 0 s or a positive time')
         if len({limit >= _FIRST_STAMP_S for limit in limits}) > 1:
-            raise ValueError("give both times from the bag's first sample, or both as stamps")
+            raise ValueError(
+                "give both times in seconds from the bag's first sample, or both as stamps "
+                '(seconds since 1970)'
+            )
         if len(limits) == 2 and not limits[0] < limits[1]:
-            raise ValueError(f'the part of a bag must end after {limits[0]:g}, got {limits[1]:g}')
+            raise ValueError(
+                f'the part of a bag must end after its begin {limits[0]:.12g} s, '
+                f'got {limits[1]:.12g} s'
+            )
 
     @property
     def is_stamped(self) -> bool:
@@ -142,7 +150,7 @@ def read_names(path: str | Path) -> dict[str, str]:
     """Read a YAML file of topics by input, as in config/drivers."""
     names = read_plain_yaml(path)
     if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
-        raise ThermoCompError('expected lines of INPUT: TOPIC', path)
+        raise ThermoCompError('expected lines of INPUT: TOPIC, as board: /imu/temperature', path)
     return names
 
 
@@ -355,6 +363,8 @@ def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -
         listed += f' and {len(present) - len(names)} more'
     if corrected and not {'counts', 'imu'}.isdisjoint(wanted):
         listed += f'; {_text_of_corrected(corrected)}'
+    if wanted.keys() == {'imu'} and any(is_called(name, _USUAL.counts) for name in present):
+        listed += '; an Imu in m/s^2 is wanted, by the calibration or --input, not counts'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',

@@ -268,7 +268,7 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
     """List the reservations about a calibration, except the advice to record more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     notes = [
-        f'the bags hold no {name}: the dynamic set is extrapolated to {name}'
+        f'the bags hold no {name} ramp: the correction in such ramps is extrapolated'
         for name, rate in (('heating', upper), ('cooling', -lower))
         if rate < _SLOWEST_RAMP_K_MIN
     ]

@@ -42,7 +42,7 @@ GRAVITY_SIGMAS = 5.0
 _ERROR, _WARN = DiagnosticStatus.ERROR[0], DiagnosticStatus.WARN[0]
 _DIRECTIONS = {-1: 'cooling', 0: 'none', 1: 'heating'}
 
-#: Level and text of a counter that has risen; the text follows the number.
+#: Level and text of a counter that has risen; the number follows the text.
 _RISEN = {
     'n_contested': (_ERROR, 'messages of more than one publisher, dropped'),
     'n_failures': (_ERROR, 'callbacks failed, see the log of the node'),
@@ -55,7 +55,7 @@ _RISEN = {
     'n_time_jumps': (_WARN, 'jumps of time backwards, estimators reset'),
     'n_lost': (_WARN, 'samples lost on the way to the node'),
     'n_malformed': (_WARN, 'messages unreadable, dropped'),
-    'n_unpublished': (_WARN, 'messages not accepted by DDS'),
+    'n_unpublished': (_WARN, 'output messages not accepted by DDS'),
 }
 
 _FAULTS = {
@@ -302,7 +302,7 @@ def findings_of(
         yield _WARN, f'board temperature {status.board_age_s:.1f} s old, held'
     for name, (level, text) in _RISEN.items():
         if new[name]:
-            yield level, f'{new[name]} {text.format(full_scale=unit.full_scale)}'
+            yield level, f'{text.format(full_scale=unit.full_scale)}: {new[name]}'
     for name, (fault, step) in status.faults.items():
         if fault in _FAULTS:
             yield _WARN, f'{name} temperature {_FAULTS[fault].format(step)}'

@@ -177,7 +177,10 @@ class Player:
         is_done = partial(publisher.wait_for_all_acked, Duration())
         if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
             name = publisher.topic_name
-            raise ThermoCompError(f'{name}: a subscriber acknowledged nothing for {PATIENCE:g} s')
+            raise ThermoCompError(
+                f'{name}: a subscriber acknowledged nothing for {PATIENCE:g} s; restart the '
+                'subscriber, or let it subscribe with best effort'
+            )
 
 
 def _in_order(block: Block) -> list[tuple[float, int, Role, bytes]]:

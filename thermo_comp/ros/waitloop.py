@@ -337,7 +337,7 @@ def _opened(create: Callable[..., Any], message_type: Any, topic: str, qos: QoSP
         # rclpy writes the overrides into the profile: give it a copy.
         return create(message_type, topic, qos_profile=copy(qos), qos_overriding_options=policies)
     except (RuntimeError, ValueError, ParameterException, InvalidQosOverridesError) as error:
-        raise ThermoCompError(f'a topic cannot be opened: {error}') from error
+        raise ThermoCompError(f'the topic {topic} cannot be opened: {error}') from error
 
 
 def _take_message(subscription: Subscription) -> bool:

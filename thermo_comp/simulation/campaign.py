@@ -100,8 +100,9 @@ def parse_cyclogram(text: str) -> Cyclogram:
         is_first = not temperature
         if match is None or (match['rate'] and (is_first or float(match['rate']) == 0.0)):
             raise ValueError(
-                f"cyclogram step {number} '{raw}' must read TARGET[@RATE] [SOAK], "
-                "e.g. '35@0.5 90min' (the first step without a rate)"
+                f"cyclogram step {number} '{raw}' must read TARGET[@RATE] [SOAK] in degC, K/min "
+                "and h, min or s, e.g. '35@0.5 90min' (the first step without a rate); or the "
+                f'cyclogram is one of {", ".join(_PROGRAMS)}'
             )
         target, rate = float(match['target']), float(match['rate'] or rate)
         if is_first:

@@ -160,7 +160,8 @@ class ThermalResponse:
             if watts[0] < 0.0 or watts[1] > heat.max_power:
                 raise ValueError(
                     f'air of {air.min():g}..{air.max():g} degC needs {watts[0]:.2f}..'
-                    f'{watts[1]:.2f} W of a thermostat that gives 0..{heat.max_power:g} W'
+                    f'{watts[1]:.2f} W of the thermostat of the unit, which gives 0..'
+                    f'{heat.max_power:g} W: choose other temperatures'
                 )
         A, b, p = network.system()
         drive = np.tile(p, (len(self._time) - 1, 1))

@@ -138,7 +138,10 @@ def simulate_blocks(
     duration = cyclogram.duration_s
     n_cycles = math.floor(duration * rate_hz * (1.0 + 1e-12))
     if n_cycles < 1:
-        raise ValueError(f'the program of {duration} s is shorter than one cycle')
+        raise ValueError(
+            f'the program of {duration:g} s is shorter than one conversion cycle of '
+            f'{1.0 / rate_hz:g} s'
+        )
     direction = np.asarray(up, dtype=float)
     # Only a load that switches at random times makes the temperatures random.
     truth = _thermal_truth(unit, cyclogram, seed if unit.load else 0)

@@ -66,7 +66,7 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
         advice = 'the file is of a newer release; update thermo_comp'
         if version < FORMAT_VERSION:
             advice = 'fit the bags again'
-        message = f'`format_version` must be {FORMAT_VERSION}, got {version}: {advice}'
+        message = f'must be {FORMAT_VERSION}, got {version}: {advice}'
         raise CalibrationError(message, path, 'format_version', rule)
     _rename(data)
     try:

@@ -120,7 +120,9 @@ def _object(cls: type, data: Any, key: str) -> Any:
     # A misspelt key is both an unknown and a missing key; the unknown key is reported.
     for name in data:
         if name not in hints:
-            raise SchemaError(_joined(key, _shown_name(name)), 'unknown key')
+            others = ', '.join(other for other in hints if other not in data)
+            expected = f', expected one of {others}' if others else ''
+            raise SchemaError(_joined(key, _shown_name(name)), f'unknown key{expected}')
     for name in required:
         if name not in data:
             raise SchemaError(_joined(key, name), 'this key is missing')
