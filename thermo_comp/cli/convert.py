@@ -220,7 +220,7 @@ def import_(
     output: Path = options.NEW_CALIBRATION,
     serial: str = option('Serial of the unit.', ..., callback=options.check_serial),
     number: int | None = option('Number of the set of parameters (TC_A0, INS_TCAL1, imu0).'),
-    gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
+    gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY, min=9.01, max=10.49),
     rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
     full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),
     noise_ug: float = option(

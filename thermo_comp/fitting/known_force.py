@@ -9,6 +9,7 @@ Owns the known |f| of a bag that is not at 1 g, from the user or from the bag's 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -28,6 +29,8 @@ from ..unit.gravity import parse_acceleration
 #: Keys of a bag's metadata about |f|.
 MAGNITUDE, ROTATION = 'specific_force_magnitude_m_s2', 'rotation_topic'
 RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
+# The name of a bag, such as 01.mcap or run_*; a number with its unit, such as 10s, is no name.
+_NAME = re.compile(r'[A-Za-z_*?]{2}|[*]')
 
 
 class Section(NamedTuple):
@@ -120,6 +123,8 @@ class ForceOptions:
     def __post_init__(self) -> None:
         if self.rotation is not None and (self.radius is None or self.magnitude is not None):
             raise ValueError('`rotation` needs `radius`, and excludes `specific_force`')
+        if self.rotation is None and (self.radius, self.radius_sd) != (None, None):
+            raise ValueError('`radius` and `radius_sd` are given without `rotation`')
 
 
 #: The options without any entry: the bags' metadata about |f| apply.
@@ -212,7 +217,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     mine: list[str] = []
     for line in content.splitlines():
         first, _, rest = line.strip().replace(',', ' ').partition(' ')
-        if not first or first[0] in '#.' or first[0].isdigit():
+        if not first or first[0] == '#' or not _NAME.search(first):
             mine.append(line)
         elif fnmatch(path.name, first):
             mine.append(rest)
