@@ -138,7 +138,7 @@ def _leaning(force: np.ndarray) -> np.ndarray:
 
 
 def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
-    """Let the clock jump in the middle, or periodically."""
+    """Let the clock jump in the middle of the recording, or after every `every` messages."""
 
     def change(stamp_ns: np.ndarray) -> np.ndarray:
         row = np.arange(len(stamp_ns))

@@ -10,11 +10,12 @@ temperatures at 10 Hz, and a sink process receives the Imu messages. Between sou
 either the node, with everything on, or the naive relay: an rclpy node that copies Vector3Stamped
 to Imu in a callback. The CPU time is that of all threads of the relay process, from the first
 sample to the last. The latency is the time from the source's publish call to the arrival in the
-sink's middleware, before any Python of the sink. Ratios hold on other machines, times do not. The
-node uses its profile for Fast DDS; source, sink and naive relay use the default profile. At the
-last rate the node is measured once more while its `calibration_file` is set twice a second.
-`--core` binds each relay to a core. `--floor` measures a third relay, too, which copies bytes with
-one wait set, one subscription and the node's profile, and computes nothing.
+sink's middleware, before any Python of the sink. Ratios of the node to the naive relay hold on
+other machines, times do not. The node uses its profile for Fast DDS; source, sink and naive relay
+use the default profile. At the last rate the node is measured once more while its
+`calibration_file` is set twice a second. `--core` binds each relay to a core. `--floor` measures
+a third relay, too, which copies bytes with one wait set, one subscription and the node's profile,
+and computes nothing.
 
 The source keeps `--depth` samples to send lost samples again. With a reliable relay Fast DDS
 removes samples from the source's store 859 at a time; with 2000 kept samples the removal delays

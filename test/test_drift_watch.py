@@ -38,7 +38,7 @@ def test_the_first_passage_follows_the_reflection_principle():
     ):
         s = np.sqrt(rate * days)
         inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
-        # At the median a share of 2000 simulated walks has a standard error of 0.011.
+        # A share of about 0.5 of 2000 simulated walks has a standard error of 0.011.
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.025)
         stays = 2.0 * (-1.0) ** (n + 1) @ np.exp(-((n * np.pi) ** 2) * rate * of_ball / 5000.0)
         assert stays == pytest.approx(1.0 - probability, abs=0.025)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a split recording: the fit and the judge take them as the whole recording."""
+"""The fit and the judge treat the parts of a split recording as the whole recording."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -72,7 +72,7 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     whole = recorded(rng, 600.0)
     (bag,) = reduced([whole])
     (rest,) = bag.intervals
-    # The order in which the parts are given does not matter.
+    # The order in which the parts of a recording are given does not matter.
     (again,) = joined(reduced(cut(whole, edges_s))[::-1])
     (continued,) = again.intervals
     assert (again.start_ns, again.end_ns) == (bag.start_ns, bag.end_ns)
@@ -83,11 +83,11 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     for name in ('board', 'case'):
         np.testing.assert_array_equal(getattr(again, name).stamp_ns, getattr(bag, name).stamp_ns)
         np.testing.assert_array_equal(getattr(again, name).value, getattr(bag, name).value)
-    # At the end of each part less than a window of 10 s is lost, and one window has few samples.
+    # Less than one window of 10 s is lost where a part of the recording ends and the next begins.
     n_lost = rest.count.sum() - continued.count.sum()
     assert 0.0 <= n_lost <= 10.0 * RATE_HZ * len(edges_s)
     assert np.all(np.diff(continued.time) > 0.0)
-    # Each window is on the line of the drift, within five sd of its own noise.
+    # Each window's mean is on the line of the drift, within five sd of the mean's noise.
     line = LEVEL + np.outer(continued.time, DRIFT)
     sd = NOISE / np.sqrt(continued.count)[:, None]
     assert np.abs((continued.mean - line) / sd).max() < 5.0
@@ -106,11 +106,11 @@ def test_a_unit_that_was_moved_between_two_parts_has_two_rests(rng):
 def test_other_recordings_are_not_joined(rng):
     whole = recorded(rng, 400.0)
     assert len(joined(reduced(cut(whole, (200.0,), pause_s=1.0)))) == 1
-    # Within 60 s a unit may have been switched off and on.
+    # In a pause of 60 s between two parts the unit may have been switched off and on.
     assert len(joined(reduced(cut(whole, (200.0,), pause_s=60.0)))) == 2
     known = KnownForce('part', parse_sections('0 400 2.0'))
     assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
-    # Of two recordings with the same stamps each is continued by its own part.
+    # Two recordings with the same stamps are each joined with their own second part.
     other = replace(whole, accel=-whole.accel)
     parts = [*cut(whole, (200.0,)), *cut(other, (200.0,))[::-1]]
     first, second = joined(reduced(parts))
@@ -131,7 +131,7 @@ def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
 
 @pytest.fixture(scope='module')
 def tests():
-    """Two of the sample bags, and each of them cut into parts of half an hour."""
+    """Read two sample bags; return both whole, and both cut into parts of half an hour."""
     columns = [thermo_comp.read(ROOT / f'bags/fit/0{number}.mcap') for number in (1, 5)]
     parts = []
     for whole in columns:
@@ -152,8 +152,9 @@ def tests():
 
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording(tests):
-    # WHY: each part had its own turn-on, rests and initial lag states. Eighteen recordings of 9 h,
-    # split hourly, took 30 times as long to fit, and the claimed sd was 6 times as large.
+    # WHY: each part of a split recording had its own turn-on, rests and initial lag states.
+    # Eighteen recordings of 9 h, split hourly, took 30 times as long to fit as the whole
+    # recordings, and the claimed sd was 6 times that of the whole recordings.
     columns, parts = tests
     whole, split = (thermo_comp.fit(bags, gravity=9.80665) for bags in tests)
     assert len(split.provenance.sources) == len(parts)
@@ -163,8 +164,8 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording(tests):
             for unit in (whole, split)
         ]
         difference = forces[1] - forces[0]
-        # Half a minute is lost at the end of each part: the drifts differ by less than the noise
-        # of a mean over a minute, 1.2 ug.
+        # Half a minute of samples is lost at the end of each part: the drifts of the corrected
+        # forces differ by less than the noise of a mean over a minute, 1.2 ug.
         assert np.nanstd(difference, axis=0).max() < 1.2 * MICRO_G
 
 

@@ -26,7 +26,7 @@ from thermo_comp.unit.posterior import Posterior
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: The groups of the unit's physics have a third of all columns, and fit in half the time of all.
+#: The groups of the unit's physics: a third of all columns, fitted in half the time of all groups.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 

@@ -194,7 +194,7 @@ def test_bare_quartz_has_the_published_slopes(seed):
     board = np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5])
     bias, scale = _static(unit, board)
     cold, hot = (scale[1] - scale[0]) * 1e6, (scale[6] - scale[5]) * 1e6
-    # Specimens scatter by 1 % of the slope about the published values.
+    # The slopes of simulated units scatter by 1 % about the published slopes.
     np.testing.assert_allclose(cold, 68.0, atol=1.5)
     np.testing.assert_allclose(hot, 87.0, atol=1.5)
     curvature = 2.0 * (scale[4] + scale[2] - 2.0 * scale[3]) * 1e6

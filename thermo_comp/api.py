@@ -225,8 +225,8 @@ def fit(
     Returns
     -------
     Calibration
-        Calibration of the unit; `thermo_comp.save` writes its file, its method `correct` applies
-        it.
+        Calibration of the unit; `thermo_comp.save` writes the calibration to a file, its method
+        `correct` corrects samples.
 
     Raises
     ------

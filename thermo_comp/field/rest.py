@@ -3,10 +3,10 @@
 """
 Owns the record of a rest, one line of text with a checksum, and the thinning of rest logs.
 
-A rest log is a folder of files, one per day (UTC). Each line is a CRC-32 in hexadecimal, a blank,
-and JSON. A JSON object describes a start of the node, a JSON list a window at rest since the last
-start. Lines with a wrong checksum are skipped, because a killed process, a power failure or a full
-disk damages only the line that is being written.
+A rest log is a folder of files, one per day (UTC). Each line of a rest log is a CRC-32 in
+hexadecimal, a blank, and JSON. A JSON object describes a start of the node, a JSON list a window
+at rest since the last start. Lines with a wrong checksum are skipped, because a killed process, a
+power failure or a full disk damages only the line that is being written.
 """
 
 import json

@@ -267,7 +267,7 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the indices of the elements of the state, and of the lags, of `wanted` in a log."""
+    """Return the indices of the state elements, and of the lags, of `wanted` within `memory`."""
     try:
         logged, target = Layout(memory).numbers, Layout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)

@@ -152,11 +152,11 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 def best_rests(candidates: list[Floats]) -> int:
     """
-    Return the best of several sets of rests, each given as mean readings of shape (n, 3).
+    Return the index of the best of several sets of rests, each of mean readings, shape (n, 3).
 
-    The best set has the smallest sd of the constants, from the residuals of |f| and the directions
-    of its rests. The first set within 2 % of the smallest sd is taken: earlier sets have stricter
-    thresholds; if no set has six attitudes, the first set of all is taken.
+    The residuals of |f| and the directions of a set's rests give the sd of the constants. The best
+    set is the first whose sd of the constants is within 2 % of the smallest sd, as earlier sets
+    have stricter thresholds. If no set of rests has six attitudes, the best set is the first set.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
     counts = [len(distinct_directions(up)) for up in ups]

@@ -3,7 +3,7 @@
 """
 Owns the joining of bags that are successive parts of one recording, which a recorder split.
 
-The unit stays switched on from one part to the next, so the parts share a turn-on, the lags
+The unit stays switched on between the parts of a recording, so the parts share a turn-on, the lags
 continue, and a rest in which a part ends continues in the next part.
 """
 
@@ -21,19 +21,19 @@ from .sources import FitSource
 
 #: Longest gap between two parts of one recording [s]; switching a unit off and on takes longer.
 CONTINUED_S = 3.0
-#: Number of windows before and after the end of a part that are compared with the step between.
+#: Number of windows before and after the end of a part that show the usual step between windows.
 _N_COMPARED = 20
-#: Largest relative difference of the intervals between samples, or of the windows, of two parts.
+#: Largest relative difference between two parts of the sample interval, and of the window length.
 _SAME_INTERVAL = 0.01
 
 
 def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
-    """Join each bag that begins where another bag ends with that bag; keep the order."""
+    """Join each bag to the bag at whose end it begins; keep the order of the given bags."""
     recordings: list[list[ReducedBag]] = []
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # Simulated recordings may have the same stamps: the parts have the nearest readings.
+            # Simulated recordings may have equal stamps: join the part with the nearest readings.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -43,10 +43,10 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
 
 
 def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
-    """Whether a bag is the next part of a recording."""
+    """Whether a bag is the part of a recording that follows `part`."""
     gap_s = 1e-9 * (bag.start_ns - part.end_ns)
     is_alike = _is_alike(part.cycle_s, bag.cycle_s)
-    # Sections of known |f| are stated from the start of their own bag.
+    # Times of sections of known |f| count from the start of a bag: such a bag is not joined.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
     is_next = abs(gap_s) < max(CONTINUED_S, 2.0 * bag.cycle_s)
@@ -55,8 +55,8 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
 
 def _step(part: ReducedBag, bag: ReducedBag) -> float:
     """
-    Return the change of the readings from the last window of a part to the first of a bag; 0 if
-    one of them has no rest.
+    Return the change of the readings from the last window of a part to the first window of a bag;
+    0 if the part or the bag has no rest.
     """
     if not (part.intervals and bag.intervals):
         return 0.0
@@ -68,7 +68,7 @@ def _is_alike(before_s: float, after_s: float) -> bool:
 
 
 def _whole(parts: Sequence[ReducedBag]) -> ReducedBag:
-    """Return the recording of successive parts."""
+    """Return the recording that consists of successive parts, as one bag."""
     first, last = parts[0], parts[-1]
     sources = [part.source for part in parts]
 
@@ -114,7 +114,7 @@ def _whole(parts: Sequence[ReducedBag]) -> ReducedBag:
 
 
 def _readings(parts: Sequence[Readings]) -> Readings:
-    """Concatenate the readings of a thermometer; keep readings with rising stamps."""
+    """Join the readings of a thermometer in successive parts; keep those with rising stamps."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     value = np.concatenate([part.value for part in parts])
     newest = np.maximum.accumulate(stamp_ns)
@@ -129,7 +129,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = _is_alike(parts[0].window_s, part.window_s)
         for number, rest in enumerate(part.intervals):
-            # Windows of a part that is so short that its windows are shorter are not whole.
+            # Windows shorter than those of the first part, as in a short part, are not whole.
             n_whole = rest.n_whole if is_alike else 0
             moved = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0
@@ -142,9 +142,9 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
-    Whether a rest continues in the next part: at most three windows are missing, and the step
-    between the parts is at most five RMS of the steps from window to window, or, where most steps
-    are 0 by rounding, at most twice the largest of these steps.
+    Whether a rest continues in the next part: the gap is at most three windows long, and the step
+    of each axis between the parts is at most five times the RMS step from window to window or, as
+    most steps may be 0 by rounding, at most twice the largest step from window to window.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-_N_COMPARED:], after.mean[:_N_COMPARED]
@@ -156,7 +156,7 @@ def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -
 
 
 def _continued(before: StillInterval, after: StillInterval) -> StillInterval:
-    """Join two parts of a rest; a last window of less than full length before the end is lost."""
+    """Join two parts of a rest; drop an incomplete window between windows of full length."""
     is_whole = after.n_whole > 0 and len(before.time) <= before.n_whole + 1
     use = slice(before.n_whole if is_whole else None)
     rates = before.angular_rate, after.angular_rate

@@ -268,7 +268,7 @@ def _is_determined(by_others: float, by_all: float) -> bool:
 
 
 def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
-    """Whether a fit without the position of `rows` determines its drift, given its `root`."""
+    """Whether a fit without a position determines its drift in `rows`; `root`: see `Posterior`."""
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True

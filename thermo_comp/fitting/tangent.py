@@ -40,10 +40,10 @@ class Tangent:
     """
     The equations linearised about a state, as coefficients of the base series at this state.
 
-    Most derivatives are one base series times a factor; the other derivatives are one of a few
-    combinations of base series. The derivative of axis i in position p by unknown u is ``factor[p,
-    i, u]`` times the series ``place[u]``, in the order base series, combinations. An axis has the
-    unknowns of the position (2 of the attitude, stretch, offset, tilts), then those of the bag
+    The derivative of the readings by an unknown is a factor times one base series or one of a few
+    combinations of base series. For axis i, position p and unknown u it is ``factor[p, i, u]``
+    times the series ``place[u]``, in the order base series, combinations. An axis has the unknowns
+    of the position (2 of the attitude, stretch, offset, tilts), then those of the bag
     (initial lag states, turn-on offset), then those of the unit (kappa, bias, weights, nonlinear
     coefficients, radius, 3 of the misalignment, 2 of each pose). The last "unknown" is the
     residual, measured minus predicted.

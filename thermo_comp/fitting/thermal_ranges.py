@@ -29,7 +29,7 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
     """
     Return the valid range of a quantity that is a power (`order`) of a heat flow: the range of its
     values with a margin, extended to ramps twice as fast, since the response to a heat flow is
-    linear. A quantity of order 0 is a temperature and valid only within the data.
+    linear. The range of a temperature (order 0) is not extended to faster ramps.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))

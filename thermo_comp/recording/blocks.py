@@ -35,8 +35,8 @@ _JUMP_NS = 10**9  # a larger backward step of the stamps is a jump of time [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # a longer jump of the stamps is shortened to this [ns]
 #: Largest number of jumps in a recording with a valid clock.
 _MOST_JUMPS = 100
-# Thermometer and accelerometer are on different clocks if at least this many readings have a
-# median stamp offset above this [s].
+# Smallest number of readings, and smallest median of their time from the samples around them [s],
+# that show a thermometer on another clock than the accelerometer.
 _FEWEST_READINGS, _APART_S = 10, 10.0
 #: An unchanged reading is kept after this time [ns], so that the sensor does not seem lost.
 _REPEAT_NS = 10_000_000_000

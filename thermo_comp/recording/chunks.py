@@ -43,7 +43,7 @@ MESSAGE = int(Opcode.MESSAGE)
 _ENDS_EARLY = 'a record ends too early'
 _ZERO_OPCODE = 'a record has the opcode 0'
 MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
-#: Largest ratio of decompression of a file, checked above this size [bytes].
+#: A file may expand to `_MAX_GROWTH` times its size plus `_FREE_GROWTH_BYTES` [bytes].
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27

@@ -150,7 +150,7 @@ _BASE, _NAME, _ARRAY = (
     1,
     2,
     3,
-)  # node kinds of a description: basic type, message, array, sequence
+)  # kinds of a field's description in `rosbags`: basic type, message, array, sequence
 
 
 class _Cursor:

@@ -6,7 +6,7 @@ Owns the conversion of serialized samples to serialized Imu messages, without rc
 Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR: 4
 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with its
 final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation, float64
-values. A message in any other form is first converted to the plain form by rclpy.
+values. rclpy first rewrites a message that is not in the plain form, as a big-endian message.
 """
 
 import struct

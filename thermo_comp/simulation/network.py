@@ -73,7 +73,7 @@ class ThermalNetwork:
 
     def system(self) -> tuple[Floats, Floats, Floats]:
         """
-        Return A, b and p of the network's equation, shapes (k, k), (k,), (k,), for exponents of 1.
+        Return A, b, p of ``dx/dt = A x + b u + p``, shapes (k, k), (k,), (k,), for exponents of 1.
         """
         n, index = len(self.nodes), self._places
         size = n + (self.thermostat is not None)

@@ -28,9 +28,9 @@ SETTLED_READINGS: Final = 5
 #: change, to the third reading, is less than this share of the step.
 CONTINUED_SHARE: Final = 0.25
 
-#: A sensor's readings count as standing still after this number of equal readings over at least
-#: this time [s]; the number is larger if the declared noise makes the run more probable than
-#: `STILL_PROBABILITY`.
+#: Smallest number of equal readings, and shortest time [s], after which a sensor counts as
+#: standing still; the number is larger if the declared noise makes that many equal readings more
+#: probable than `STILL_PROBABILITY`.
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
@@ -47,8 +47,8 @@ LARGEST_ERROR: Final = 60.0
 #: share of the temperature change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: Number of readings in a row with at least this ratio of the slower to the faster sensor's rate
-#: after which a sensor leads; from `DOUBTFUL_RATE_SHARE` on a lead of the board adds variance.
+#: A sensor leads after `LEAD_READINGS` readings in a row in which the slower sensor's rate exceeds
+#: `LEAD_RATE_SHARE` of the faster's; above `DOUBTFUL_RATE_SHARE` a board's lead adds variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03

@@ -6,9 +6,9 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u the value of its kind (`unit.terms`), t the
 board temperature from the reference, and w the weight of the dynamic regime. u is held at the
 edges of the column's range, and t at the edges of the calibrated temperatures. Beyond the
-calibrated temperatures the curves continue along their tangents, but the powers of t are constant.
-Along a tangent ``u t^p`` would have the slope ``u p t^(p - 1)``, but no recording determines how a
-coefficient that changes with temperature continues beyond the calibrated temperatures.
+calibrated temperatures the curves continue along their tangents, but the powers of t are
+constant: no recording determines how a coefficient that changes with temperature continues beyond
+the calibrated temperatures.
 
 Each group of the bank has the columns of the kind with the same name, with these exceptions. Group
 *product* has the kind board, and group *gradient_x_temperature* the kinds gradient and

@@ -11,10 +11,10 @@ elements of the misalignment M. To first order the error e of the corrected forc
     e_y = yx (u0 + x u1) + u2 + y u3 + x u6
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
-Each element of the covariance of e is a polynomial of second degree in x, y, z, and its
-coefficients are sums over the elements of the covariance of u. In an array, the covariance of the
-errors u has as rows a, b, c of each axis, with the axis' error variance ``a + b x + c x^2``, then
-one row for each pair of errors in `BETWEEN`.
+Each element of the covariance of the force error e is a polynomial of second degree in the forces
+x, y, z, and the coefficients are sums over the elements of the covariance of the errors u. In an
+array, the covariance of the errors u has as rows a, b, c of each axis, with the axis' error
+variance ``a + b x + c x^2``, then one row for each pair of errors in `BETWEEN`.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ class CovarianceMap:
 
 @lru_cache(maxsize=16)
 def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
-    """Return the places of the rows in the sum of each coefficient, and the rows' factors."""
+    """Return which rows of the covariance of u a coefficient sums, and the factors of the rows."""
     # Derivative of the force by the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
     J = np.zeros((3, 4, 9))
     J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0

@@ -85,8 +85,8 @@ class Posterior:
 class Block(NamedTuple):
     """
     Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
-    level of the set, followed by its function's coefficients; `response` to `end` (exclusive):
-    weights of the columns.
+    index of the level of the set, which its function's coefficients follow; `response`: index of
+    the first weight of the columns; `end`: index after the last weight of the columns.
     """
 
     static: int
