@@ -19,7 +19,7 @@ from ..recording.blocks import Block
 from .reduction import Readings, ReducedBag, StillInterval
 from .sources import FitSource
 
-#: Longest gap between two parts of one recording [s]; switching a unit off and on takes longer.
+#: Longest gap or overlap of two parts of one recording [s]; switching off and on takes longer.
 CONTINUED_S = 3.0
 #: Number of windows before and after the end of a part that show the usual step between windows.
 _N_COMPARED = 20
@@ -114,7 +114,7 @@ def _whole(parts: Sequence[ReducedBag]) -> ReducedBag:
 
 
 def _readings(parts: Sequence[Readings]) -> Readings:
-    """Join the readings of a thermometer in successive parts; keep those with rising stamps."""
+    """Join a thermometer's readings in successive parts; keep readings with rising stamps."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     value = np.concatenate([part.value for part in parts])
     newest = np.maximum.accumulate(stamp_ns)

@@ -238,7 +238,7 @@ class _PartCurves:
         by a share of the gradient or, without a case thermometer, by a time.
 
         The residual is linearised in the time constant and the lead. The lead must reduce the sum
-        of squares so far that white residuals would do so by a chance of 1e-5.
+        of squares by a factor that white residuals would reach with a probability of 1e-5.
         """
         tau = lag.tau_s
         if not tau:

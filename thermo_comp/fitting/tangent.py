@@ -41,8 +41,8 @@ class Tangent:
     The equations linearised about a state, as coefficients of the base series at this state.
 
     The derivative of the readings by an unknown is a factor times one base series or one of a few
-    combinations of base series. For axis i, position p and unknown u it is ``factor[p, i, u]``
-    times the series ``place[u]``, in the order base series, combinations. An axis has the unknowns
+    combinations of base series. For axis i, position p and unknown u the derivative is ``factor[p,
+    i, u]`` times series ``place[u]``, in the order base series, combinations. An axis has unknowns
     of the position (2 of the attitude, stretch, offset, tilts), then those of the bag
     (initial lag states, turn-on offset), then those of the unit (kappa, bias, weights, nonlinear
     coefficients, radius, 3 of the misalignment, 2 of each pose). The last "unknown" is the
