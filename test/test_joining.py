@@ -188,3 +188,8 @@ def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng, cli):
     thermo_comp.save(calibration, tmp_path / 'unit.yaml')
     errors = cli('evaluate', *paths, '-c', tmp_path / 'unit.yaml').stderr
     assert 'part0.mcap .. part1.mcap: 2 bags of one recording, joined' in errors
+    page = tmp_path / 'unit.html'
+    cli('report', *paths, '-c', tmp_path / 'unit.yaml', '-o', page)
+    # The certificate has the name and the SHA-256 of each bag, not of the joined recording alone.
+    text = page.read_text()
+    assert all(path.name in text and digest(path) in text for path in paths)
