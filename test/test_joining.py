@@ -110,6 +110,9 @@ def test_other_recordings_are_not_joined(rng):
     assert len(joined(reduced(cut(whole, (200.0,), pause_s=60.0)))) == 2
     known = KnownForce('part', parse_sections('0 400 2.0'))
     assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
+    # Two recordings of 2 s whose stamps begin at the same time are no parts of one recording.
+    short = recorded(rng, 2.0)
+    assert len(joined(reduced([short, short]))) == 2
     # Two recordings with the same stamps are each joined with their own second part.
     other = replace(whole, accel=-whole.accel)
     parts = [*cut(whole, (200.0,)), *cut(other, (200.0,))[::-1]]

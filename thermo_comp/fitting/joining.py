@@ -49,7 +49,9 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     # Times of sections of known |f| count from the start of a bag: such a bag is not joined.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
-    is_next = abs(gap_s) < max(CONTINUED_S, 2.0 * bag.cycle_s)
+    # Short recordings whose stamps all begin at 0 overlap, but are not parts of one recording.
+    overlap_s = min(CONTINUED_S, 1e-10 * (part.end_ns - part.start_ns))
+    is_next = -overlap_s < gap_s < max(CONTINUED_S, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)
 
 
