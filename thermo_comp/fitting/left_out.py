@@ -186,11 +186,12 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 def is_undecided(before: Score, after: Score) -> bool:
     """
     Whether left-out data do not decide between two models, of which the second is not better:
-    their drifts are equal, and they have no common norms, or smaller norms by the second model.
+    their drifts are equal, and they have no common norms, or the norms of the second model are
+    smaller by one to two standard errors.
     """
     *drift, norms = _gains(before, after)
     is_equal = all(abs(gain[0]) < _EQUAL for gain in drift if gain)
-    return is_equal and (norms is None or norms[0] > 0.0)
+    return is_equal and (norms is None or norms[0] > norms[1])
 
 
 def is_near(chosen: Score, other: Score) -> bool:
