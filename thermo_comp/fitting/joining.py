@@ -23,8 +23,6 @@ from .sources import FitSource
 CONTINUED_S = 3.0
 #: Number of windows before and after the end of a part that show the usual step between windows.
 _N_COMPARED = 20
-#: Largest relative difference between two parts of the sample interval, and of the window length.
-_SAME_INTERVAL = 0.01
 
 
 def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
@@ -66,7 +64,8 @@ def _step(part: ReducedBag, bag: ReducedBag) -> float:
 
 
 def _is_alike(before_s: float, after_s: float) -> bool:
-    return abs(after_s - before_s) < _SAME_INTERVAL * before_s
+    """Whether two sample intervals, or two lengths of windows, differ by less than 1 %."""
+    return abs(after_s - before_s) < 0.01 * before_s
 
 
 def _whole(parts: Sequence[ReducedBag]) -> ReducedBag:

@@ -49,36 +49,12 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     Raises FitError for fewer calibrations than three, or if they differ in input, reference
     temperature, sensors or curves.
     """
-    if len(calibrations) < UNITS_NEEDED:
-        raise FitError(
-            f'the prior of a type needs the calibrations of at least {UNITS_NEEDED} units, got '
-            f'{len(calibrations)}'
-        )
     # Nonlinear terms are left out: most units have none, because a centrifuge is needed to
     # determine them.
     calibrations = [
         each if each.nonlinearity is None else without_terms(each) for each in calibrations
     ]
-    first = calibrations[0]
-    serials = [calibration.unit.serial for calibration in calibrations]
-    if twice := sorted(serial for serial in set(serials) if serials.count(serial) > 1):
-        raise FitError(
-            f'two of the calibrations are of one unit, {twice[0]}: give one of each unit'
-        )
-    for calibration in calibrations:
-        serial, unit = calibration.unit.serial, calibration.unit
-        alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
-        if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
-            raise FitError(
-                f'unit {serial} differs from unit {first.unit.serial} in the key unit.input, '
-                'reference_temperature_c or sensors: they are not of one type'
-            )
-        if _shape(calibration) != _shape(first):
-            raise FitError(
-                f'the curves over temperature of unit {serial} have another form than those of '
-                f'unit {first.unit.serial}: fit both with the same --model, --static-curve and '
-                '--dynamic-curve'
-            )
+    _check_alike(calibrations)
     keys: dict[Column, list[Column]] = {}
     for calibration in calibrations:
         for column in prior_columns(calibration):
@@ -103,6 +79,35 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     # Parameters that none of the units determined keep the uncertainty of their own prior.
     scatter += np.mean([covariance for _, covariance in units], axis=0)
     return with_parameters(template, mean_K, mean, scatter)
+
+
+def _check_alike(calibrations: Sequence[Calibration]) -> None:
+    """Raise FitError for too few calibrations, or calibrations of different types of units."""
+    if len(calibrations) < UNITS_NEEDED:
+        raise FitError(
+            f'the prior of a type needs the calibrations of at least {UNITS_NEEDED} units, got '
+            f'{len(calibrations)}'
+        )
+    first = calibrations[0]
+    serials = [calibration.unit.serial for calibration in calibrations]
+    if twice := sorted(serial for serial in set(serials) if serials.count(serial) > 1):
+        raise FitError(
+            f'two of the calibrations are of one unit, {twice[0]}: give one of each unit'
+        )
+    for calibration in calibrations:
+        serial, unit = calibration.unit.serial, calibration.unit
+        alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
+        if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
+            raise FitError(
+                f'unit {serial} differs from unit {first.unit.serial} in the key unit.input, '
+                'reference_temperature_c or sensors: they are not of one type'
+            )
+        if _shape(calibration) != _shape(first):
+            raise FitError(
+                f'the curves over temperature of unit {serial} have another form than those of '
+                f'unit {first.unit.serial}: fit both with the same --model, --static-curve and '
+                '--dynamic-curve'
+            )
 
 
 def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
