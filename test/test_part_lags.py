@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import second_simulator
 import strangers
+import strangers_units
 from accuracy import errors, fit_and_correct
 from strangers_baselines import minutes
 from strangers_cases import (
@@ -26,7 +27,7 @@ from strangers_cases import (
     third_node,
 )
 from strangers_helpers import slow
-from strangers_units import GRAVITY, UG, record, rng_of, spread
+from strangers_units import GRAVITY, UG, rng_of, spread
 
 from thermo_comp.fitting.population import population
 from thermo_comp.fitting.windows import Model, Sets
@@ -348,7 +349,7 @@ def test_six_faces_in_three_soaks_show_the_curve_of_a_mems():
         ups /= np.linalg.norm(ups, axis=1, keepdims=True)
         soak = program(celsius, 20.0)
         bags += [
-            record(unit, soak, up, rng, name=f'{celsius:g}-{k}', rate_hz=10.0)
+            strangers_units.record(unit, soak, up, rng, name=f'{celsius:g}-{k}', rate_hz=10.0)
             for k, up in enumerate(ups)
         ]
     calibration = strangers.fitted(Study('', tuple(bags), {}, MEMS_SCALE))
