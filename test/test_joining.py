@@ -11,7 +11,8 @@ import pytest
 from builders import ArrayBlock
 
 import thermo_comp
-from thermo_comp.fitting import FitSource
+from thermo_comp.errors import FitError
+from thermo_comp.fitting import FitOptions, FitSource, fit
 from thermo_comp.fitting.joining import joined
 from thermo_comp.fitting.known_force import KnownForce, parse_sections
 from thermo_comp.fitting.reduction import reduce_source
@@ -130,6 +131,12 @@ def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
     (bag,) = joined(parts)
     assert len(bag.intervals) == 1
     assert bag.n_samples == 60_000
+    assert parts[1].restless
+    assert not bag.restless
+    sources = [part.source for part in parts]
+    assert len(fit(sources, FitOptions(gravity=9.80665, groups=('curve',))).positions) == 1
+    with pytest.raises(FitError, match='part1: '):
+        fit(sources[1:], FitOptions(gravity=9.80665))
 
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():

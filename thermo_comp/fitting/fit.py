@@ -80,23 +80,33 @@ def fit(
     bags = []
     for number, source in enumerate(sources):
         progress(0.5 * number / len(sources))
-        bags.append(reduce_bag(source, options))
-    return fit_bags(bags, options, progress)
+        bags.append(_reduced(source, options))
+    # A part of a split recording may have no rest: check the joined recordings.
+    return fit_bags([_checked(bag) for bag in joined(bags)], options, progress)
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
     """Reduce a source to sufficient statistics; raises FitError if it has no still interval."""
-    bag = reduce_source(
+    return _checked(_reduced(source, options))
+
+
+def _reduced(source: FitSource, options: FitOptions) -> ReducedBag:
+    return reduce_source(
         source,
         min_rest_s=options.min_rest_s,
         still_sd=options.still_sd / STANDARD_GRAVITY,
         full_scale=options.saturated_at,
         fewest_windows=FEWEST_WINDOWS,
     )
+
+
+def _checked(bag: ReducedBag) -> ReducedBag:
+    """Return the bag; raises FitError if it has no samples, or no still interval."""
     if not bag.n_samples:
-        raise FitError(f'{source.name}: no accelerometer samples in the part that is read')
+        name = bag.source.name
+        raise FitError(f'{name}: no accelerometer samples in the part that is read')
     if bag.restless:
-        raise FitError(f'{source.name}: {bag.restless}')
+        raise FitError(f'{bag.source.name}: {bag.restless}')
     return bag
 
 

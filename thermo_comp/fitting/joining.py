@@ -108,6 +108,7 @@ def _whole(parts: Sequence[ReducedBag]) -> ReducedBag:
         n_spikes=sum((Counter(part.n_spikes) for part in parts), Counter()),
         is_integer=all(part.is_integer for part in parts),
         middle=max(part.middle for part in parts),
+        restless='' if any(part.intervals for part in parts) else first.restless,
         max_abs=max(part.max_abs for part in parts),
         angular_rate=rates.pop() if len(rates) == 1 else 'part',
         info=replace(first.info, end_ns=last.info.end_ns, truncated='; '.join(torn) or None),
