@@ -81,8 +81,7 @@ def fit(
     for number, source in enumerate(sources):
         progress(0.5 * number / len(sources))
         bags.append(_reduced(source, options))
-    # A part of a split recording may have no rest: check the joined recordings.
-    return fit_bags([_checked(bag) for bag in joined(bags)], options, progress)
+    return fit_bags(bags, options, progress)
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
@@ -114,9 +113,11 @@ def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """Fit a calibration to reduced bags; raises FitError if the bags contradict themselves."""
+    # A part of a split recording may have no rest, so the joined recordings are checked.
+    recordings = [_checked(bag) for bag in joined(bags)]
     # The fit multiplies many small matrices, and threads would only slow these products down.
     with threadpool_limits(1, 'blas'):
-        return _fit_about_offset(joined(bags), options, progress)
+        return _fit_about_offset(recordings, options, progress)
 
 
 def _fit_about_offset(
