@@ -24,6 +24,8 @@ from strangers_units import (
     Environment,
     Floats,
     Unit,
+    consumer_grade,
+    navigation,
     program,
     record,
     rests_of,
@@ -110,43 +112,6 @@ class Bound:
 
 
 FULL_SCALE = {'full_scale': 8388607.0}
-
-
-def navigation(rng: np.random.Generator, **given: Any) -> Unit:
-    """Draw a unit of navigation grade whose parts lag the board with different time constants."""
-    drawn = {
-        'bias': 1500.0 * rng.standard_normal(3),
-        'gain': 0.01 * rng.standard_normal(3),
-        'misalignment': 1e-3 * rng.standard_normal(3),
-        'bias_curve': np.array([signed(rng, 5, 20), 0.08 * rng.standard_normal(3)]),
-        'scale_curve': np.array([rng.uniform(30, 90, 3), 0.2 * rng.standard_normal(3)]),
-        'case_s': rng.uniform(120, 300),
-        'board_s': rng.uniform(400, 900),
-        'part_s': rng.uniform(500, 1500, 3),
-        'heat_k': rng.uniform(0.5, 2.0),
-    }
-    return Unit(**{**drawn, **given})
-
-
-def consumer_grade(rng: np.random.Generator) -> Unit:
-    """Draw a MEMS unit with one thermometer, on the die."""
-    return Unit(
-        bias=2e4 * rng.standard_normal(3),
-        gain=0.01 * rng.standard_normal(3),
-        misalignment=5e-3 * rng.standard_normal(3),
-        bias_curve=np.array([signed(rng, 50, 400), 2.0 * rng.standard_normal(3)]),
-        scale_curve=np.array([signed(rng, 30, 120)]),
-        case_s=rng.uniform(100, 200),
-        board_s=rng.uniform(100, 250),
-        part_s=rng.uniform(20, 60, 3),
-        heat_k=rng.uniform(1, 3),
-        counts=2048.0 / GRAVITY,
-        carries=False,
-        density=150.0,
-        reading_sd=0.1,
-        reading_step=1.0 / 16.0,
-        sensors=('board',),
-    )
 
 
 def positions(
@@ -373,6 +338,21 @@ def slow_thermometer(number: int) -> Iterator[Study]:
     yield Study('', fit, one_test(positions(unit, HELD, spread(3, rng), rng)), FULL_SCALE)
 
 
+def coarse_thermometer(number: int) -> Iterator[Study]:
+    """Record a MEMS unit whose thermometer has coarse steps, or is read once per minute."""
+    for step_k, interval_s in ((1.0, 1.0), (0.5, 60.0), (0.1, 60.0)):
+        rng = rng_of('coarse-thermometer', step_k, interval_s, number)
+        unit = replace(
+            consumer_grade(rng), reading_sd=0.02, reading_step=step_k, reading_s=interval_s
+        )
+        fit, held = (
+            positions(unit, corners, spread(n, rng), rng, rate_hz=10.0)
+            for corners, n in ((WARM, 12), (WARM_HELD, 4))
+        )
+        label = f'{step_k:g} K, {interval_s:g} s'
+        yield Study(label, fit, one_test(held), {'full_scale': 32767.0})
+
+
 def flicker(number: int) -> Iterator[Study]:
     """Give units a bias instability: flicker noise of 3 ug, and of 60 ug in a MEMS unit."""
     for label, floor, grade, full_scale, rate_hz in (
@@ -493,6 +473,7 @@ CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'gravity': (gravity, 3),
     'cold-start': (cold_start, 3),
     'slow-thermometer': (slow_thermometer, 3),
+    'coarse-thermometer': (coarse_thermometer, 3),
     'flicker': (flicker, 3),
     'third-node': (third_node, 3),
     'bench3': (bench3, 3),

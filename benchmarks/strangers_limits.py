@@ -145,6 +145,7 @@ LIMITS = {
     # error may be half the claimed sd.
     'flicker': Limit(low=0.5, high=1.4, unit=2.0),
     'slow-thermometer': Limit(),
+    'coarse-thermometer': Limit(),
     'third-node alone': Limit(),
     # A further bag of another environment must not increase the error by more than the noise of
     # the fit, 2 %.

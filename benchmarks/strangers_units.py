@@ -15,6 +15,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -189,6 +190,43 @@ def spread(n: int, rng: np.random.Generator) -> Floats:
     while len(chosen) < n:
         chosen.append(many[np.argmin((many @ np.array(chosen).T).max(axis=1))])
     return np.array(chosen)
+
+
+def navigation(rng: np.random.Generator, **given: Any) -> Unit:
+    """Draw a unit of navigation grade whose parts lag the board with different time constants."""
+    drawn = {
+        'bias': 1500.0 * rng.standard_normal(3),
+        'gain': 0.01 * rng.standard_normal(3),
+        'misalignment': 1e-3 * rng.standard_normal(3),
+        'bias_curve': np.array([signed(rng, 5, 20), 0.08 * rng.standard_normal(3)]),
+        'scale_curve': np.array([rng.uniform(30, 90, 3), 0.2 * rng.standard_normal(3)]),
+        'case_s': rng.uniform(120, 300),
+        'board_s': rng.uniform(400, 900),
+        'part_s': rng.uniform(500, 1500, 3),
+        'heat_k': rng.uniform(0.5, 2.0),
+    }
+    return Unit(**{**drawn, **given})
+
+
+def consumer_grade(rng: np.random.Generator) -> Unit:
+    """Draw a MEMS unit with one thermometer, on the die."""
+    return Unit(
+        bias=2e4 * rng.standard_normal(3),
+        gain=0.01 * rng.standard_normal(3),
+        misalignment=5e-3 * rng.standard_normal(3),
+        bias_curve=np.array([signed(rng, 50, 400), 2.0 * rng.standard_normal(3)]),
+        scale_curve=np.array([signed(rng, 30, 120)]),
+        case_s=rng.uniform(100, 200),
+        board_s=rng.uniform(100, 250),
+        part_s=rng.uniform(20, 60, 3),
+        heat_k=rng.uniform(1, 3),
+        counts=2048.0 / GRAVITY,
+        carries=False,
+        density=150.0,
+        reading_sd=0.1,
+        reading_step=1.0 / 16.0,
+        sensors=('board',),
+    )
 
 
 def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:

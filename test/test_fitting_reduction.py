@@ -335,11 +335,33 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # Noise below a tenth of the quantum is invisible; a tenth of the quantum is assumed as noise.
-    assert learned.noise_sd_c == pytest.approx(max(noise, 0.1 * quantum), rel=0.1)
+    assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
     assert learned.fastest_ramp_k_min >= 1.0
+
+
+@pytest.mark.parametrize('noise', [0.02, 0.05, 0.09])
+def test_readings_that_flicker_at_the_edges_of_a_degree_show_their_noise(noise, rng):
+    learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
+    # Each of 30 edges is passed once; the two slowest passes show the noise best.
+    assert learned.noise_sd_c == pytest.approx(noise, rel=0.3)
+
+
+def test_readings_that_never_flicker_have_a_noise_of_a_hundredth_of_their_quantum(rng):
+    learned = learn_thermometer([soak_ramp_soak(1.0, 0.0, rng)], ThermometerSettings())
+    assert learned.noise_sd_c == pytest.approx(0.01)
+
+
+def test_the_lag_is_at_least_three_reading_intervals(rng):
+    # WHY: the estimate of a thermometer restarts after a pause longer than its lag, so readings
+    # each minute with a lag of 50 s left the rate at 0 in all ramps.
+    time = np.arange(0.0, 14400.0, 60.0)
+    celsius = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
+    readings = Readings(
+        stamps(len(time), 1.0 / 60.0), celsius + 0.01 * rng.standard_normal(len(time))
+    )
+    assert learn_thermometer([readings], ThermometerSettings()).lag_s == pytest.approx(180.0)
 
 
 def test_a_quantum_of_a_degree_is_estimated():

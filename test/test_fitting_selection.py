@@ -479,3 +479,16 @@ def test_few_norms_that_both_models_predict_do_not_decide():
     assert is_undecided(constants, curve)
     assert not is_undecided(curve, constants)
     assert is_better(constants, score(2.0, 40.0, 5.0, 2.0))
+
+
+def test_errors_of_a_coarse_thermometer_are_not_explained_by_a_larger_model():
+    # WHY: readings in steps of 1 K have the same errors in all bags of a program. Bends over the
+    # temperature halved the left-out drift and doubled the error in another program.
+    def score(drift, by_thermometer):
+        folds = Folds(np.full(18, (drift * MICRO) ** 2), np.full(18, 20.0))
+        none = np.zeros((0, 3))
+        return Score(folds, folds, folds, none, none, folds, by_thermometer=by_thermometer * MICRO)
+
+    assert is_better(score(46.0, 49.0), score(20.0, 49.0)) is False
+    assert is_better(score(46.0, 5.0), score(20.0, 5.0))
+    assert is_better(score(120.0, 49.0), score(46.0, 49.0))

@@ -128,6 +128,22 @@ def test_equal_coarse_readings_keep_the_sd_of_their_quantum():
     assert thermometer.var_temperature == pytest.approx(0.0625**2 / 12.0, rel=0.2)
 
 
+@pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
+def test_equal_readings_each_minute_bound_the_estimate_after_a_ramp(quantum, lag_s):
+    # WHY: once the predicted temperature had left the cell of the reading, equal readings had no
+    # weight, and the claimed sd rose to 24 K within an hour of soak.
+    t = np.arange(-3600.0, 9000.0, 60.0)
+    truth = 20.0 + lagged(t, [(0.0, 1.0), (1200.0, 0.0)], lag_s)
+    thermometer = Thermometer(ThermometerSettings(0.01 * quantum, quantum, lag_s=lag_s))
+    out = run(thermometer, t, np.round(truth / quantum) * quantum)
+    error, sd = out[:, 0] - truth, np.sqrt(out[:, 2])
+    assert np.abs(error).max() < 1.5 * quantum
+    assert sd[1:].max() < quantum
+    # Between two readings the estimate follows a ramp, here 1 K/min.
+    rows = np.flatnonzero((t > 2.0 * lag_s) & (t < 1200.0))
+    assert np.abs(out[rows, 1] - 1.0 / 60.0).max(initial=0.0) < max(quantum, 0.3) / 60.0
+
+
 def test_a_constant_without_noise_is_exact():
     thermometer = Thermometer(ThermometerSettings())
     for k in range(100):

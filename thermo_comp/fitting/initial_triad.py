@@ -160,6 +160,25 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     return np.asarray(np.where(smallest < 0.7 * noises[0], smallest, noises[0]))
 
 
+def thermometer_error_of(windows: Windows, scale: Floats) -> Floats:
+    """
+    Return the error of the windows of each axis by a coarse thermometer of the board [m/s^2],
+    shape (3,): the sd of the temperature beyond the noise of a reading, times the slope of the
+    readings over temperature within the positions.
+    """
+    if windows.board is None:
+        return np.zeros(3)
+    first = windows.edges[:-1]
+    drift = within_positions(windows.mean / scale, windows.position)
+    change = within_positions(windows.board[:, :1], windows.position)
+    power = np.maximum(np.add.reduceat(change**2, first), 1e-12)
+    along = np.add.reduceat(change * drift, first)
+    # White noise alone explains one squared noise of each position.
+    square = along**2 / power - white_noise_of(windows, scale) ** 2
+    slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
+    return np.asarray(slope * np.sqrt(max(float(windows.board[:, 1].mean()), 0.0)))
+
+
 def within_positions(values: Floats, position: Ints) -> Floats:
     """Subtract from the values of each window, shape (n, k), their mean in its position."""
     _, where, count = np.unique(position, return_inverse=True, return_counts=True)

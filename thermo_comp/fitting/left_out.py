@@ -33,7 +33,7 @@ import numpy as np
 
 from ..typing import Floats, Ints
 from .elimination import inverse_root
-from .initial_triad import white_noise_of
+from .initial_triad import thermometer_error_of, white_noise_of
 from .regression import Point, Posterior, Regression
 from .unknowns import State
 
@@ -41,6 +41,9 @@ from .unknowns import State
 _FEWEST_WINDOWS = 8
 # Two logarithms of mean square errors count as equal below this difference: 5 % of an RMS.
 _EQUAL = 0.1
+# Errors of up to 1.7 times the noise count as noise: in a soak, changes of the temperature by
+# hundredths of a kelvin, whose lag is not known, add to the white noise.
+_AS_NOISE = 1.7
 
 
 @dataclass(frozen=True)
@@ -104,9 +107,7 @@ class Folds:
         """Whether white noise explains the errors in the folds that are scored for both models."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
-        # Errors of up to 1.7 times the noise count as noise: in a soak, changes of the temperature
-        # by hundredths of a kelvin, whose lag is not known, add to the white noise.
-        return bool(square <= (1.7 * noise) ** 2)
+        return bool(square <= (_AS_NOISE * noise) ** 2)
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ class Score:
         the drift, without its section, shape (n, 3)
     halves: drift of left-out halves of the program, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
+    by_thermometer: error of a window by a coarse thermometer of the board, likewise
     """
 
     positions: Folds
@@ -131,6 +133,7 @@ class Score:
     drift: Floats
     halves: Folds
     noise: float = 0.0
+    by_thermometer: float = 0.0
 
     @property
     def kinds(self) -> tuple[Folds, Folds, Folds]:
@@ -142,6 +145,11 @@ class Score:
         """RMS of the left-out drift, the larger of the RMS over positions and over sections."""
         known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
         return max(known, default=float('nan'))
+
+    @property
+    def is_by_thermometer(self) -> bool:
+        """Whether errors of a coarse thermometer explain the left-out drift."""
+        return self.rms <= _AS_NOISE * self.by_thermometer
 
 
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
@@ -160,6 +168,10 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     of both models are equal, the gain is the log gain of the norms of left-out positions, which
     must exceed two standard errors.
     """
+    if before.is_by_thermometer:
+        # The errors of a coarse thermometer repeat in all bags of one program: a model can explain
+        # them in left-out bags, and fails in another program.
+        return 0.0
     *drifts, norms = _gains(before, after)
     drift = [gain for gain in drifts if gain]
     # The drift of one kind of folds need not decrease if white noise explains it and the drift of
@@ -215,8 +227,9 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
     by_halves, _ = _by_sections(regression, posterior, halves, n_steps=2, is_within=True)
     drift = np.where(np.isfinite(drift), drift, section_drift)
     scale = regression.nominal_scale
-    noise = float(np.sqrt(np.mean(white_noise_of(regression.windows, scale) ** 2)))
-    return Score(positions, sections, norms, force, drift, by_halves, noise)
+    errors = (of(regression.windows, scale) for of in (white_noise_of, thermometer_error_of))
+    noise, by_thermometer = (float(np.sqrt(np.mean(error**2))) for error in errors)
+    return Score(positions, sections, norms, force, drift, by_halves, noise, by_thermometer)
 
 
 def _by_positions(

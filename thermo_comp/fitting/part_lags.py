@@ -27,7 +27,12 @@ from ..thermal.lags import Lag
 from ..typing import Floats
 from ..unit.columns import Part
 from .hyperparameters import undisturbed
-from .initial_triad import ConstantCalibration, position_means, white_noise_of
+from .initial_triad import (
+    ConstantCalibration,
+    position_means,
+    thermometer_error_of,
+    white_noise_of,
+)
 from .windows import ThermalWindows
 
 # Ratio of a time constant of the columns to the next smaller time constant: half an octave.
@@ -100,7 +105,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
         return None
-    noise = white_noise_of(data, start.scale)
+    noise = np.hypot(white_noise_of(data, start.scale), thermometer_error_of(data, start.scale))
     accepted, least = None, np.inf
     for shape in _SHAPES:
         if shape.has_gradient and not windows.gradient.any():

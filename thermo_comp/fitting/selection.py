@@ -57,8 +57,9 @@ class Trial:
 
     @property
     def is_complete(self) -> bool:
-        """Whether noise explains the left-out drift."""
-        return self.score.rms <= 2.0 * float(self.posterior.prior.sigma.mean())
+        """Whether noise or the errors of a coarse thermometer explain the left-out drift."""
+        is_noise = self.score.rms <= 2.0 * float(self.posterior.prior.sigma.mean())
+        return is_noise or self.score.is_by_thermometer
 
 
 @dataclass(frozen=True)

@@ -71,10 +71,10 @@ def learn_thermometer(
     recorded: Sequence[Readings], base: ThermometerSettings
 ) -> ThermometerSettings:
     """Estimate one sensor's quantum, noise, lag and fastest ramp."""
-    long = [readings.value for readings in recorded if len(readings.value) >= 30]
+    long = [readings for readings in recorded if len(readings.value) >= 30]
     if not long:
         return base
-    quantum = quantum_of(np.concatenate(long))
+    quantum = quantum_of(np.concatenate([readings.value for readings in long]))
     # With a noise setting below 0.1 mK the thermometer's estimate would follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
     histories = _rate_histories(recorded, noise, quantum)
@@ -89,7 +89,11 @@ def learn_thermometer(
         change = np.abs(history.rate[_BINS_PER_SIDE:] - history.rate[:-_BINS_PER_SIDE])
         if (steepest := float(np.quantile(change, 0.995)) / (_BIN_S * _BINS_PER_SIDE)) > 0.0:
             lags.append(history.fastest / steepest)
-    lag = float(np.clip(np.median(lags), 30.0, 3600.0)) if lags else base.lag_s
+    # The estimate of the temperature restarts after a pause longer than the lag, so the lag is at
+    # least three reading intervals.
+    interval_ns = max(float(np.median(np.diff(readings.stamp_ns))) for readings in long)
+    least_s = min(max(30.0, 3e-9 * interval_ns), 3600.0)
+    lag = float(np.clip(np.median(lags), least_s, 3600.0)) if lags else base.lag_s
     return replace(
         base,
         noise_sd_c=noise,
@@ -112,17 +116,41 @@ def quantum_of(values: Floats) -> float:
     return round(step, 9) if is_grid.mean() > 0.9 else 0.0
 
 
-def _noise_of(values: Sequence[Floats], quantum: float) -> float:
+def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
     # Second differences of readings do not depend on a linear ramp; white noise of sd s gives them
     # an sd of s sqrt(6).
-    second = np.concatenate([np.diff(value, 2) for value in values])
+    second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
     # Most rounded readings equal their neighbours, so the median of the differences is 0: use
     # the differences' mean square without the largest 1 %, less the variance of rounding.
     square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
-    variance = max(float(square.mean()) / 6.0 - quantum**2 / 12.0, (0.1 * quantum) ** 2)
-    return float(np.sqrt(variance))
+    noise = float(np.sqrt(max(float(square.mean()) / 6.0 - quantum**2 / 12.0, 0.0)))
+    limit = 0.1 * quantum
+    return noise if noise > limit else float(np.clip(_flicker(recorded), 0.1 * limit, limit))
+
+
+def _flicker(recorded: Sequence[Readings]) -> float:
+    """
+    Return the sd of the noise of readings with a wide quantum [K].
+
+    At the rate r the noise of sd s moves readings of the interval h ``2 s / (r h sqrt(pi))`` times
+    over an edge between two values while the temperature passes the edge, and at least once.
+    """
+    moves = inverse_rates = 0.0
+    for readings in recorded:
+        time, value = (readings.stamp_ns - readings.stamp_ns[0]) * 1e-9, readings.value
+        changed = np.flatnonzero(np.diff(value))
+        edges = 0.5 * (value[changed] + value[changed + 1])
+        first = np.flatnonzero(np.diff(edges, prepend=np.nan))
+        count = np.diff(np.append(first, len(edges)))
+        edge, at_s = edges[first], time[changed[first]]
+        # Where the temperature turns back, it passes the same edge twice.
+        step, apart_s = edge[2:] - edge[:-2], at_s[2:] - at_s[:-2]
+        passes = np.abs(step) > 1e-9
+        moves += float(np.sum(count[1:-1][passes] ** 2 - 1)) * float(np.median(np.diff(time))) ** 2
+        inverse_rates += float(np.sum((apart_s[passes] / step[passes]) ** 2))
+    return 0.5 * float(np.sqrt(np.pi * moves / (inverse_rates or np.inf)))
 
 
 def _rate_histories(

@@ -62,6 +62,8 @@ class Windows:
     pose: number of the pose to which the unit was returned in each position, -1 for none, shape
         (n_positions,), or None if the unit was not returned
     has_prior: whether a prior calibration states the unit's parameters
+    board: temperature of the board [degC] and the variance of its estimate less that of the noise
+        of a reading [K^2], shape (n, 2), or None if unknown
     """
 
     position: Ints
@@ -83,6 +85,7 @@ class Windows:
     acts_on: Bools | None = None
     pose: Ints | None = None
     has_prior: bool = False
+    board: Floats | None = None
 
     @property
     def n_positions(self) -> int:

@@ -243,11 +243,11 @@ def thermal_windows(
     sizes = [len(part.time) for part in parts]
     rows = _Rows(*(np.concatenate(values) for values in zip(*parts, strict=True)))
     position, bag_of = np.repeat(np.arange(len(parts)), sizes), np.repeat(numbers, sizes)
-    temperature, rate, weight, gradient = rows.thermal[:, :4].T
+    temperature, rate, weight, gradient = rows.thermal[:, [0, 2, 3, 4]].T
     return ThermalWindows(
         *(model, _windows(model, spec, rows, position, bag_of)),
         *(temperature, rate, weight, gradient),
-        raw=rows.thermal[:, 4:],
+        raw=rows.thermal[:, 5:],
         angular_rate=rows.angular_rate,
         typical_count=float(np.median(rows.n_samples)),
         rests=tuple(rests),
@@ -287,7 +287,7 @@ def _rows(
         mean(time[:, None])[:, 0],
         np.add.reduceat(count, first),
         mean(interval.mean[use]),
-        mean(np.array([board, states[RATE], weight, states[GRADIENT], *raw]).T),
+        mean(np.array([*states[[BOARD, VAR_BOARD, RATE]], weight, states[GRADIENT], *raw]).T),
         mean(np.array([*curves, *(raw * factors)]).T),
         mean(by_start.T),
         mean(np.empty((len(time), 0)) if rate is None else rate[use]),
@@ -305,7 +305,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         )
         acts_on = np.vstack((of_sets, acts_on, of_parts))
     n_curves, lags = len(groups), Layout(spec).lags
-    t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 3]
+    t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 4]
     # A support tilts linearly with the board and case temperatures, and with the square of the
     # case temperature.
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
@@ -318,7 +318,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
     of_part = rows.columns @ curves.sums.T
-    kelvins = _kelvins(model, rows.columns, rows.thermal[:, 4:], t, gradient)
+    kelvins = _kelvins(model, rows.columns, rows.thermal[:, 5:], t, gradient)
     # The columns of a curve over a part's temperature have at most one lag, the lag of the part.
     lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
     return Windows(
@@ -337,6 +337,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         in_scale=np.array(in_scale),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
         acts_on=acts_on,
+        board=rows.thermal[:, :2] - (0.0, model.detector.board.noise_sd_c**2),
     )
 
 

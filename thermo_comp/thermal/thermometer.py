@@ -39,6 +39,7 @@ COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
 # Horizon of linear extrapolation [reading intervals]; beyond it the temperature is held.
 HORIZON_INTERVALS: Final = 5.0
+LONGEST_STEP: Final = 0.125  # longest step of a prediction / lag of the sensor
 NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
 # The filters of the two modes are written out in floats: a matrix library costs more per call.
@@ -125,8 +126,12 @@ class Thermometer:
         prior_quiet = 1.0 - prior_bending
         quiet = mix(self._quiet, self._bent, bending * to_quiet / prior_quiet)
         bent = mix(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
-        quiet = predict(quiet, dt, lag, self._quiet_power)
-        bent = predict(bent, dt, lag, self._bending_power)
+        # The transition of `predict` holds for times much shorter than the lag: a long interval is
+        # predicted in steps.
+        n_steps = 1 + int(dt / (LONGEST_STEP * lag))
+        for _ in range(n_steps):
+            quiet = predict(quiet, dt / n_steps, lag, self._quiet_power)
+            bent = predict(bent, dt / n_steps, lag, self._bending_power)
 
         apart = bent[0] - quiet[0]
         expected = quiet[0] + prior_bending * apart
@@ -285,15 +290,15 @@ class Thermometer:
         if jump > half:
             edge = 0.5 * (reading + self.reading) + 0.5 * move
             return edge, min(noise + (move * move + 4.0 * var_move) / 12.0, self._flat)
-        # A repeated reading has no new information: its cell only bounds the variance. If the
-        # estimate is outside the cell, the edge of the cell counts as one measurement per time in
-        # which the predicted temperature changes by one sd of the estimate.
-        if abs(expected - reading) > half:
-            edge = reading + (half if expected > reading else -half)
-            return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
+        # A repeated reading has no new information: its cell only bounds the variance.
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
+        # If the estimate is outside the cell, the edge of the cell counts as one measurement per
+        # time in which the predicted temperature changes by one sd of the estimate.
+        if abs(expected - reading) > half:
+            edge = reading + (half if expected > reading else -half)
+            return edge, variance * max(1.0, sqrt(variance) / (abs(move) + 1e-30))
         return reading, inf
 
 
