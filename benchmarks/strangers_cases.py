@@ -26,6 +26,7 @@ from strangers_units import (
     Unit,
     consumer_grade,
     navigation,
+    positions,
     program,
     record,
     rests_of,
@@ -112,24 +113,6 @@ class Bound:
 
 
 FULL_SCALE = {'full_scale': 8388607.0}
-
-
-def positions(
-    unit: Unit,
-    corners: Floats | Sequence[Floats],
-    up: Floats,
-    rng: np.random.Generator,
-    shifts: Floats | float = 0.0,
-    **given: Any,
-) -> tuple[Bag, ...]:
-    """Record a bag in each attitude, shape (n, 3); a tuple of programs is used in turn."""
-    shifts = np.broadcast_to(shifts, (len(up), 3))
-    programs = corners if isinstance(corners, tuple) else (corners,)
-    return tuple(
-        record(unit, programs[k % len(programs)], up[k], rng, name=f'p{k + 1:02d}',
-               shift=shifts[k], **given)
-        for k in range(len(up))
-    )  # fmt: skip
 
 
 def one_test(bags: tuple[Bag, ...]) -> dict[str, tuple[Bag, ...]]:
@@ -339,18 +322,43 @@ def slow_thermometer(number: int) -> Iterator[Study]:
 
 
 def coarse_thermometer(number: int) -> Iterator[Study]:
-    """Record a MEMS unit whose thermometer has coarse steps, or is read once per minute."""
-    for step_k, interval_s in ((1.0, 1.0), (0.5, 60.0), (0.1, 60.0)):
-        rng = rng_of('coarse-thermometer', step_k, interval_s, number)
-        unit = replace(
-            consumer_grade(rng), reading_sd=0.02, reading_step=step_k, reading_s=interval_s
-        )
+    """
+    Record a MEMS unit whose thermometer has coarse steps, is read once per minute, or is noisy.
+    """
+    for label, step_k, interval_s, sd_k in (
+        ('1 K each second', 1.0, 1.0, 0.02),
+        ('0.5 K each minute', 0.5, 60.0, 0.02),
+        ('0.1 K each minute', 0.1, 60.0, 0.02),
+        ('noise of 1 K', 0.01, 1.0, 1.0),
+    ):
+        rng = rng_of('coarse-thermometer', label, number)
+        given = {'reading_sd': sd_k, 'reading_step': step_k, 'reading_s': interval_s}
+        unit = replace(consumer_grade(rng), **given)
         fit, held = (
             positions(unit, corners, spread(n, rng), rng, rate_hz=10.0)
             for corners, n in ((WARM, 12), (WARM_HELD, 4))
         )
-        label = f'{step_k:g} K, {interval_s:g} s'
         yield Study(label, fit, one_test(held), {'full_scale': 32767.0})
+
+
+def random_walk(number: int) -> Iterator[Study]:
+    """Let the bias walk by 20 ug per square root of an hour within each bag."""
+    rng = rng_of('random-walk', number)
+    unit = navigation(rng)
+
+    def walking(bags: tuple[Bag, ...]) -> tuple[Bag, ...]:
+        result = ()
+        for bag in bags:
+            step = 20.0 * np.sqrt((bag.time_s[1] - bag.time_s[0]) / 3600.0)
+            walk = np.cumsum(step * rng.standard_normal(bag.samples.shape), axis=0)
+            result += (replace(bag, samples=np.rint(bag.samples + unit.counts * UG * walk)),)
+        return result
+
+    fit, held = (
+        walking(positions(unit, corners, spread(n, rng), rng))
+        for corners, n in ((HALF, 12), (HELD, 3))
+    )
+    yield Study('', fit, one_test(held), FULL_SCALE)
 
 
 def flicker(number: int) -> Iterator[Study]:
@@ -474,6 +482,7 @@ CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'cold-start': (cold_start, 3),
     'slow-thermometer': (slow_thermometer, 3),
     'coarse-thermometer': (coarse_thermometer, 3),
+    'random-walk': (random_walk, 4),
     'flicker': (flicker, 3),
     'third-node': (third_node, 3),
     'bench3': (bench3, 3),

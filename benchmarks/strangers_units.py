@@ -13,7 +13,7 @@ the package is not an error of the simulated truth.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -370,6 +370,24 @@ def record(
         value = np.interp(read, grid, node) + unit.reading_sd * rng.standard_normal(len(read))
         temperatures[sensor] = read, np.round(value / unit.reading_step) * unit.reading_step
     return Bag(name, stamps, samples, temperatures, force)
+
+
+def positions(
+    unit: Unit,
+    corners: Floats | Sequence[Floats],
+    up: Floats,
+    rng: np.random.Generator,
+    shifts: Floats | float = 0.0,
+    **given: Any,
+) -> tuple[Bag, ...]:
+    """Record a bag in each attitude, shape (n, 3); a tuple of programs is used in turn."""
+    shifts = np.broadcast_to(shifts, (len(up), 3))
+    programs = corners if isinstance(corners, tuple) else (corners,)
+    return tuple(
+        record(unit, programs[k % len(programs)], up[k], rng, name=f'p{k + 1:02d}',
+               shift=shifts[k], **given)
+        for k in range(len(up))
+    )  # fmt: skip
 
 
 def turned(up: Floats, hold_s: float, n: int, rate_hz: float, rng: np.random.Generator) -> Floats:

@@ -26,7 +26,7 @@ from thermo_comp.fitting.claim import claim_of
 from thermo_comp.fitting.evidence import group_evidence
 from thermo_comp.fitting.hyperparameters import downweigh, settle
 from thermo_comp.fitting.initialisation import STEEPEST
-from thermo_comp.fitting.left_out import Folds, Score, is_better, is_undecided
+from thermo_comp.fitting.left_out import is_better
 from thermo_comp.fitting.regression import Regression
 from thermo_comp.fitting.selection import Selected, fit_all, select
 from thermo_comp.fitting.series import Whitener
@@ -463,32 +463,3 @@ def test_the_drifts_of_scale_factors_show_how_well_turn_ons_repeat():
     for errors in truth.errors(regression, posterior).values():
         # The RMS of three independent errors in units of their sd exceeds 2 by a chance of 0.7 %.
         assert np.sqrt(np.mean(errors**2)) < 2.0
-
-
-def test_few_norms_that_both_models_predict_do_not_decide():
-    # WHY: a MEMS in six faces at three temperatures, with a recording for each, got no curve over
-    # temperature: only four left-out norms were determined with and without the curve, and their
-    # gain of 4.7 was below two standard errors. The error was 7 mg instead of 0.3 mg.
-    def score(*norms):
-        drift = Folds(np.full(18, (20.0 * MICRO) ** 2), np.full(18, 20.0))
-        of_norms = Folds((np.array(norms) * MICRO) ** 2, np.full(4, 20.0))
-        return Score(drift, drift, of_norms, np.zeros((0, 3)), np.zeros((0, 3)), drift)
-
-    constants, curve = score(22.4, 457.7, 54.6, 26.1), score(16.8, 21.0, 22.5, 25.2)
-    assert not is_better(constants, curve)
-    assert is_undecided(constants, curve)
-    assert not is_undecided(curve, constants)
-    assert is_better(constants, score(2.0, 40.0, 5.0, 2.0))
-
-
-def test_errors_of_a_coarse_thermometer_are_not_explained_by_a_larger_model():
-    # WHY: readings in steps of 1 K have the same errors in all bags of a program. Bends over the
-    # temperature halved the left-out drift and doubled the error in another program.
-    def score(drift, by_thermometer):
-        folds = Folds(np.full(18, (drift * MICRO) ** 2), np.full(18, 20.0))
-        none = np.zeros((0, 3))
-        return Score(folds, folds, folds, none, none, folds, by_thermometer=by_thermometer * MICRO)
-
-    assert is_better(score(46.0, 49.0), score(20.0, 49.0)) is False
-    assert is_better(score(46.0, 5.0), score(20.0, 5.0))
-    assert is_better(score(120.0, 49.0), score(46.0, 49.0))

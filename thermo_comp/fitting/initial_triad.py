@@ -160,11 +160,13 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     return np.asarray(np.where(smallest < 0.7 * noises[0], smallest, noises[0]))
 
 
-def thermometer_error_of(windows: Windows, scale: Floats) -> Floats:
+def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool = False) -> Floats:
     """
-    Return the error of the windows of each axis by a coarse thermometer of the board [m/s^2],
-    shape (3,): the sd of the temperature beyond the noise of a reading, times the slope of the
-    readings over temperature within the positions.
+    Return the error of the windows of each axis by the board's thermometer [m/s^2], shape (3,):
+    the sd of the temperature times the slope of the samples over temperature within the positions.
+
+    `beyond_noise`: take the variance beyond that of a reading's noise, as by coarse steps or long
+    intervals
     """
     if windows.board is None:
         return np.zeros(3)
@@ -176,7 +178,8 @@ def thermometer_error_of(windows: Windows, scale: Floats) -> Floats:
     # White noise alone explains one squared noise of each position.
     square = along**2 / power - white_noise_of(windows, scale) ** 2
     slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
-    return np.asarray(slope * np.sqrt(max(float(windows.board[:, 1].mean()), 0.0)))
+    variance = float(windows.board[:, 1].mean()) - beyond_noise * windows.board_noise**2
+    return np.asarray(slope * np.sqrt(max(variance, 0.0)))
 
 
 def within_positions(values: Floats, position: Ints) -> Floats:

@@ -183,7 +183,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     ]
     # The RMS error of left-out halves of the program may rise by a quarter, about its scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
-    if (norms and norms[0] < -norms[1]) or is_worse_by_halves:
+    if is_worse_by_norms(before, after) or is_worse_by_halves:
         return 0.0
     total = sum(gain for gain, _ in drift)
     is_sure = bool(must_gain) and all(gain > error for gain, error in must_gain)
@@ -193,6 +193,12 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
         return norms[0]
     return 0.0
+
+
+def is_worse_by_norms(before: Score, after: Score) -> bool:
+    """Whether the second model has larger left-out norms, by more than the standard error."""
+    norms = before.norms.gain_of(after.norms)
+    return norms is not None and norms[0] < -norms[1]
 
 
 def is_undecided(before: Score, after: Score) -> bool:
@@ -227,9 +233,10 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
     by_halves, _ = _by_sections(regression, posterior, halves, n_steps=2, is_within=True)
     drift = np.where(np.isfinite(drift), drift, section_drift)
     scale = regression.nominal_scale
-    errors = (of(regression.windows, scale) for of in (white_noise_of, thermometer_error_of))
-    noise, by_thermometer = (float(np.sqrt(np.mean(error**2))) for error in errors)
-    return Score(positions, sections, norms, force, drift, by_halves, noise, by_thermometer)
+    by_thermometer = thermometer_error_of(regression.windows, scale, beyond_noise=True)
+    errors = white_noise_of(regression.windows, scale), by_thermometer
+    rms = (float(np.sqrt(np.mean(error**2))) for error in errors)
+    return Score(positions, sections, norms, force, drift, by_halves, *rms)
 
 
 def _by_positions(

@@ -125,7 +125,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         # noise: the lags are then accepted only if they reduce the RMS residual of each axis to an
         # eighth or less of the residual without a lag.
         is_explained = bool((square <= (shape.most_noise * noise) ** 2).all())
-        if not is_explained and min(map(subset.reduction, lags, range(3))) < 8.0:
+        if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
         largest = float(np.sqrt((square / noise**2).max()))
         if largest < least:

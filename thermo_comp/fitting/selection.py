@@ -25,7 +25,7 @@ from .hyperparameters import (
     settle,
     with_slow_noise,
 )
-from .left_out import Score, gain, is_better, is_near, is_undecided, score_of
+from .left_out import Score, gain, is_better, is_near, is_undecided, is_worse_by_norms, score_of
 from .regression import Posterior, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalWindows
@@ -253,7 +253,8 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
-    is_likelier = evidence_gain > CLEAR_GAIN and not is_better(large.score, small.score)
+    is_worse = is_better(large.score, small.score) or is_worse_by_norms(small.score, large.score)
+    is_likelier = evidence_gain > CLEAR_GAIN and not is_worse
     return large if is_likelier or is_better(small.score, large.score) else small
 
 
@@ -395,7 +396,8 @@ def finish(
     if slow.prior.noise != white.posterior.prior.noise:
         slow = pruned_fit(regression, slow, candidates)
         slow_score = score_of(regression, slow)
-        if not is_better(slow_score, white.score):
+        is_worse = is_worse_by_norms(white.score, slow_score)
+        if not (is_worse or is_better(slow_score, white.score)):
             return slow, slow_score
     return white.posterior, white.score
 

@@ -62,8 +62,9 @@ class Windows:
     pose: number of the pose to which the unit was returned in each position, -1 for none, shape
         (n_positions,), or None if the unit was not returned
     has_prior: whether a prior calibration states the unit's parameters
-    board: temperature of the board [degC] and the variance of its estimate less that of the noise
-        of a reading [K^2], shape (n, 2), or None if unknown
+    board: temperature of the board [degC] and the variance of its estimate [K^2], shape (n, 2), or
+        None if unknown
+    board_noise: sd of the noise of a reading of the board's thermometer [K]
     """
 
     position: Ints
@@ -86,6 +87,7 @@ class Windows:
     pose: Ints | None = None
     has_prior: bool = False
     board: Floats | None = None
+    board_noise: float = 0.0
 
     @property
     def n_positions(self) -> int:

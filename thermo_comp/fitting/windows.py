@@ -337,7 +337,8 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         in_scale=np.array(in_scale),
         tilt=tilt[:, is_tilting] / tilt_rms[is_tilting],
         acts_on=acts_on,
-        board=rows.thermal[:, :2] - (0.0, model.detector.board.noise_sd_c**2),
+        board=rows.thermal[:, :2],
+        board_noise=model.detector.board.noise_sd_c,
     )
 
 
