@@ -121,9 +121,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         factors = undisturbed(residual, data.weight, data.position)
         square = np.average(residual**2, axis=0, weights=data.weight * factors)
         square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
-        # A residual above `most_noise` times the white noise has another cause, for example slow
-        # noise: the lags are then accepted only if they reduce the RMS residual of each axis to an
-        # eighth or less of the residual without a lag.
+        # A residual above `most_noise` times the noise has another cause, for example slow noise:
+        # the lags are then accepted only if they reduce the RMS residual of each axis to a quarter
+        # or less of the residual without a lag.
         is_explained = bool((square <= (shape.most_noise * noise) ** 2).all())
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
