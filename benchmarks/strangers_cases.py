@@ -341,24 +341,31 @@ def coarse_thermometer(number: int) -> Iterator[Study]:
         yield Study(label, fit, one_test(held), {'full_scale': 32767.0})
 
 
-def random_walk(number: int) -> Iterator[Study]:
-    """Let the bias walk by 20 ug per square root of an hour within each bag."""
-    rng = rng_of('random-walk', number)
-    unit = navigation(rng)
+def slow_drift(number: int) -> Iterator[Study]:
+    """Let the bias walk within each bag, or the support tilt."""
+    for kind in ('bias', 'support'):
+        rng = rng_of('slow-drift', kind, number)
+        unit = navigation(rng)
+        fit, held = (
+            tuple(
+                _drifting(bag, unit, kind, rng)
+                for bag in positions(unit, way, spread(n, rng), rng)
+            )
+            for way, n in ((HALF, 12), (HELD, 3))
+        )
+        yield Study(kind, fit, one_test(held), FULL_SCALE)
 
-    def walking(bags: tuple[Bag, ...]) -> tuple[Bag, ...]:
-        result = ()
-        for bag in bags:
-            step = 20.0 * np.sqrt((bag.time_s[1] - bag.time_s[0]) / 3600.0)
-            walk = np.cumsum(step * rng.standard_normal(bag.samples.shape), axis=0)
-            result += (replace(bag, samples=np.rint(bag.samples + unit.counts * UG * walk)),)
-        return result
 
-    fit, held = (
-        walking(positions(unit, corners, spread(n, rng), rng))
-        for corners, n in ((HALF, 12), (HELD, 3))
-    )
-    yield Study('', fit, one_test(held), FULL_SCALE)
+def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
+    """Add a walk of the bias, 20 ug per square root of an hour, or tilts of 60 urad in 4 h."""
+    force = np.ones((len(bag.samples), 1)) * bag.force
+    step = 20.0 * UG * np.sqrt((bag.time_s[1] - bag.time_s[0]) / 3600.0)
+    change = np.cumsum(step * rng.standard_normal(force.shape), axis=0)
+    if kind == 'support':
+        phase = 2.0 * np.pi * (bag.time_s[:, None] / 14400.0 + rng.uniform())
+        change = np.cross(6e-5 * np.sin(phase) * rng.standard_normal(3), force)
+        force = force + change
+    return replace(bag, samples=np.rint(bag.samples + unit.counts * change), force=force)
 
 
 def flicker(number: int) -> Iterator[Study]:
@@ -482,7 +489,7 @@ CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'cold-start': (cold_start, 3),
     'slow-thermometer': (slow_thermometer, 3),
     'coarse-thermometer': (coarse_thermometer, 3),
-    'random-walk': (random_walk, 4),
+    'slow-drift': (slow_drift, 4),
     'flicker': (flicker, 3),
     'third-node': (third_node, 3),
     'bench3': (bench3, 3),

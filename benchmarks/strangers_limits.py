@@ -146,7 +146,7 @@ LIMITS = {
     'flicker': Limit(low=0.5, high=1.4, unit=2.0),
     'slow-thermometer': Limit(),
     'coarse-thermometer': Limit(),
-    'random-walk': Limit(),
+    'slow-drift': Limit(),
     'third-node alone': Limit(),
     # A further bag of another environment must not increase the error by more than the noise of
     # the fit, 2 %.

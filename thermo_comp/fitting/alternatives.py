@@ -97,21 +97,24 @@ def windows_of(
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows with one lag per axis; or with a bank of time constants, if no lags are found,
-    or if the lags leave a left-out drift above noise and the bank is better on left-out data.
+    or if all lags that are found leave a left-out drift above noise and the bank is better on
+    left-out data.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
-    parts = find_parts(windows, problem.start) if is_free else None
-    if parts is None:
-        return regress(windows, problem)
-    model = model_of(bags, options, parts.lags)
-    of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
-    fit = regress(of_parts, problem)
-    if fit.selected.score.rms > parts.most_drift:
-        with_bank = regress(windows, problem)
-        if is_better(fit.selected.score, with_bank.selected.score):
-            return with_bank
-    return fit
+    best: Fit | None = None
+    for parts in find_parts(windows, problem.start) if is_free else []:
+        model = model_of(bags, options, parts.lags)
+        of_parts = windows_of(bags, model, options, windows.tracks, parts.undisturbed)
+        best = _better(best, regress(of_parts, problem))
+        if best.selected.score.rms <= parts.most_drift:
+            return best
+    return _better(best, regress(windows, problem))
+
+
+def _better(fit: Fit | None, other: Fit) -> Fit:
+    """Return the first fit, if there is one and the other is not better on left-out data."""
+    return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit
 
 
 def _may_have_sets(selected: Selected) -> bool:

@@ -15,6 +15,7 @@ the lead minimise the RMS residual of a spline of the bias and a cubic of the sc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -95,18 +96,19 @@ class Parts:
     most_drift: float
 
 
-def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | None:
+def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Parts]:
     """
     Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
-    Returns None if the model with one lag per axis does not explain the drift of all axes, or if
-    the data do not determine a time constant.
+    Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
+    data do not determine a time constant. If noise does not explain the residual, lags of one
+    stage come first: slow noise or a tilt of the support looks like a second stage.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
-        return None
+        return []
     noise = np.hypot(white_noise_of(data, start.scale), thermometer_error_of(data, start.scale))
-    accepted, least = None, np.inf
+    best, least = None, np.inf
     for shape in _SHAPES:
         if shape.has_gradient and not windows.gradient.any():
             continue
@@ -114,29 +116,47 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> Parts | N
         searched = _PartCurves(windows, start, shape, 500).lags(noise)
         if searched is None:
             continue
-        sizes = 3000, len(data.time)
-        subset, full = (_PartCurves(windows, start, shape, n) for n in sizes)
+        subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
-        residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
-        factors = undisturbed(residual, data.weight, data.position)
-        square = np.average(residual**2, axis=0, weights=data.weight * factors)
-        square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
+        parts, ratio = _parts_of(windows, start, shape, lags, noise)
         # A residual above `most_noise` times the noise has another cause, for example slow noise:
         # the lags are then accepted only if they reduce the RMS residual of each axis to a quarter
         # or less of the residual without a lag.
-        is_explained = bool((square <= (shape.most_noise * noise) ** 2).all())
+        is_explained = ratio <= shape.most_noise
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
-        largest = float(np.sqrt((square / noise**2).max()))
-        if largest < least:
-            x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-            # Curves alone extrapolate badly to left-out sections: drifts of 10 sd are allowed.
-            most_drift = 10.0 if is_explained and not shape.has_stress else 2.0
-            accepted = Parts((x, y, z), factors, most_drift * float(noise.mean()))
-            least = largest
-        if largest <= _EXPLAINED:
+        if ratio < least:
+            best, least = parts, ratio
+        if ratio <= _EXPLAINED:
             break
+    accepted = [] if best is None else [best]
+    if least > _SHAPES[-1].most_noise:
+        curves = _PartCurves(windows, start, _SHAPES[0], 500)
+        lags = [curves.single(axis) for axis in range(3)]
+        if min(map(curves.reduction, lags, range(3))) > 2.0:
+            return [_parts_of(windows, start, _SHAPES[0], lags, noise)[0], *accepted]
     return accepted
+
+
+def _parts_of(
+    windows: ThermalWindows,
+    start: ConstantCalibration,
+    shape: _Shape,
+    lags: Sequence[Part],
+    noise: Floats,
+) -> tuple[Parts, float]:
+    """Return the lags with the weights of the windows, and the ratio of RMS residual to noise."""
+    data = windows.data
+    full = _PartCurves(windows, start, shape, len(data.time))
+    residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
+    factors = undisturbed(residual, data.weight, data.position)
+    square = np.average(residual**2, axis=0, weights=data.weight * factors)
+    square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
+    ratio = float(np.sqrt((square / noise**2).max()))
+    x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
+    # Curves alone extrapolate badly to left-out sections: drifts of 10 sd are allowed.
+    is_curve = ratio <= shape.most_noise and not shape.has_stress
+    return Parts((x, y, z), factors, (10.0 if is_curve else 2.0) * float(noise.mean())), ratio
 
 
 class _PartCurves:
@@ -208,7 +228,7 @@ class _PartCurves:
         A second stage, or another share of the gradient, must reduce a residual above the white
         noise (`noise`) by 5 %.
         """
-        single = self._time_constant(axis)
+        single = self.single(axis)
         best = self._with_lead(single, axis)
         enough = 1.1**2 * noise**2 * len(self._t)
         if self._square(best, axis) > enough:
@@ -216,7 +236,7 @@ class _PartCurves:
             if self._has_case:
                 # The residual has several minima in a valley, in which the time constant grows
                 # with the time by which the temperature between board and case leads the board.
-                along = [self._time_constant(axis, share) for share in (0.3, 0.6, 0.9)]
+                along = [self.single(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
                 # No second stage or other share of the gradient meets the limits of `find_parts`.
@@ -304,7 +324,7 @@ class _PartCurves:
         minimum = minimize(log_square, simplex[0], method='Nelder-Mead', options=options)
         return lag_at(minimum.x)
 
-    def _time_constant(self, axis: int, sensor_share: float = 0.0) -> Part:
+    def single(self, axis: int, sensor_share: float = 0.0) -> Part:
         """Return the lag of one stage with the smallest RMS residual; 0 s if no lag is better."""
 
         def square(tau_s: float) -> float:
@@ -321,8 +341,13 @@ class _PartCurves:
         return Part(tau, 0.0, sensor_share) if square(tau) < square(0.0) else Part(0.0)
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
-        """Whether `_STEP` times longer or shorter time constants add 5 % to the RMS residual."""
+        """
+        Whether `_STEP` times longer or shorter time constants add 5 % to the RMS residual, and the
+        lag settles to 10 % within the longest bag.
+        """
         tau, second, share, lead = lag
+        if tau > float(self._age.max()) / np.log(10.0):
+            return False
         others = [
             Part(ratio * tau, ratio * second, share, ratio * lead)
             for ratio in (1.0 / _STEP, _STEP)
