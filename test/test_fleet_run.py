@@ -308,6 +308,7 @@ def test_other_options_fit_a_unit_again(client, fleet, tmp_path):
     assert fit_fleet(str(refused), tmp_path / 'out', other, client=client).n_done == 1
 
 
+@pytest.mark.slow
 def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
     # WHY: one position in the chamber does not separate bias from scale: a unit with one position
     # needs the prior of its siblings.

@@ -110,12 +110,10 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
     assert result.residuals[-1].fitted.rms / MG < 0.75
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('length', 'n_sets', 'sets', 'drift', 'mg'),
-    [
-        pytest.param(71.0, 2, (0, 1), 2.1, 0.19, marks=pytest.mark.slow),
-        (284.0, 5, (0, 3), 2.5, 0.8),
-    ],
+    [(71.0, 2, (0, 1), 2.1, 0.19), (284.0, 5, (0, 3), 2.5, 0.8)],
 )
 def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
     real_data, work, length, n_sets, sets, drift, mg

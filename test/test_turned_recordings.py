@@ -87,6 +87,7 @@ def test_a_single_turn_on_is_claimed_with_the_repeatability_of_its_grade():
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
 
 
+@pytest.mark.slow
 def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
     # WHY: an update took the difference of the turn-ons for ageing of the bias, and forgot the
     # turn-on of the prior: the error after a third turn-on was larger than without the update.
