@@ -359,7 +359,7 @@ def slow_drift(number: int) -> Iterator[Study]:
 def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
     """Add a walk of the bias, 20 ug per square root of an hour, or tilts of 60 urad in 4 h."""
     force = np.ones((len(bag.samples), 1)) * bag.force
-    step = 20.0 * UG * np.sqrt((bag.time_s[1] - bag.time_s[0]) / 3600.0)
+    step = 20.0 * UG * np.sqrt(2.0 / 3600.0)  # in the 2 s from one sample to the next
     change = np.cumsum(step * rng.standard_normal(force.shape), axis=0)
     if kind == 'support':
         phase = 2.0 * np.pi * (bag.time_s[:, None] / 14400.0 + rng.uniform())

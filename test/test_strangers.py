@@ -135,11 +135,12 @@ def recorded(monkeypatch):
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):
-        bag = Bag(name, np.zeros(0), np.zeros((0, 3)), {})
+        bag = Bag(name, np.zeros(0), np.zeros((0, 3)), {}, np.asarray(up))
         notes[id(bag)] = (bag, given, np.asarray(corners), np.asarray(up), keys)
         return bag
 
     monkeypatch.setattr(cases, 'record', note)
+    monkeypatch.setattr(units, 'record', note)
     monkeypatch.setattr(cases, 'bias_bound', lambda *_: np.ones(3))
     monkeypatch.setattr(cases, 'replace', lambda bag, **_: bag)
     return lambda bag: notes[id(bag)][1:]
