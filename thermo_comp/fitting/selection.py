@@ -406,15 +406,18 @@ def _with_large_offsets(
     regression: Regression, fitted: Trial, candidates: Candidates
 ) -> list[Trial]:
     """
-    Fit a model again from a large sd of mounting offsets; return [] if its sd is large already.
+    Fit a model again from a large sd of mounting offsets; return [] if its sd is large already, or
+    if the model does not describe the drifts down to the noise.
 
     A drift of the scale factor is proportional to the specific force along the axis, so drifts
-    also show the offsets of mountings, if the model describes the drifts completely. Nine
-    constants explain the norms of nine positions, but not their drifts.
+    also show the offsets of mountings; but large offsets would explain drifts that the model
+    lacks. Nine constants explain the norms of nine positions, but not their drifts.
     """
     posterior = fitted.posterior
     prior, scale = posterior.prior, posterior.prior.offset_scale
-    if prior.offset_sd >= scale:
+    score = fitted.score
+    is_noise = score.rms <= 2.0 * float(np.hypot(score.noise, score.by_thermometer))
+    if prior.offset_sd >= scale or not is_noise:
         return []
     large = LARGE_OFFSETS * scale
     prior = replace(prior, offset_sd=large, turn_on_sd=large)
