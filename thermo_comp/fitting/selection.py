@@ -407,7 +407,7 @@ def _with_large_offsets(
 ) -> list[Trial]:
     """
     Fit a model again from a large sd of mounting offsets; return [] if its sd is large already, or
-    if the model does not describe the drifts down to the noise.
+    if the left-out drift exceeds four times the noise of a window.
 
     A drift of the scale factor is proportional to the specific force along the axis, so drifts
     also show the offsets of mountings; but large offsets would explain drifts that the model
@@ -416,7 +416,7 @@ def _with_large_offsets(
     posterior = fitted.posterior
     prior, scale = posterior.prior, posterior.prior.offset_scale
     score = fitted.score
-    is_noise = score.rms <= 2.0 * float(np.hypot(score.noise, score.by_thermometer))
+    is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
     if prior.offset_sd >= scale or not is_noise:
         return []
     large = LARGE_OFFSETS * scale
