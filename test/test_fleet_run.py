@@ -57,6 +57,7 @@ def fleet(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client, fleet, tmp_path):
     out = tmp_path / 'out'
     collected = []
