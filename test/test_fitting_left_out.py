@@ -41,6 +41,10 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
+    # Norms above the thermometer's error still decide: rests at three temperatures need a curve.
+    flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
+    assert is_better(flat, curved)
+    assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
     # With a fine thermometer the same gain counts.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 

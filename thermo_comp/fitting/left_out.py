@@ -168,11 +168,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     of both models are equal, the gain is the log gain of the norms of left-out positions, which
     must exceed two standard errors.
     """
-    if before.is_by_thermometer:
-        # The errors of a coarse thermometer repeat in all bags of one program: a model can explain
-        # them in left-out bags, and fails in another program.
-        return 0.0
-    *drifts, norms = _gains(before, after)
+    *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
     # The drift of one kind of folds need not decrease if white noise explains it and the drift of
     # the other kind decreases: bags of soaks do not show the effects of ramps.
@@ -207,7 +203,7 @@ def is_undecided(before: Score, after: Score) -> bool:
     their drifts are equal, and they have no common norms, or the norms of the second model are
     smaller by one to two standard errors.
     """
-    *drift, norms = _gains(before, after)
+    *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _EQUAL for gain in drift if gain)
     return is_equal and (norms is None or norms[0] > norms[1])
 
@@ -216,6 +212,17 @@ def is_near(chosen: Score, other: Score) -> bool:
     """Whether a model is at most one standard error worse than the chosen model."""
     gains = [gain for gain in _gains(chosen, other) if gain]
     return bool(gains) and all(gain > -error for gain, error in gains)
+
+
+def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
+    """
+    Return the gains, None for a drift or norms that errors of a coarse thermometer explain. These
+    errors repeat in all bags of one program: a model can explain them in left-out bags, and fails
+    in another program.
+    """
+    is_known = before.norms.rms > _AS_NOISE * before.by_thermometer
+    keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)
+    return [gain if kept else None for gain, kept in zip(_gains(before, after), keep, strict=True)]
 
 
 def _gains(before: Score, after: Score) -> list[tuple[float, float] | None]:
