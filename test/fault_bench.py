@@ -252,14 +252,19 @@ def lots(events):
 
 
 @contextmanager
-def bench(calibration, *parameters):
-    """Start a node process and a peer, and wait until they have discovered each other."""
+def bench(calibration, *parameters, **environment):
+    """
+    Start a node process and a peer, and wait until they have discovered each other.
+
+    `environment`: environment variables of the node, in addition to those of the test
+    """
     overrides = [f'calibration_file:={calibration}', *PARAMETERS, *parameters]
     arguments = [word for override in overrides for word in ('-p', override)]
     context = Context()
     rclpy.init(args=[], context=context)
     try:
-        with NodeProcess(*lossless(), '--log-level', 'FATAL', *arguments) as node:
+        arguments = *lossless(), '--log-level', 'FATAL', *arguments
+        with NodeProcess(*arguments, **environment) as node:
             peer = Bench(node, context)
             try:
                 peer.meet()

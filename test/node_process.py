@@ -11,19 +11,29 @@ from pathlib import Path
 
 _STOPPING_S = 10.0  # time for the node to end [s]
 
+#: Environment of a process that a test kills: Fast DDS without shared memory, because a killed
+#: process leaves its segments of shared memory, and the end of other processes crashes in them.
+OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
+
 
 class NodeProcess:
-    """The node in a separate process, which ends with the context."""
+    """
+    The node in a separate process, which ends with the context.
 
-    def __init__(self, *ros_args):
+    `environment`: environment variables in addition to those of the test
+    """
+
+    def __init__(self, *ros_args, **environment):
         self._ros_args = ros_args
+        self._environment = environment
 
     def __enter__(self):
         self._log = tempfile.TemporaryFile()
         command = [sys.executable, '-m', 'thermo_comp.ros.node', '--ros-args', *self._ros_args]
         # Run this source tree, not an installed package.
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get('PYTHONPATH', '')]
-        environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, paths))}
+        path = os.pathsep.join(filter(None, paths))
+        environment = {**os.environ, **self._environment, 'PYTHONPATH': path}
         self.process = subprocess.Popen(
             command, stdout=self._log, stderr=self._log, env=environment
         )

@@ -16,6 +16,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 import soak
 from fault_bench import bench
 from fault_rig import RATE_HZ, START_NS, bag, corrected, force_at, seconds_of, unit
+from node_process import OVER_UDP
 
 from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import SIZE_LIMIT, dump_calibration, save_calibration
@@ -54,7 +55,7 @@ def test_a_restarted_publisher_changes_no_output(node):
 def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
     events = [e for e in bag() if seconds_of(e[1]) < 300.0]
     _, undisturbed = corrected(events)
-    with bench(path) as node:
+    with bench(path, **OVER_UDP) as node:
         before = node.play([e for e in events if seconds_of(e[1]) < 90.0])
         assert sigmas(before) < SIGMAS
         assert before.values['regime'] == 'dynamic'

@@ -17,7 +17,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticStatus
-from node_process import NodeProcess
+from node_process import OVER_UDP, NodeProcess
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import (
@@ -261,7 +261,7 @@ def test_while_a_calibration_file_hangs_other_parameters_can_be_set(peer, unit):
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
 def test_while_a_calibration_file_hangs_the_node_can_be_ended(peer, unit, number):
-    with NodeProcess('-p', f'calibration_file:={unit}') as node:
+    with NodeProcess('-p', f'calibration_file:={unit}', **OVER_UDP) as node:
         assert peer.set_parameters(calibration_file=str(unit))[0].successful
         children = Path(f'/proc/{node.process.pid}/task').glob('*/children')
         (reader,) = ' '.join(child.read_text() for child in children).split()

@@ -3,6 +3,7 @@
 """Samples of two publishers are never mixed, and a restarted driver is accepted soon."""
 
 import contextlib
+import os
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
+from node_process import OVER_UDP
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_helpers import (
     CYCLE_NS,
@@ -103,8 +105,8 @@ rclpy.spin(node)
 @contextlib.contextmanager
 def driver_process(name):
     """Run a driver; return the time of its first sample [ns]. The driver is killed at the end."""
-    command = [sys.executable, '-c', DRIVER, name]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    command, environment = [sys.executable, '-c', DRIVER, name], {**os.environ, **OVER_UDP}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
         yield process, int(process.stdout.readline())
     finally:

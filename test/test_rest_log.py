@@ -17,7 +17,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
 from builders import calibration
 from diagnostic_msgs.msg import DiagnosticArray
-from node_process import NodeProcess
+from node_process import OVER_UDP, NodeProcess
 from ros_helpers import SECOND_NS, START_NS, Driver, drive, node_arguments, node_in_thread
 
 from thermo_comp.errors import OutputError
@@ -252,7 +252,7 @@ def test_the_node_logs_rests_and_a_kill_tears_at_most_one_line(tmp_path, unit, p
             pause.wait(0.02)
         raise AssertionError(f'{what} did not come true')
 
-    with NodeProcess(*words) as process:
+    with NodeProcess(*words, **OVER_UDP) as process:
         driver = Driver(peer)
         until(lambda: bool(logged(folder)), 'a rest on the disk')
         assert process.stop(signal.SIGKILL) == -signal.SIGKILL
