@@ -299,6 +299,35 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
     assert after == pytest.approx(before, abs=1e-9)
 
 
+def test_another_setting_does_not_end_a_stop_by_the_check_of_gravity(rng):
+    # WHY: any change of a parameter began the check of |f| anew, and samples were published for
+    # another 13 s at rest, and without end in motion.
+    compensator = Compensator(calibration(), CompensatorConfig())
+
+    def published(seconds, size):
+        count = 0
+        for second in seconds:
+            for name in ('board', 'case'):
+                compensator.push(name, second * SECOND_NS, 20.0)
+            for k in range(10):
+                x, y, z = rng.normal((0.0, 0.0, size), 0.1)
+                stamp = second * SECOND_NS + (k + 1) * SECOND_NS // 10
+                count += compensator.process(stamp, x, y, z) is not None
+        return count
+
+    count_per_g = GRAVITY * compensator.calibration.axes.z.scale_factor
+    assert published(range(60), 1.1 * count_per_g) < 600
+    assert compensator.gravity.is_refuted
+    assert published(range(60, 65), 1.1 * count_per_g) == 0
+    other = replace(compensator.config, transition_time_s=50.0)
+    compensator.take_over(compensator.thermal.model, other)
+    assert published(range(65, 70), 1.3 * count_per_g) == 0
+    # Another tolerance is a new check.
+    other = replace(other, gravity_tolerance_m_s2=5.0)
+    compensator.take_over(compensator.thermal.model, other)
+    assert published(range(70, 75), 1.1 * count_per_g) > 0
+
+
 @pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
 def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
     # The compensator drops output that is not finite, even if the calibration passed its checks.

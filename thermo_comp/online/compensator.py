@@ -120,10 +120,13 @@ class Compensator:
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
 
     def _gravity_check(self) -> GravityCheck:
-        return GravityCheck(
-            self.config.local_gravity_m_s2 or self.calibration.gravity_m_s2,
-            self.config.gravity_tolerance_m_s2,
-        )
+        return GravityCheck(*self._gravity_settings)
+
+    @property
+    def _gravity_settings(self) -> tuple[float, float]:
+        """Gravity and the tolerance of |f| [m/s^2]."""
+        gravity = self.config.local_gravity_m_s2 or self.calibration.gravity_m_s2
+        return gravity, self.config.gravity_tolerance_m_s2
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
         """Queue a reading [degC] of ``'board'`` or another of the calibration's thermometers."""
@@ -298,9 +301,14 @@ class Compensator:
         """Use another model or settings; the original of a copied `self` stays as it is."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
+        gravity, is_refusing, before = copy(self.gravity), self.is_refusing, self._gravity_settings
         self.config, self.thermal = config, copy(self.thermal)
         self.thermal.take_over(model, config, self.now_ns)
+        is_same = self.calibration == model.calibration
         self._use(model.calibration)
+        if is_same and self._gravity_settings == before:
+            # A change of other settings does not end a stop by the check of |f|.
+            self.gravity, self.is_refusing = gravity, is_refusing
         self.event_ns = EVER_NS
 
     @property

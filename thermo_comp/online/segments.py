@@ -135,7 +135,10 @@ class ThermalSide:
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
         """Use another model or configuration; the original of a copied `self` stays as it is."""
         old, self.queue = self.tracker, copy(self.queue)
+        unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
+        if self.calibration.unit == unit:
+            self.rate = rate  # a change of other settings does not end a stop by this check
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
         if is_same and self.correction.memory == old.spec:
