@@ -57,7 +57,7 @@ HOMES = {
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {
-    'fitting/assembly.py'  # reads the date of a fit for its provenance
+    'fitting/assembly.py'  # dates a fit in the provenance of the calibration
 }
 
 SOURCES = sorted(PACKAGE.rglob('*.py'))

@@ -77,7 +77,7 @@ def test_faults_of_a_recording_are_named(tmp_path, temperature, options, text):
     ('back_s', 'text'),
     [
         (600.0, 'the sample before: 3000; those'),
-        (7200.0, 'than an hour (1 times): a fit takes it'),
+        (7200.0, 'than an hour (1 times): a fit takes each jump'),
     ],
 )
 def test_samples_after_a_clock_was_set_back_are_counted(tmp_path, back_s, text):

@@ -108,7 +108,7 @@ def correct(
     Parameters
     ----------
     calibration : Calibration
-        Calibration of the unit; ``calibration.correct(time_s, ...)`` is equal to this function.
+        Calibration of the unit; its method `correct` gives the same result.
     time_s : array_like, shape (n,)
         Time of each sample, strictly rising: seconds since any origin, or datetime64.
     counts : array_like, shape (n, 3)

@@ -114,7 +114,7 @@ class Acquisition:
         #: Earliest stamp at which the next position can begin [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
-        # Mean sample of the position's first rest, which the search loses after a quieter rest.
+        # Mean sample of the first rest of a position; after a quieter rest the search misses it.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:

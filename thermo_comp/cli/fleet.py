@@ -105,11 +105,11 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
             )
             for row in result.rows
         ],
-        title='|f| - g at rest, RMS; bags: found, less those left out',
+        title='|f| - g at rest, RMS; bags: number found - number left out',
     )
     out.sources((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        # Print the bags left out only without reservations, which name the bags left out, too.
+        # Reservations name the bags left out: print these bags if there are no reservations.
         text = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {problem}' for problem in text if problem)
     out.points(

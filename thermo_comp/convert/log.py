@@ -59,7 +59,7 @@ class ForeignLog:
 
     path: str
     stamp_ns: Ints  # `NO_STAMP` if missing, shape (n,)
-    accel: Floats  # in the stated unit; NaN if a cell is not a number, shape (n, 3)
+    accel: Floats  # samples in the stated unit, NaN if no number, shape (n, 3)
     gyro: Floats | None = None  # [rad/s], shape (n, 3)
     temperatures: Mapping[str, Readings] = field(default_factory=dict)
     line: Ints | None = None  # line of each row in the file, shape (n,); None: the row's number

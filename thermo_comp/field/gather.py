@@ -32,7 +32,7 @@ _SPACING = ((360, 30), (60, 6), (0, 1))
 
 @dataclass
 class _Cell:
-    """Sums, over the seconds `begin` to `last`, of the samples less the first one, `origin`."""
+    """Sums, over the seconds `begin` to `last`, of the samples less the first sample, `origin`."""
 
     begin: int
     last: int

@@ -113,7 +113,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _better(fit: Fit | None, other: Fit) -> Fit:
-    """Return the first fit, if there is one and the other is not better on left-out data."""
+    """Return the first fit, if it exists and the other fit is not better on left-out data."""
     return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit
 
 

@@ -123,7 +123,7 @@ class Score:
         the drift, without its section, shape (n, 3)
     halves: drift of left-out halves of the program, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
-    by_thermometer: error of a window by a coarse thermometer of the board, likewise
+    by_thermometer: error of a window by a coarse board thermometer, RMS of the axes [m/s^2]
     """
 
     positions: Folds

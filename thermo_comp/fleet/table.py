@@ -56,7 +56,7 @@ _TABLE = (
     ('serial', 'text', "serial in the bags' metadata, or the folder's name"),
     ('lot', 'text', '`lot` in the metadata, else the folder above the unit'),
     ('verdict', 'text', 'verdict of evaluate on the bags of the fit; or refused, failed'),
-    ('reason', 'text', 'the numbers of the verdict'),
+    ('reason', 'text', 'numbers that decided the verdict'),
     ('problem', 'text', 'reason why there is no calibration'),
     ('reservations', 'text', 'reservations on the certificate'),
     ('left_out', 'text', 'bags that were left out, each with its reason'),

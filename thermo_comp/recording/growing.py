@@ -147,7 +147,7 @@ class PositionBags:
             if self._writer is not None:
                 self._writer.flush()
         except OutputError:
-            self._writer, self._held = None, []  # report a failed write once, do not repeat it
+            self._writer, self._held = None, []  # after a failed write, write no more
             raise
 
     def _write(self, block: Block) -> None:

@@ -284,6 +284,6 @@ def _offered_qos(topic: str) -> dict[str, Any]:
 
 def dump_yaml(content: Any) -> str:
     """Write YAML in block style with the keys in their order."""
-    # Write repeated values out: without YAML aliases.
+    # Write repeated values in full, without YAML aliases.
     dumper: Any = type('Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda *_: True})
     return str(yaml.dump(content, None, dumper, sort_keys=False, allow_unicode=True, width=10_000))

@@ -162,8 +162,8 @@ def survey_recording(
         ),
         (
             clock.n_restarts,
-            f'the time goes back by more than an hour ({clock.n_restarts} times): a fit takes it '
-            'for a pause of an hour',
+            f'the time goes back by more than an hour ({clock.n_restarts} times): a fit takes '
+            'each jump for a pause of an hour',
         ),
         (
             clock.n_gaps,

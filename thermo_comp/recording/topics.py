@@ -213,7 +213,7 @@ def select_topics(
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    among = ["driver's", 'only']  # words for a topic of REP 145, or the only one of a type
+    among = ["driver's", 'only']  # words for a topic of REP 145, or for the only topic of a type
     chosen = [
         choice_note(
             name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]

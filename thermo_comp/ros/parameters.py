@@ -87,7 +87,7 @@ class NodeConfig:
     )
     frame_id: str = _parameter(
         '',
-        "Frame of the output; empty keeps the input's. The values are not rotated.",
+        "Frame of the output; empty keeps the input's. The node does not rotate samples.",
         longest=LONGEST_FRAME,
     )
     transition_time: float = _parameter(

@@ -30,7 +30,7 @@ from .reader import LoadedCalibration
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes 10 MB at most.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
-#: Files of a day that are not larger than this [bytes] are not thinned to bound the folder.
+#: Size up to which the file of a day is not thinned to bound the size of the folder [bytes].
 _UNTHINNED_BYTES = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000

@@ -78,7 +78,7 @@ class Sources:
         """Return the index of the first message that is surely from the only active publisher."""
         was_contested, n_before, self._n_known = self.is_contested, self._n_known, n_known
         if n_known <= 1:
-            # The first batch after a second publisher has left may hold its last messages.
+            # The first batch after a publisher has left may hold messages of this publisher.
             self.is_contested, self._number = False, numbers[-1]
             return len(numbers) if was_contested else 0
         if n_known > n_before:
@@ -203,7 +203,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call a function every `period_s`, instead of any earlier one; cheaper than a timer."""
+        """Call a function every `period_s`, replacing an earlier call; cheaper than a timer."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback

@@ -6,9 +6,9 @@ Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stampe
 Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, in which the
 acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
 acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
-the mixture of both filters, and its variance includes their difference. If a sensor's quantum
-exceeds its noise, a changed reading is a precise measurement of the edge between two cells, and an
-unchanged reading only bounds the temperature by its cell.
+the mixture of the quiet and the bending filter; its variance includes their difference. If a
+sensor's quantum exceeds its noise, a changed reading is a precise measurement of the edge between
+two cells, and an unchanged reading only bounds the temperature by its cell.
 
 References
 ----------
@@ -30,8 +30,8 @@ OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a readin
 RESTART_READINGS: Final = 4  # number of outliers in a row on one side that count as a real change
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
-QUIET_SHARE: Final = 5e-3  # acceleration in quiet / bending mode, for a sensor without wide cells
-CELL_SHARE: Final = 0.2  # acceleration in quiet / bending mode, for a sensor with wide cells
+QUIET_SHARE: Final = 5e-3  # quiet / bending change of acceleration, without wide cells
+CELL_SHARE: Final = 0.2  # quiet / bending change of acceleration, with wide cells
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
 #: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
