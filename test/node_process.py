@@ -11,8 +11,8 @@ from pathlib import Path
 
 _STOPPING_S = 10.0  # time for the node to end [s]
 
-#: Environment of a process that a test kills: Fast DDS without shared memory, because a killed
-#: process leaves its segments of shared memory, and the end of other processes crashes in them.
+#: Environment of a process that a test kills: Fast DDS without shared memory. A killed process
+#: leaves its segments of shared memory, the suspected cause of rare crashes when other nodes end.
 OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 
