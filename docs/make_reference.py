@@ -47,7 +47,8 @@ ranges that do not rise, functions that are not normalised at the reference temp
 could reach zero within its ranges, a posterior of the wrong size, another `format_version`, YAML
 aliases or tags, or more than 8 MiB. The error names the file, the key, the value and the expected
 value. Numbers are written with all digits and the posterior in single precision, so that reading
-and writing a file again does not change it.
+and writing a file again does not change it. The last line of a written file is `...`: a written file that is cut, for
+example by a copy that has not ended, is refused.
 
 The main keys:
 

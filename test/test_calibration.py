@@ -223,6 +223,14 @@ def test_any_damage_gives_a_calibration_or_a_calibration_error(data):
         assert parse_calibration(dump_calibration(value).encode()) == value
 
 
+def test_a_written_file_that_is_cut_at_any_line_is_refused():
+    # WHY: a copy that a reload reads half-way lost columns and covariance without a word.
+    lines = dump_calibration(rich_calibration()).splitlines(keepends=True)
+    for n in range(1, len(lines)):
+        with pytest.raises(CalibrationError, match='the file is cut'):
+            parse_calibration(''.join(lines[:n]).encode())
+
+
 def test_paths_that_are_no_regular_file_are_refused(tmp_path):
     fifo = tmp_path / 'fifo'
     os.mkfifo(fifo)

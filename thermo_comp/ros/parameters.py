@@ -119,7 +119,8 @@ class NodeConfig:
     )
     gravity_tolerance: float = _parameter(
         _DEFAULTS.gravity_tolerance_m_s2,
-        'Error of |f| at rest [m/s^2] at which publishing stops (another unit, a reversed axis); '
+        'Error of |f| at rest [m/s^2] at which publishing stops (another unit; a reversed '
+        'axis changes |f| by at most twice the bias of the axis); '
         '0 never stops.',
         (0.0, 100.0),
     )

@@ -23,6 +23,11 @@ from .schema import SchemaError, build, fields_of, plain
 #: thermometers.
 SIZE_LIMIT = 1 << 23
 
+#: First line of a written file. A file with this first line is complete only if its last line is
+#: the mark of the end: without the mark, a file that is cut between two keys would be valid.
+_HEADER = '# written by thermo_comp: the last line of a complete file is "..."'
+_END = '...'
+
 #: Former names of groups and kinds of columns, which files of version 0.2.0 may have.
 _FORMER = {
     'now': 'gradient',
@@ -51,7 +56,10 @@ def load_calibration(path: str | Path) -> Calibration:
 def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibration:
     """Build a Calibration from the bytes of a file; raises CalibrationError if it is not valid."""
     try:
-        data = load_plain_yaml(content.decode('utf-8'))
+        text = content.decode('utf-8')
+        if text.startswith(_HEADER) and text.split()[-1] != _END:
+            raise CalibrationError('the file is cut: its last line is not "..."', path)
+        data = load_plain_yaml(text)
     except UnicodeDecodeError as error:
         raise CalibrationError(f'not UTF-8 text (byte {error.start})', path) from error
     except PlainYamlError as error:
@@ -92,7 +100,7 @@ def dump_calibration(calibration: Calibration) -> str:
     """
     Write a Calibration as YAML; raises CalibrationError if reading the text gives another value.
     """
-    text: str = yaml.dump(
+    content: str = yaml.dump(
         plain(calibration),
         Dumper=_Dumper,
         sort_keys=False,
@@ -100,12 +108,13 @@ def dump_calibration(calibration: Calibration) -> str:
         width=98,
         allow_unicode=True,
     )
-    content = text.encode()
-    if len(content) > SIZE_LIMIT:
+    text = f'{_HEADER}\n{content}{_END}\n'
+    size = len(text.encode())
+    if size > SIZE_LIMIT:
         raise CalibrationError(
-            f'the calibration takes {len(content)} bytes, at most {SIZE_LIMIT} are accepted'
+            f'the calibration takes {size} bytes, at most {SIZE_LIMIT} are accepted'
         )
-    if parse_calibration(content) != calibration:
+    if parse_calibration(text.encode()) != calibration:
         raise CalibrationError('reading the written calibration gives another value')
     return text
 
