@@ -328,6 +328,25 @@ def test_another_setting_does_not_end_a_stop_by_the_check_of_gravity(rng):
     assert published(range(70, 75), 1.1 * count_per_g) > 0
 
 
+def test_another_setting_does_not_end_a_stop_by_the_rate_of_samples(rng):
+    compensator = Compensator(calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.0))
+    warm(compensator, until_s=10)
+    step_ns = round(0.25e9 * compensator.calibration.unit.cycle_time_s)
+
+    def published(begin_s):
+        stamps = range(begin_s * SECOND_NS, (begin_s + 1) * SECOND_NS, step_ns)
+        force = rng.normal(0.0, 1.0, (len(stamps), 3))
+        samples = zip(stamps, *force.T, strict=True)
+        return sum(compensator.process(*sample) is not None for sample in samples)
+
+    # Samples that come at four times the rate of the converter are refused after a burst.
+    assert published(3) > 0
+    assert published(4) == 0
+    other = replace(compensator.config, transition_time_s=50.0)
+    compensator.take_over(compensator.thermal.model, other)
+    assert published(5) == 0
+
+
 @pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
 def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
     # The compensator drops output that is not finite, even if the calibration passed its checks.

@@ -301,14 +301,14 @@ class Compensator:
         """Use another model or settings; the original of a copied `self` stays as it is."""
         if config.stuck_timeout_s != self.config.stuck_timeout_s:
             self.stuck = StuckCheck(config.stuck_timeout_s)
-        gravity, is_refusing, before = copy(self.gravity), self.is_refusing, self._gravity_settings
+        gravity, before = copy(self.gravity), self._gravity_settings
         self.config, self.thermal = config, copy(self.thermal)
         self.thermal.take_over(model, config, self.now_ns)
         is_same = self.calibration == model.calibration
         self._use(model.calibration)
         if is_same and self._gravity_settings == before:
             # A change of other settings does not end a stop by the check of |f|.
-            self.gravity, self.is_refusing = gravity, is_refusing
+            self.gravity = gravity
         self.event_ns = EVER_NS
 
     @property

@@ -138,7 +138,8 @@ class ThermalSide:
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            self.rate = rate  # a change of other settings does not end a stop by this check
+            # A change of other settings does not end a stop by the rate of samples.
+            self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
         if is_same and self.correction.memory == old.spec:
