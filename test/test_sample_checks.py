@@ -67,36 +67,77 @@ def test_few_equal_samples_are_chance_however_long_they_take(rng):
 
 
 @given(
-    st.lists(st.sampled_from([1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]), max_size=40),
+    st.lists(
+        st.tuples(
+            st.sampled_from([1, 1, 1, 2, 3, 24, 48, 49, 50, 51, 52, 120]), st.integers(0, 7)
+        ),
+        max_size=40,
+    ),
     st.lists(st.integers(1, 300), min_size=1, max_size=10),
     st.sampled_from([0, 1, 49, 60]),
-    st.sampled_from([2, 3, 1000]),
 )
 @settings(max_examples=300, deadline=None)
-def test_standstills_are_found_however_long_the_batch(lengths, cuts, period, n_values):
-    # Runs of equal samples; successive runs differ in one axis, distant runs may be equal.
-    values = np.repeat(np.arange(len(lengths)) % n_values, lengths)
-    samples = np.stack([values * (k == values % 3) for k in range(3)], axis=1) + 1.0
-    stamps = np.arange(len(values), dtype=np.int64) * 20_000_000
+def test_standstills_are_found_however_long_the_batch(parts, cuts, period):
+    # Parts of a recording in which each axis stands or changes with each sample.
+    stands = np.array(
+        [[which >> axis & 1 for axis in range(3)] for n, which in parts for _ in range(n)]
+    )
+    stands = stands.reshape(-1, 3)
+    samples = 1.0 + np.cumsum(1 - stands, axis=0)
+    stamps = np.arange(len(samples), dtype=np.int64) * 20_000_000
     one, many = (StuckCheck(period / 50.0) for _ in range(2))
     expected = []
-    for stamp_ns, sample in zip(stamps.tolist(), samples.tolist(), strict=True):
-        if tuple(sample) == one.run[:3]:
-            expected.append(one.again(stamp_ns))
+    for stamp_ns, (x, y, z) in zip(stamps.tolist(), samples.tolist(), strict=True):
+        last = one.last
+        if x == last[0] or y == last[1] or z == last[2]:
+            expected.append(one.again(stamp_ns, x, y, z))
         else:
-            one.run, one.n_same = (*sample, stamp_ns), 0
+            one.last, one.runs = (x, y, z, stamp_ns), ()
             expected.append(False)
     collected = []
     begin = 0
-    for cut in [*cuts, len(values)]:
-        end = min(begin + cut, len(values))
+    for cut in [*cuts, len(stamps)]:
+        end = min(begin + cut, len(stamps))
         if end > begin:
-            mask = many.find(stamps[begin:end], samples[begin:end])
-            collected += [False] * (end - begin) if mask is None else mask.tolist()
+            collected += many.find(stamps[begin:end], samples[begin:end]).tolist()
         begin = end
     assert collected == expected
-    assert many.n_same == one.n_same
-    np.testing.assert_array_equal(many.run, one.run)  # `run` is NaN before the first sample
+    np.testing.assert_array_equal(many.last, one.last)  # NaN before the first sample
+    if len(stamps):
+        assert many.runs == (one.runs or ((int(stamps[-1]), 0, 0, 0),) * 3)
+
+
+@pytest.mark.parametrize('axis', range(3))
+@pytest.mark.parametrize('value', [0.0, 123.0])
+def test_one_axis_that_stands_while_the_others_change_is_stuck(rng, axis, value):
+    compensator = Compensator(calibration())
+
+    # Noise of one count: 28 % of the samples repeat the number of the sample before.
+    def sample(_):
+        counts = [float(round(K * GRAVITY * u + rng.normal())) for u in UP]
+        counts[axis] = value
+        return tuple(counts)
+
+    run(compensator, recording(1000, 100.0, sample))
+    assert compensator.counters.n_out == 201  # two seconds
+    assert compensator.counters.n_stuck == 799
+
+
+@pytest.mark.parametrize('moving', [0, 1])
+def test_an_axis_whose_noise_is_below_the_step_is_not_stuck(rng, moving):
+    compensator = Compensator(calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.0))
+
+    # The first axis stands; the second is at the edge of a step, and the third too, or it moves.
+    def sample(k):
+        z = 2300.0 + (100.0 * math.sin(0.1 * k) if moving else 0.0)
+        return (
+            1060.0,
+            round(-1411.5 + rng.normal(0.0, 0.1)),
+            round(z + 0.5 + rng.normal(0.0, 0.1)),
+        )
+
+    run(compensator, recording(5000, 100.0, sample))
+    assert compensator.counters.n_stuck == 0
 
 
 def test_a_user_may_switch_checks_of_samples_off():

@@ -332,7 +332,7 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     try:
         return valid_serial(options.serial or next(iter(serials), 'unknown'))
     except ValueError as mistake:
-        advice = '' if options.serial else '; it is that of the bags, --serial can replace it'
+        advice = '' if options.serial else '; the bags state this serial, --serial can replace it'
         raise FitError(f'{mistake}{advice}') from mistake
 
 

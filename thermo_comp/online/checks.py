@@ -4,7 +4,7 @@
 Owns the plausibility checks of samples: a stuck converter, samples faster than conversions can be,
 and |f| at rest, which must be gravity.
 
-A converter with noise does not repeat three numbers for seconds; three exact zeros indicate a dead
+A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
 calibration, or that of another unit, |f| at rest differs from gravity by more than the claimed
 uncertainty. |f| is averaged over still windows of a second or longer: their scatter is the
@@ -14,7 +14,7 @@ to another is not a motion, and is judged within a second.
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from .status import GravityResidual
 
 #: Smallest number of equal samples in a row at which the converter counts as stuck.
 STUCK_SAMPLES: Final = 50
+#: Smallest share of samples with which the other axes change if one axis is stuck. Noise below the
+#: converter's step changes half of the samples at most; white noise with an sd of 0.7 steps, 60 %.
+CHANGING: Final = 0.6
 #: Largest accepted ratio of the long-term rate of samples to the calibrated rate.
 LARGEST_RATE: Final = 1.5
 #: Burst of samples accepted beyond `LARGEST_RATE`, as from a driver's buffer: number of samples,
@@ -54,45 +57,92 @@ STEP_NS: Final = 300_000_000
 REFUTING_SIGMAS: Final = 5.0
 
 
+#: Run of equal readings of an axis: stamp of its first sample [ns], number of samples after the
+#: first, and number of those with which the next axis (y of x, z of y, x of z) changed, and the
+#: axis after that.
+Run: TypeAlias = tuple[int, int, int, int]
+
+
 class StuckCheck:
-    """Counts equal samples in a row; after the time-out [s] (0 = never) they count as stuck."""
+    """
+    Counts equal readings in a row of each axis; after the time-out [s] (0 = never) they are stuck.
+
+    Samples are stuck if all three axes repeat their readings, or if one axis does while each of
+    the others changes with a share of `CHANGING` of the samples: their noise, or a motion, then
+    exceeds the converter's step. Axes with less noise may repeat their readings for long.
+    """
 
     def __init__(self, timeout_s: float) -> None:
         self.is_on = timeout_s > 0.0
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
-        self.run = (math.nan, math.nan, math.nan, 0)  # first of the equal samples, and its stamp
-        self.n_same = 0  # number of samples equal to the first sample in `run`
+        self.last = (math.nan, math.nan, math.nan, 0)  # the last sample and its stamp
+        #: Present run of each axis, or empty if the last sample changed all three.
+        self.runs: tuple[Run, ...] = ()
 
-    def again(self, stamp_ns: int) -> bool:
-        """Count another equal sample; return whether the samples are stuck."""
-        self.n_same += 1
-        return self.n_same >= STUCK_SAMPLES and stamp_ns - self.run[3] > self.limit_ns
+    def again(self, stamp_ns: int, x: float, y: float, z: float) -> bool:
+        """Take a sample that repeats at least one axis; return whether it is stuck."""
+        x0, y0, z0, last_ns = self.last
+        self.last = x, y, z, stamp_ns
+        xs, ys, zs = self.runs or ((last_ns, 0, 0, 0),) * 3
+        new = (stamp_ns, 0, 0, 0)
+        dx, dy, dz = x != x0, y != y0, z != z0
+        xs = new if dx else (xs[0], xs[1] + 1, xs[2] + dy, xs[3] + dz)
+        ys = new if dy else (ys[0], ys[1] + 1, ys[2] + dz, ys[3] + dx)
+        zs = new if dz else (zs[0], zs[1] + 1, zs[2] + dx, zs[3] + dy)
+        self.runs = xs, ys, zs
+        most = max(xs[1], ys[1], zs[1])
+        return most >= STUCK_SAMPLES and self._is_stuck(stamp_ns)
+
+    def _is_stuck(self, stamp_ns: int) -> bool:
+        latest_ns = stamp_ns - self.limit_ns
+        long = [run for run in self.runs if run[1] >= STUCK_SAMPLES and run[0] < latest_ns]
+        return len(long) == 3 or any(min(run[2:]) >= CHANGING * run[1] for run in long)
 
     def find(self, stamps: Ints, samples: Floats) -> Bools:
         """Find the samples (n > 0, 3) that the stream drops as stuck or as three exact zeros."""
         n = len(stamps)
-        x, y, z = samples.T
-        same = np.empty(n, dtype=np.bool_)
-        same[0] = (x[0], y[0], z[0]) == self.run[:3]
-        same[1:] = (x[1:] == x[:-1]) & (y[1:] == y[:-1]) & (z[1:] == z[:-1])
-        changed = np.flatnonzero(~same)
+        columns = samples.T
+        changes = np.empty((3, n), dtype=np.bool_)
+        changes[:, 0] = columns[:, 0] != self.last[:3]
+        changes[:, 1:] = columns[:, 1:] != columns[:, :-1]
+        totals = np.cumsum(changes, axis=1)
+        before = self.runs or ((self.last[3], 0, 0, 0),) * 3
+        self.last = (*columns[:, -1].tolist(), int(stamps[-1]))
+        are_long = np.zeros((3, n), dtype=np.bool_)
         is_stuck = np.zeros(n, dtype=np.bool_)
-        if int(np.max(np.diff(changed, prepend=-1 - self.n_same, append=n))) > STUCK_SAMPLES:
-            row = np.arange(n)
-            begin = np.maximum.accumulate(np.where(same, -1, row))
-            n_same = np.where(begin < 0, row + 1 + self.n_same, row - begin)
-            since = np.where(begin < 0, self.run[3], stamps[begin])
-            is_stuck |= same & (n_same >= STUCK_SAMPLES) & (stamps - since > self.limit_ns)
-        if len(changed):
-            last = changed.item(-1)
-            self.run = (x.item(last), y.item(last), z.item(last), int(stamps[last]))
-            self.n_same = n - 1 - last
-        else:
-            self.n_same += n
+        last_runs = []
+        for axis, run in enumerate(before):
+            counts = np.stack([np.arange(1, n + 1), totals[axis - 2], totals[axis - 1]])
+            changed = np.flatnonzero(changes[axis])
+            if int(np.max(np.diff(changed, prepend=-1 - run[1], append=n))) > STUCK_SAMPLES:
+                begins, (n_equal, *n_others) = _runs(stamps, changes[axis], counts, run)
+                are_long[axis] = (n_equal >= STUCK_SAMPLES) & (stamps - begins > self.limit_ns)
+                is_stuck |= are_long[axis] & (np.minimum(*n_others) >= CHANGING * n_equal)
+            begin_ns, *start = run
+            last = counts[:, -1] + start
+            if len(changed):
+                begin_ns = int(stamps[changed[-1]])
+                last = counts[:, -1] - counts[:, changed[-1]]
+            last_runs.append((begin_ns, *last.tolist()))
+        self.runs = tuple(last_runs)
+        is_stuck |= are_long.all(axis=0)
         if self.is_on:
-            zeros = np.flatnonzero(x == 0.0)
+            zeros = np.flatnonzero(columns[0] == 0.0)
             is_stuck[zeros[~samples[zeros].any(axis=1)]] = True
         return is_stuck
+
+
+def _runs(stamps: Ints, changes: Bools, counts: Ints, before: Run) -> tuple[Ints, Ints]:
+    """
+    Return the beginning (n,) and the counts (3, n) of one axis' run (`Run`) at each sample.
+
+    `counts` are those of all samples so far, `before` is the run before the first sample.
+    """
+    first = np.maximum.accumulate(np.where(changes, np.arange(len(stamps)), -1))
+    goes_on = first < 0  # whether the run began before the first of these samples
+    begin_ns, *start = before
+    n_before = np.where(goes_on, -np.array(start)[:, None], counts[:, first])
+    return np.where(goes_on, begin_ns, stamps[first]), counts - n_before
 
 
 class RateCheck:

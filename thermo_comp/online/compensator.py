@@ -145,13 +145,13 @@ class Compensator:
             return self._process_first(stamp_ns, x, y, z)
         self.last_ns = stamp_ns
         stuck = self.stuck
-        run = stuck.run
+        last = stuck.last
         is_stuck = False
-        if x == run[0] and y == run[1] and z == run[2]:
-            is_stuck = stuck.again(stamp_ns)
+        if x == last[0] or y == last[1] or z == last[2]:
+            is_stuck = stuck.again(stamp_ns, x, y, z)
         else:
-            stuck.run = (x, y, z, stamp_ns)
-            stuck.n_same = 0
+            stuck.last = (x, y, z, stamp_ns)
+            stuck.runs = ()
         limit = self._limit
         if is_stuck or not (-limit < x < limit and -limit < y < limit and -limit < z < limit):
             self._count_bad(x, y, z)
