@@ -174,7 +174,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a temperature that is constant while that of the other thermometer changes | its readings are not used: the last value is held, then the sensor counts as lost |
 | both temperatures constant over 20 readings and 5 s, or more | used, with a growing covariance, WARN |
 | a board that leads the case in ramps (swapped topics) | larger covariance, ERROR |
-| counts constant for `stuck_timeout`, on all axes or on one while the others change, or all zero | dropped, counted, ERROR |
+| counts constant for `stuck_timeout`, on all axes or on one while both others move, or all zero | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude at rest that misses gravity by `gravity_tolerance` | nothing is published, ERROR |
 | a second publisher of a topic | the topic is not used, ERROR, until only one publisher is left, or only one has sent for a second (after a kill the middleware lists the other for 20 s, WARN) |

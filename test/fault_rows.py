@@ -148,7 +148,7 @@ SAMPLE_ROWS = [
     Row('counts stuck in motion', frozen('counts', 10.0, 20.0),
         ((ERROR, 'samples stuck or all zero, dropped'),), 3850, silent=((14.1, 20.0),),
         blind=(10.0, 14.1), recovered=20.0),
-    Row('one axis stuck in motion', value('counts', 10.0, 20.0, lambda v: (v[0], 77.0, v[2])),
+    Row('one axis stuck in motion', value('counts', 10.0, 20.0, lambda v: (v[0], v[1], 77.0)),
         ((ERROR, 'samples stuck or all zero, dropped'),), 3850, silent=((14.1, 20.0),),
         blind=(10.0, 14.1), recovered=20.0),
     Row('counts all zero', value('counts', 80.0, 95.0, lambda _: (0.0, 0.0, 0.0)),

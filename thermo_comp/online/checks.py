@@ -24,9 +24,8 @@ from .status import GravityResidual
 
 #: Smallest number of equal samples in a row at which the converter counts as stuck.
 STUCK_SAMPLES: Final = 50
-#: Smallest share of samples with which the other axes change if one axis is stuck. Noise below the
-#: converter's step changes half of the samples at most; white noise with an sd of 0.7 steps, 60 %.
-CHANGING: Final = 0.6
+#: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck.
+MOTION: Final = 0.2
 #: Largest accepted ratio of the long-term rate of samples to the calibrated rate.
 LARGEST_RATE: Final = 1.5
 #: Burst of samples accepted beyond `LARGEST_RATE`, as from a driver's buffer: number of samples,
@@ -57,46 +56,45 @@ STEP_NS: Final = 300_000_000
 REFUTING_SIGMAS: Final = 5.0
 
 
-#: Run of equal readings of an axis: stamp of its first sample [ns], number of samples after the
-#: first, and number of those with which the next axis (y of x, z of y, x of z) changed, and the
-#: axis after that.
-Run: TypeAlias = tuple[int, int, int, int]
+#: Run of equal readings of an axis: its first sample with the stamp [ns], number of samples after
+#: the first, and the largest change since then that both other axes have made [input unit].
+Run: TypeAlias = tuple[tuple[float, float, float, int], int, float]
 
 
 class StuckCheck:
     """
     Counts equal readings in a row of each axis; after the time-out [s] (0 = never) they are stuck.
 
-    Samples are stuck if all three axes repeat their readings, or if one axis does while each of
-    the others changes with a share of `CHANGING` of the samples: their noise, or a motion, then
-    exceeds the converter's step. Axes with less noise may repeat their readings for long.
+    Samples are stuck if all three axes repeat their readings, or if one axis does while both
+    others change by `motion` [input unit]: no motion leaves one axis at exactly one number. At
+    rest an axis whose noise is less than the converter's step may repeat its reading for long.
     """
 
-    def __init__(self, timeout_s: float) -> None:
+    def __init__(self, timeout_s: float, motion: float) -> None:
         self.is_on = timeout_s > 0.0
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
+        self.motion = motion
         self.last = (math.nan, math.nan, math.nan, 0)  # the last sample and its stamp
         #: Present run of each axis, or empty if the last sample changed all three.
         self.runs: tuple[Run, ...] = ()
 
     def again(self, stamp_ns: int, x: float, y: float, z: float) -> bool:
         """Take a sample that repeats at least one axis; return whether it is stuck."""
-        x0, y0, z0, last_ns = self.last
-        self.last = x, y, z, stamp_ns
-        xs, ys, zs = self.runs or ((last_ns, 0, 0, 0),) * 3
-        new = (stamp_ns, 0, 0, 0)
-        dx, dy, dz = x != x0, y != y0, z != z0
-        xs = new if dx else (xs[0], xs[1] + 1, xs[2] + dy, xs[3] + dz)
-        ys = new if dy else (ys[0], ys[1] + 1, ys[2] + dz, ys[3] + dx)
-        zs = new if dz else (zs[0], zs[1] + 1, zs[2] + dx, zs[3] + dy)
-        self.runs = xs, ys, zs
-        most = max(xs[1], ys[1], zs[1])
-        return most >= STUCK_SAMPLES and self._is_stuck(stamp_ns)
-
-    def _is_stuck(self, stamp_ns: int) -> bool:
+        last = self.last
+        self.last = sample = (x, y, z, stamp_ns)
+        runs = self.runs or ((last, 0, 0.0),) * 3
+        (xs, nx, mx), (ys, ny, my), (zs, nz, mz) = runs
+        new = sample, 0, 0.0
+        self.runs = (
+            (xs, nx + 1, _larger(mx, y - xs[1], z - xs[2])) if x == last[0] else new,
+            (ys, ny + 1, _larger(my, z - ys[2], x - ys[0])) if y == last[1] else new,
+            (zs, nz + 1, _larger(mz, x - zs[0], y - zs[1])) if z == last[2] else new,
+        )
+        if max(nx, ny, nz) < STUCK_SAMPLES - 1:
+            return False
         latest_ns = stamp_ns - self.limit_ns
-        long = [run for run in self.runs if run[1] >= STUCK_SAMPLES and run[0] < latest_ns]
-        return len(long) == 3 or any(min(run[2:]) >= CHANGING * run[1] for run in long)
+        moved = [m for first, n, m in self.runs if n >= STUCK_SAMPLES and first[3] < latest_ns]
+        return len(moved) == 3 or max(moved, default=0.0) > self.motion
 
     def find(self, stamps: Ints, samples: Floats) -> Bools:
         """Find the samples (n > 0, 3) that the stream drops as stuck or as three exact zeros."""
@@ -105,26 +103,29 @@ class StuckCheck:
         changes = np.empty((3, n), dtype=np.bool_)
         changes[:, 0] = columns[:, 0] != self.last[:3]
         changes[:, 1:] = columns[:, 1:] != columns[:, :-1]
-        totals = np.cumsum(changes, axis=1)
-        before = self.runs or ((self.last[3], 0, 0, 0),) * 3
-        self.last = (*columns[:, -1].tolist(), int(stamps[-1]))
+        runs = list(self.runs or ((self.last, 0, 0.0),) * 3)
         are_long = np.zeros((3, n), dtype=np.bool_)
         is_stuck = np.zeros(n, dtype=np.bool_)
-        last_runs = []
-        for axis, run in enumerate(before):
-            counts = np.stack([np.arange(1, n + 1), totals[axis - 2], totals[axis - 1]])
-            changed = np.flatnonzero(changes[axis])
-            if int(np.max(np.diff(changed, prepend=-1 - run[1], append=n))) > STUCK_SAMPLES:
-                begins, (n_equal, *n_others) = _runs(stamps, changes[axis], counts, run)
-                are_long[axis] = (n_equal >= STUCK_SAMPLES) & (stamps - begins > self.limit_ns)
-                is_stuck |= are_long[axis] & (np.minimum(*n_others) >= CHANGING * n_equal)
-            begin_ns, *start = run
-            last = counts[:, -1] + start
-            if len(changed):
-                begin_ns = int(stamps[changed[-1]])
-                last = counts[:, -1] - counts[:, changed[-1]]
-            last_runs.append((begin_ns, *last.tolist()))
-        self.runs = tuple(last_runs)
+        for axis, (begun, n_before, moved) in enumerate(runs):
+            begins = np.concatenate([[-1 - n_before], np.flatnonzero(changes[axis])])
+            ends = np.append(begins[1:], n)
+            is_judged = (ends - begins > STUCK_SAMPLES) & (ends > 0)
+            is_judged[-1] = True
+            spans = zip(begins[is_judged].tolist(), ends[is_judged].tolist(), strict=True)
+            for begin, end in spans:
+                is_new = begin >= 0
+                first = (*samples[begin].tolist(), int(stamps[begin])) if is_new else begun
+                here = slice(max(begin, 0), end)
+                with np.errstate(invalid='ignore'):
+                    moved_by = np.abs(columns[:, here].T - first[:3])
+                both = np.minimum(moved_by[:, axis - 2], moved_by[:, axis - 1])
+                most = np.fmax.accumulate(np.append(0.0 if is_new else moved, both))[1:]
+                equal = np.arange(here.start - begin, end - begin)
+                is_long = (equal >= STUCK_SAMPLES) & (stamps[here] - first[3] > self.limit_ns)
+                are_long[axis, here] = is_long
+                is_stuck[here] |= is_long & (most > self.motion)
+                runs[axis] = first, end - 1 - begin, most.item(-1)
+        self.last, self.runs = (*samples[-1].tolist(), int(stamps[-1])), tuple(runs)
         is_stuck |= are_long.all(axis=0)
         if self.is_on:
             zeros = np.flatnonzero(columns[0] == 0.0)
@@ -132,17 +133,10 @@ class StuckCheck:
         return is_stuck
 
 
-def _runs(stamps: Ints, changes: Bools, counts: Ints, before: Run) -> tuple[Ints, Ints]:
-    """
-    Return the beginning (n,) and the counts (3, n) of one axis' run (`Run`) at each sample.
-
-    `counts` are those of all samples so far, `before` is the run before the first sample.
-    """
-    first = np.maximum.accumulate(np.where(changes, np.arange(len(stamps)), -1))
-    goes_on = first < 0  # whether the run began before the first of these samples
-    begin_ns, *start = before
-    n_before = np.where(goes_on, -np.array(start)[:, None], counts[:, first])
-    return np.where(goes_on, begin_ns, stamps[first]), counts - n_before
+def _larger(most: float, change: float, other: float) -> float:
+    """Return the larger of `most` and the smaller of two changes; NaN is no change."""
+    change, other = abs(change), abs(other)
+    return min(change, other) if change > most and other > most else most
 
 
 class RateCheck:

@@ -28,7 +28,7 @@ from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess, is_sound
 from ..unit.covariance import covariance_at
 from ..unit.functions import TANGENT_SPANS
 from ..unit.nonlinearity import corrected_nonlinear
-from .checks import GravityCheck, StuckCheck
+from .checks import MOTION, GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
 
@@ -98,10 +98,10 @@ class Compensator:
     ) -> None:
         self.config = config or CompensatorConfig()
         self.counters = Counters()
-        self.stuck = StuckCheck(self.config.stuck_timeout_s)
         model = calibration if isinstance(calibration, Model) else Model(calibration)
         self.thermal = ThermalSide(model, self.config, self.counters)
         self._use(model.calibration)
+        self.stuck = self._stuck_check()
         self.last_ns = self.event_ns = EVER_NS
         #: Stamp of a sample that is far ahead of the sample before and is not confirmed yet.
         self.leapt_ns: int | None = None
@@ -118,6 +118,10 @@ class Compensator:
         self.gravity = self._gravity_check()
         self._corrected = corrected_nonlinear if calibration.nonlinearity else corrected
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
+
+    def _stuck_check(self) -> StuckCheck:
+        scales = [abs(axis.scale_factor) for axis in self.calibration.axes]
+        return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales))
 
     def _gravity_check(self) -> GravityCheck:
         return GravityCheck(*self._gravity_settings)
@@ -257,7 +261,7 @@ class Compensator:
         # Waiting readings with later stamps belong to the time before the backward jump.
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
-        self.stuck = StuckCheck(self.config.stuck_timeout_s)
+        self.stuck = self._stuck_check()
         self.gravity = self._gravity_check()
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
@@ -299,9 +303,8 @@ class Compensator:
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
         """Use another model or settings; the original of a copied `self` stays as it is."""
-        if config.stuck_timeout_s != self.config.stuck_timeout_s:
-            self.stuck = StuckCheck(config.stuck_timeout_s)
         gravity, before = copy(self.gravity), self._gravity_settings
+        stuck = self.stuck
         self.config, self.thermal = config, copy(self.thermal)
         self.thermal.take_over(model, config, self.now_ns)
         is_same = self.calibration == model.calibration
@@ -309,6 +312,9 @@ class Compensator:
         if is_same and self._gravity_settings == before:
             # A change of other settings does not end a stop by the check of |f|.
             self.gravity = gravity
+        self.stuck = self._stuck_check()
+        if self.stuck.limit_ns == stuck.limit_ns:
+            self.stuck.last, self.stuck.runs = stuck.last, stuck.runs
         self.event_ns = EVER_NS
 
     @property

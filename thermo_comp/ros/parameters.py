@@ -108,8 +108,8 @@ class NodeConfig:
     )
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
-        'Time after which samples that repeat their values on all axes, or on one while the '
-        'others change, are not published [s]; samples of three zeros are never published; '
+        'Time after which samples that repeat their values on all axes, or on one while both '
+        'others move, are not published [s]; samples of three zeros are never published; '
         '0 publishes all of them.',
         (0.0, 3600.0),
     )
