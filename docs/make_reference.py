@@ -381,9 +381,9 @@ def parameters_table() -> str:
             limits = '{:g} .. {:g}'.format(*field.metadata['bounds'])
         if field.metadata['choices']:
             limits = ', '.join(f'`{choice}`' for choice in field.metadata['choices'])
-        rows.append(
-            f'| `{field.name}` | {kind} | `{default}` | {limits} | {field.metadata["description"]} |'
-        )
+        # A bar, as of |f|, would begin another cell.
+        meaning = field.metadata['description'].replace('|', r'\|')
+        rows.append(f'| `{field.name}` | {kind} | `{default}` | {limits} | {meaning} |')
     return '\n'.join(rows) + '\n'
 
 

@@ -85,6 +85,15 @@ def test_every_page_is_in_the_site_s_menu():
     assert sorted(listed(nav)) == sorted(page.name for page in [*PAGES[1:], TUTORIAL])
 
 
+def test_rows_of_tables_have_as_many_cells_as_their_head():
+    # WHY: a bar in a cell, as of |f|, began a further cell.
+    for page in PAGES:
+        text = re.sub(FENCE, '', page.read_text(encoding='utf-8'))
+        for table in re.findall(r'^\|.*\n(?:\|.*\n)+', text, re.MULTILINE):
+            numbers = {len(re.findall(r'(?<!\\)\|', row)) for row in table.splitlines()}
+            assert len(numbers) == 1, f'{page.name}: {table[:200]}'
+
+
 def test_the_site_builds_without_a_warning(tmp_path):
     for module in ('material', 'mkdocstrings', 'mkdocs_jupyter'):
         pytest.importorskip(module, reason=f'{module} is not installed: the extra `docs`')
