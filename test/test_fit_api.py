@@ -77,14 +77,37 @@ def test_a_thermometer_on_two_topics_counts_once():
     assert not any('repeats' in note for note in one.provenance.notes)
 
 
-def columns_of(slopes):
-    """Record one position for each of the given bias slopes [ug/K]."""
+def columns_of(slopes, shift=0.0):
+    """Record one position for each of the given bias slopes [ug/K]; shift: of all biases [ug]."""
     rng = np.random.default_rng(10)
     bags = []
     for k, (up, slope) in enumerate(zip(UPS, slopes, strict=False)):
         time_s, force, board = recording(up, rng, slope)
+        force = force + shift * MICRO_G
         bags.append(tc.Columns(time_s, force, {'board': (time_s[::5], board[::5])}, name=f'r{k}'))
     return bags
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('shift', [300.0, -20000.0])
+def test_a_unit_that_has_changed_is_updated_although_its_drift_contradicts_the_prior(
+    shift, monkeypatch
+):
+    # WHY: the drift excluded all new bags, so that the constants were those of the prior, wrong by
+    # 35 times their claimed sd.
+    monkeypatch.setitem(globals(), 'KNEE_C', 5.0)
+    options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',)}
+    old = tc.fit(columns_of([SLOPE] * len(UPS)), mounting_sd=1e-7, **options)
+    slope = 1.3 * SLOPE
+    new = tc.fit(columns_of([slope] * 6, shift), prior=old, **options)
+    (note,) = [note for note in new.provenance.notes if note.startswith('environment')]
+    assert 'the unit has changed since the prior' in note
+    time_s, force, board = recording(UPS[6], np.random.default_rng(12), slope)
+    given = time_s, force + shift * MICRO_G
+    error = new.correct(*given, board=(time_s[::5], board[::5])).specific_force
+    error = error[300:] - G * UPS[6] / np.linalg.norm(UPS[6])
+    # Six positions determine bias and scale factor; the noise of a sample is 2 ug.
+    assert np.sqrt(np.mean(error**2)) < 5.0 * MICRO_G
 
 
 def sd_of_a_correction(unit):

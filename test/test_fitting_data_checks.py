@@ -171,7 +171,7 @@ def judged(raw, fitted, slow, left_out=None, span=30.0, drift=500.0, noise=0.1, 
     findings = judge_result(
         np.full(3, 990.0), [ResidualRow('all', *steps)], slow * MICRO_G,
         FitOptions(gravity=9.81, **options), span=span, drift=drift * MICRO_G,
-        noise=noise * MICRO_G,
+        noise=noise * MICRO_G, is_changed=False,
     )  # fmt: skip
     return {finding.name: finding for finding in findings}
 

@@ -313,6 +313,7 @@ def judge_result(
     span: float,
     drift: float,
     noise: float,
+    is_changed: bool,
 ) -> Iterator[Finding]:
     """
     Check the residuals of a fit.
@@ -321,6 +322,7 @@ def judge_result(
     span: span of the board temperature [K]
     drift: RMS of the residuals about their means in the positions [m/s^2]
     noise: white noise of a window [m/s^2]
+    is_changed: whether the evidence is for a change of the unit since the prior calibration
     """
     overall = rows[-1]
     raw, fitted, left_out = (
@@ -351,12 +353,19 @@ def judge_result(
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
     # A bias offset of a new turn-on of up to 2 sd (`slow`) does not contradict the prior.
+    contradiction = ''
     if options.prior is not None and overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow):
+        contradiction = (
+            f'|f| - g is {ug_text(overall.fitted.rms)} RMS with the prior, {ug_text(alone)} with '
+            'two sets fitted without it'
+        )
+    elif is_changed:
+        contradiction = 'the parameters differ from it by far more than the sd that it states'
+    if contradiction:
         yield advice(
             'prior',
-            f'the bags contradict the prior: |f| - g is {ug_text(overall.fitted.rms)} RMS with '
-            f'the prior, {ug_text(alone)} with two sets fitted without it; check that the '
-            'calibration in --prior is one of this unit, or of its type',
+            f'the bags contradict the prior: {contradiction}; check that the calibration in '
+            '--prior is one of this unit, or of its type',
         )
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
         yield advice(

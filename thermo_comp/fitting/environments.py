@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from .initialisation import initial_state
 from .lack_of_fit import drift_variance
 from .left_out import Folds
 from .options import FitOptions
-from .priors import constants_of, informative_priors, prior_model, with_calibration
+from .priors import constants_of, informative_priors, offset_sd_of, prior_model, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
@@ -36,7 +37,7 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """Whether the RMS of a drift exceeds five times the usual RMS, both given as mean squares."""
+    """Whether an RMS error exceeds five times the usual RMS, both given as mean squares."""
     return np.asarray(square > 5.0**2 * usual)
 
 
@@ -74,13 +75,24 @@ def _square_of_bags(fit: Fit) -> Floats:
     return Folds.of(folds.square, folds.windows, bag).square
 
 
-def bags_contradicting_prior(
+class Contradiction(NamedTuple):
+    """
+    Bags that contradict a calibration of the same unit.
+
+    bags: bags whose drift contradicts it: with the unit's parameters fixed, no initial lag states
+        of the bag explain the drift
+    is_changed: whether |f| misses gravity by far more than the drift and the claimed sd of |f|, so
+        that the constants have changed as well
+    """
+
+    bags: list[int]
+    is_changed: bool
+
+
+def contradiction(
     windows: ThermalWindows, known: Calibration, options: FitOptions
-) -> list[int]:
-    """
-    Find the bags whose drift contradicts a calibration of the same unit: with the unit's
-    parameters fixed, no initial lag states of the bag explain the drift.
-    """
+) -> Contradiction:
+    """Find the bags whose drift contradicts a calibration of the same unit."""
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(known, data, options.gravity)
     first = informative_priors(known, regression, state, windows.model, options)[0]
@@ -107,8 +119,14 @@ def bags_contradicting_prior(
     lack = np.square(lacks).max(axis=0) if lacks else np.zeros(3)
     ratio = np.sum(drift**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
     mean = np.bincount(data.bag, ratio) / np.maximum(np.bincount(data.bag), 1)
-    contradicting: list[int] = np.flatnonzero(_is_far_above(mean, 1.0)).tolist()
-    return contradicting
+    position, n_windows = data.position, np.diff(data.edges)
+    force = regression.force(state)
+    means = [np.bincount(position, axis) / n_windows for axis in force.T]
+    norm = np.linalg.norm(means, axis=0) - regression.norms(state)
+    along = regression.at(state, prior).norms_by_unit @ inverse
+    usual = np.mean(drift**2) + np.mean(np.sum(along**2, axis=1)) + offset_sd_of(known) ** 2
+    is_changed = bool(_is_far_above(np.mean(norm**2), usual))
+    return Contradiction(np.flatnonzero(_is_far_above(mean, 1.0)).tolist(), is_changed)
 
 
 def _at_calibration(
@@ -122,11 +140,13 @@ def _at_calibration(
 
 
 def with_excluded_error(
-    calibration: Calibration, bags: Sequence[ReducedBag], others: str
+    calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool = False
 ) -> tuple[Calibration, Finding]:
     """
-    Add the error of the correction of excluded bags to the lack of fit of both regimes; `others`
-    names the bags or the prior that the excluded bags contradict.
+    Add the drift that the correction leaves in bags to the lack of fit of both regimes.
+
+    `others` names the bags or the prior that these bags contradict; `is_updated`: whether the bags
+    took part in the fit
     """
     windows = thermal_windows(bags, prior_model(calibration))
     regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)
@@ -136,15 +156,21 @@ def with_excluded_error(
         _widened(regime, np.mean(drift[rows if rows.any() else slice(None)] ** 2, axis=0))
         for regime, rows in zip(calibration.regime_sets(), regimes, strict=True)
     )
-    rms = float(np.sqrt(np.mean(drift**2))) / MICRO_G
     names = ', '.join(one_line(bag.source.name) for bag in bags)
-    finding = Finding(
-        'environment',
-        'advice',
+    rms = float(np.sqrt(np.mean(drift**2))) / MICRO_G
+    text = (
         f'{names}: the correction by {others} leaves a drift of {rms:.0f} ug. The recording took '
         'no part in the fit; the published uncertainty includes this error. Another environment, '
-        'with the fan off or mounted elsewhere, needs a separate calibration',
+        'with the fan off or mounted elsewhere, needs a separate calibration'
     )
+    if is_updated:
+        text = (
+            f'{names}: the unit has changed since {others}: |f| at rest and the effects of '
+            f'temperature both differ. The fit leaves a drift of {rms:.0f} ug, which the '
+            f'published uncertainty includes. Bags over the whole temperature range allow '
+            f'a fit without {others}'
+        )
+    finding = Finding('environment', 'advice', text)
     return replace(calibration, static=static, dynamic=dynamic), finding
 
 

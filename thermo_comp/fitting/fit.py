@@ -28,12 +28,7 @@ from .assembly import build_calibration
 from .claim import claim_of
 from .coverage import LeastKnown, least_known, rough_centre
 from .data_checks import Finding, enforce
-from .environments import (
-    bags_contradicting_prior,
-    contradicting_bag,
-    is_better_without,
-    with_excluded_error,
-)
+from .environments import contradicting_bag, contradiction, is_better_without, with_excluded_error
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
 from .initial_triad import within_positions
@@ -200,25 +195,29 @@ def _fit_one_environment(
     """Fit the bags, without bags of another environment, see `environments`."""
     first = _fit(bags, options, progress)
     known = options.prior
-    excluded: list[int] = []
+    excluded, is_changed = [], False
     if known is None:
         excluded = contradicting_bag(first.fit)
     elif known.unit.serial == first.calibration.unit.serial and not first.fit.windows.data.forces:
-        excluded = bags_contradicting_prior(first.fit.windows, known, options)
+        excluded, is_changed = contradiction(first.fit.windows, known, options)
     if not excluded:
         return first
     kept = [bag for k, bag in enumerate(bags) if k not in excluded]
     refit = first
+    is_updated = is_changed and not kept
     if kept:
         refit = _fit(kept, options, progress)
         if known is None and not is_better_without(first.fit, refit.fit, excluded[0]):
             return first
-    elif known is not None:
-        # If all bags contradict the prior, no bag can update the prior.
+    elif known is not None and not is_updated:
+        # If all bags contradict the prior's effects of temperature, and the constants have not
+        # changed, the bags are of another environment and cannot update the prior.
         provenance = first.calibration.provenance
         refit = replace(first, calibration=replace(known, provenance=provenance))
     others, gone = 'the other bags' if known is None else 'the prior', [bags[k] for k in excluded]
-    calibration, finding = with_excluded_error(refit.calibration, gone, others)
+    calibration, finding = with_excluded_error(
+        refit.calibration, gone, others, is_updated=is_updated
+    )
     return replace(
         refit,
         calibration=with_notes(calibration, [finding]),
@@ -254,12 +253,13 @@ def _fit(bags: Sequence[ReducedBag], options: FitOptions, progress: Progress) ->
     residuals, in_sample, left_out = residual_rows(fit)
     drift = within_positions(in_sample[:, None], fit.windows.data.position)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
-    K = fit.posterior.state.kappa * start.scale
+    K, informative = fit.posterior.state.kappa * start.scale, fit.posterior.prior.informative
     findings += data_checks.judge_result(
         *(K, residuals, claim.offset_sd, options),
         span=float(np.ptp(fit.windows.temperature)),
         drift=float(np.sqrt(np.mean(drift**2))),
         noise=fit.selected.score.noise,
+        is_changed=bool(informative and informative.is_changed),
     )
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
     try:

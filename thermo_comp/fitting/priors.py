@@ -130,15 +130,25 @@ def informative_priors(
             for multiple in (0.3, 1.0)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
+        # Candidates in which the effects of temperature have changed as well.
+        tried += [
+            (grown(ageing * options.gravity, ageing), share)
+            for share in (1.0, 1e3, 1e6)
+            for ageing in (3e-5, 3e-4, 3e-3)
+        ]
     # The fit begins with the last, widest candidate: under a narrow prior the noise estimated by
     # the first fit would absorb changes of the unit.
-    tried.append((tried[-1][0], 1.0))
+    if any(stated):
+        tried.append((tried[-1][0], 1.0))
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
     used = range(len(calibration.response))
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
     mean = as_vector(state, layout)[: layout.n_unit]
-    return [InformativePrior(mean, _root(*candidate, to_file)) for candidate in tried]
+    return [
+        InformativePrior(mean, _root(wide, share, to_file), is_changed=share > 1.0)
+        for wide, share in tried
+    ]
 
 
 def _root(covariance: Floats, share: float, to_file: Floats) -> Floats:

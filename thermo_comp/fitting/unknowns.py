@@ -205,10 +205,12 @@ class InformativePrior:
 
     mean: shape (n_unit,)
     root: upper triangular R with ``R.T @ R`` the inverse covariance, shape (n_unit, n_unit)
+    is_changed: whether the covariance is far wider than that of the prior calibration
     """
 
     mean: Floats
     root: Floats
+    is_changed: bool = False
 
 
 @dataclass(frozen=True)
