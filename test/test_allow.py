@@ -157,6 +157,14 @@ def test_an_axis_that_is_dead_in_one_position_is_named(rng):
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads \S+ to the bit for 0\.\d+ h: the axis is'):
         fit(sources_of(rests), FORCE)
+    for rest in rests:
+        rest.accel[:, 2] = rest.level[2]
+    # WHY: an axis that was stuck in all positions, at a number of each, ended in a traceback.
+    with pytest.raises(
+        FitError, match=r'^bag0: z reads \S+ to the bit for 0\.\d+ h; bag1: z .*dead'
+    ):
+        fit(sources_of(rests), FORCE)
+    rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
     # WHY: axes at the full scale, here 10 m/s^2, were taken for dead axes.
     rests[2].accel[:, 0], rests[4].accel[:, 1] = -10.0, 10.0
     with pytest.raises(FitError, match=r'^bag2: x .*; bag4: y .* full scale: .*-scale 9.999 '):

@@ -159,10 +159,16 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
 
 
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
-    """Find axes that are constant throughout a rest, but not in most of the rests."""
+    """
+    Find axes that are constant throughout a rest, but not in most of the rests, or that are
+    constant in every rest while another axis is not.
+    """
     rests = [(bag.source.name, rest) for bag in bags for rest in bag.intervals]
     alive = np.array([rest.sample_sd > 0.0 for _, rest in rests])
     usual = 2 * alive.sum(axis=0) >= len(rests)
+    if len(rests) > 1 and usual.any():
+        has_reading = np.any([rest.mean[0] != 0.0 for _, rest in rests], axis=0)
+        usual |= has_reading & ~alive.any(axis=0)
     for (name, rest), is_alive in zip(rests, alive, strict=True):
         is_dead = ~is_alive & usual & (np.ptp(rest.mean, axis=0) == 0.0)
         # The samples of a working axis show noise or drift within a thousand samples.
