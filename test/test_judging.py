@@ -21,6 +21,7 @@ from thermo_comp.recording.reader import open_recording
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter, table_writer
 from thermo_comp.replay import replay
+from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G, parse_acceleration, ug_text
 from thermo_comp.unit.provenance import Provenance, ResidualSummary, Source
 
@@ -207,6 +208,13 @@ class TestWindows:
         short = resting(tmp_path / 'short', 25.0, minutes=0.5)
         (note,) = evaluate([good, short], [('it', CLAIMING)]).notes
         assert note.startswith(f'{short}: no window of 60 s at rest')
+
+    def test_a_report_that_judges_nothing_does_not_count_as_valid(self, tmp_path, cli):
+        short = resting(tmp_path / 'short', 25.0, minutes=0.5)
+        save_calibration(CLAIMING, tmp_path / 'unit.yaml')
+        options = '-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'report.html'
+        finished = cli('report', short, *options, code=1)
+        assert 'not judged: no recording has a rest' in finished.stdout
 
     def test_another_unit_and_a_bag_shorter_than_a_window_are_refused(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0, minutes=1.0, serial='T-9')

@@ -231,7 +231,7 @@ def report(
     judgement = evidence.judgement
     out.line(f'{output}: {evidence.headline}')
     out.end(
-        judgement.exit_code if judgement else 0,
+        judgement.exit_code if judgement else int(bool(opened and loaded)),
         output=output,
         **picked(evidence, 'headline findings'),
         history=drifts_of(evidence.history),

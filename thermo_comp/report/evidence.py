@@ -103,6 +103,8 @@ class Evidence:
         if self.judgement is not None:
             return str(self.judgement)
         if self.calibration is not None:
+            if self.bags:
+                return 'not judged: no recording has a rest of the length of a window'
             return 'the calibration alone: no recording was judged with it'
         if not self.bags:
             return 'nothing to show yet: no file could be read'
