@@ -95,7 +95,7 @@ def contradiction(
     """Find the bags whose drift contradicts a calibration of the same unit."""
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(known, data, options.gravity)
-    first = informative_priors(known, regression, state, windows.model, options)[0]
+    first = next(informative_priors(known, regression, state, windows.model, options))
     # Length of a typical window [s], and the white noise of its mean [m/s^2].
     window_s = windows.typical_count * known.unit.cycle_time_s
     sigma = np.array(known.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)

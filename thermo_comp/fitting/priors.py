@@ -11,6 +11,7 @@ increased by the ageing of the unit.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields, replace
 
 import numpy as np
@@ -95,7 +96,7 @@ def informative_priors(
     state: State,
     model: Model,
     options: FitOptions,
-) -> list[InformativePrior]:
+) -> Iterator[InformativePrior]:
     """
     Return candidate priors from a calibration, which the fit compares by evidence.
 
@@ -130,7 +131,9 @@ def informative_priors(
             for multiple in (0.3, 1.0)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
-        # Candidates in which the effects of temperature have changed as well.
+        # Candidates in which the effects of temperature have changed as well: `share` multiplies
+        # the sd of the prior by 1.4, 30 and 1000, as the sd of a good prior may be a thousandth
+        # of the effect itself.
         tried += [
             (grown(ageing * options.gravity, ageing), share)
             for share in (1.0, 1e3, 1e6)
@@ -145,10 +148,10 @@ def informative_priors(
     used = range(len(calibration.response))
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
     mean = as_vector(state, layout)[: layout.n_unit]
-    return [
+    return (
         InformativePrior(mean, _root(wide, share, to_file), is_changed=share > 1.0)
         for wide, share in tried
-    ]
+    )
 
 
 def _root(covariance: Floats, share: float, to_file: Floats) -> Floats:

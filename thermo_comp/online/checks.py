@@ -25,6 +25,7 @@ from .status import GravityResidual
 #: Smallest number of equal samples in a row at which the converter counts as stuck.
 STUCK_SAMPLES: Final = 50
 #: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck.
+#: A turn by 1.2 degrees makes this change; noise and the steps of a converter at rest do not.
 MOTION: Final = 0.2
 #: Largest accepted ratio of the long-term rate of samples to the calibrated rate.
 LARGEST_RATE: Final = 1.5
