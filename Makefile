@@ -3,7 +3,7 @@
 #
 # make demo   sets up .venv, plays the sample bag over DDS into the node, prints the table
 # make test   sets up .venv, runs the test suite
-# make slow   the tests that `make test` leaves out: further units, long statistics (two minutes)
+# make slow   the tests that `make test` leaves out: further units, long statistics (four minutes)
 # make lint   ruff, mypy --strict and the layering test
 # make nightly  `make slow`, and the properties of test_properties.py with ten thousand examples
 # make oldest  the suite with the oldest versions that setup.py allows, in .venv-oldest

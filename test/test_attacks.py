@@ -199,6 +199,7 @@ for at in range(1, 1000):
 """
 
 
+@pytest.mark.slow
 def test_a_write_killed_at_any_line_leaves_the_old_or_the_new_calibration(tmp_path):
     old, new, target = (tmp_path / f'{name}.yaml' for name in ('old', 'new', 'unit'))
     for path, serial in ((old, 'old'), (new, 'new'), (target, 'old')):

@@ -94,6 +94,7 @@ def test_rows_of_tables_have_as_many_cells_as_their_head():
             assert len(numbers) == 1, f'{page.name}: {table[:200]}'
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
     for module in ('material', 'mkdocstrings', 'mkdocs_jupyter'):
         pytest.importorskip(module, reason=f'{module} is not installed: the extra `docs`')

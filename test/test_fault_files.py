@@ -139,8 +139,12 @@ def run(script, *arguments, cwd):
 
 @pytest.mark.parametrize(
     ('name', 'point'),
-    [(name, 'before') for name in ('unit.yaml', 'page.html', 'bag.mcap')]
-    + [('bag.mcap', 'writing')],
+    [
+        pytest.param('unit.yaml', 'before', marks=pytest.mark.slow),
+        pytest.param('page.html', 'before', marks=pytest.mark.slow),
+        ('bag.mcap', 'before'),
+        ('bag.mcap', 'writing'),
+    ],
 )
 def test_a_killed_command_leaves_the_old_file(folder, name, point):
     output = folder / name

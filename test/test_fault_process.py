@@ -199,7 +199,9 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    'number', [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_a_signal_while_samples_flow_ends_the_node_cleanly(path, number):
     with bench(path) as node:
         heard = node.play(bag(duration_s=20.0))

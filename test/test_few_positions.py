@@ -56,6 +56,7 @@ def test_two_positions_tell_the_thermal_response():
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 
+@pytest.mark.slow
 def test_two_sets_leave_a_lag():
     assert (left_by((1, 2), model='golovach') > 10.0).all()
 
@@ -209,6 +210,7 @@ def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
+@pytest.mark.slow
 def test_one_tilted_support_is_not_the_scale_of_an_axis_across_gravity():
     # WHY: a tilt of 17 urad/K gave a scale slope of 817 +- 23 ppm/K, for prior sd up to 200 ppm/K.
     rng = rng_of('linear tilts', 1)

@@ -210,6 +210,7 @@ def test_nine_positions_claim_turn_ons_that_their_norms_cannot_show(rng):
     assert np.sqrt(np.mean(pulls(found, PLAIN) ** 2)) < 1.55
 
 
+@pytest.mark.slow
 def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng):
     # WHY: compensated samples, and a triad without drift, were fitted without a message.
     program = parse_cyclogram('20 10min, 45@1.5 15min, 5@1.5 15min')

@@ -153,6 +153,7 @@ def test_noise_parameters_are_estimated(noisy):
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
+@pytest.mark.slow
 def test_flicker_noise_has_several_correlation_times():
     # WHY: with a single correlation time the initial lag states and the tilts explained the slower
     # processes, and the errors of the biases were 1.9 claimed sd.

@@ -108,6 +108,7 @@ def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client,
     assert {name for name, known in seen.items() if known} == {'A/good'}
 
 
+@pytest.mark.slow
 def test_paths_with_dots_never_lead_out_of_the_folder(client, tmp_path):
     fleet = tmp_path / 'fleet'
     for seed, name in enumerate(('one', '..two', 'three..')):

@@ -104,6 +104,7 @@ class TestRow:
         )
         json.dumps(row, allow_nan=False)
 
+    @pytest.mark.slow
     def test_a_corrupt_bag_is_left_out_and_a_torn_bag_is_read_up_to_the_cut(self, tmp_path):
         paths = write_unit(tmp_path / 'u', 2, 6)
         paths[2].write_bytes(paths[2].read_bytes()[:-300])

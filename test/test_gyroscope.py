@@ -109,6 +109,7 @@ def test_the_residual_of_a_mems_gyroscope_is_its_noise(unit, fitted, held_out):
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
+@pytest.mark.slow
 def test_left_out_residuals_of_the_fit_hold_for_new_positions(fitted):
     row = fitted.rates[-1]
     assert row.section == 'all'
@@ -233,6 +234,7 @@ def test_the_rate_is_corrected_by_hand_numbers():
     np.testing.assert_allclose(np.square(sd), variances - noise, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_fit_with_a_prior_keeps_the_gyroscope_of_the_prior(unit, fitted):
     record = arrays(unit, plan('tumble', 2)[:1], 5, rate_hz=RATE_HZ)[0]
     again = fit([source_of(record, unit.scale_factor)], replace(OPTIONS, prior=fitted.calibration))
@@ -279,6 +281,7 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
     assert unknown.exit_code == 0
 
 
+@pytest.mark.slow
 def test_a_bag_without_temperature_change_gives_no_alarm(unit, fitted):
     bags = reduced(unit, arrays(unit, plan('tumble', 2)[:2], 3, rate_hz=RATE_HZ))
     rate = judge_bags(bags, fitted.calibration).rate

@@ -172,6 +172,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
     assert np.nanstd(difference, axis=0).max() < 1.2 * MICRO_G
 
 
+@pytest.mark.slow
 def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng, cli):
     paths, topics = [], Topics()
     for number, part in enumerate(cut(recorded(rng, 900.0), (450.0,))):

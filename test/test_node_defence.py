@@ -259,7 +259,9 @@ def test_while_a_calibration_file_hangs_other_parameters_can_be_set(peer, unit):
         samples.go_on()
 
 
-@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    'number', [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
+)
 def test_while_a_calibration_file_hangs_the_node_can_be_ended(peer, unit, number):
     with NodeProcess('-p', f'calibration_file:={unit}', **OVER_UDP) as node:
         assert peer.set_parameters(calibration_file=str(unit))[0].successful

@@ -122,6 +122,7 @@ def test_the_node_equals_the_replay_for_counts(tmp_path):
     assert run(unit, tmp_path / 'bag', tmp_path) == n
 
 
+@pytest.mark.slow
 def test_the_board_decides_the_regime_of_a_unit_without_a_case_sensor(tmp_path):
     # WHY: `regime/dynamic` was not published, and the regime in the table of a replay was always
     # `unknown`.

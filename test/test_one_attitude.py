@@ -62,12 +62,13 @@ def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
         assert axis.residual_sd_m_s2 == pytest.approx(0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('draw', 'unit', 'is_cold'),
     [
-        pytest.param(consumer_grade, 3, False, marks=pytest.mark.slow),
-        pytest.param(consumer_grade, 4, False, marks=pytest.mark.slow),
-        pytest.param(navigation, 2, True, marks=pytest.mark.slow),
+        (consumer_grade, 3, False),
+        (consumer_grade, 4, False),
+        (navigation, 2, True),
         (navigation, 2, False),
     ],
 )

@@ -356,6 +356,7 @@ def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
     assert lags_of(calibration) <= {*FINE_TAUS}
 
 
+@pytest.mark.slow
 def test_soaks_alone_do_not_tell_lags_or_a_loose_thermometer():
     # Soaks determine no time constant. Soaks do not show the lag of the board either, so the
     # gradient of a ramp does not indicate a fault.

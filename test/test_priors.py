@@ -288,10 +288,10 @@ def test_the_command_names_the_nonlinear_terms_that_a_prior_leaves_out(cli, tmp_
 
 
 def test_a_prior_without_covariance_is_refused():
-    prior = replace(fitted(1).calibration, posterior=None)
+    prior = replace(fitted(9).calibration, posterior=None)
     few = [source(record) for record in test_of(9, 0, 6)]
     with pytest.raises(FitError, match='no covariance'):
-        fit(few, replace(OPTIONS, serial='unit-1', prior=prior))
+        fit(few, replace(OPTIONS, serial='unit-9', prior=prior))
 
 
 @pytest.mark.slow
