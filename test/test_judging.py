@@ -42,6 +42,7 @@ def resting(
     error=0.0,
     serial='',
     reading_s=1,
+    dead='',
 ):
     """Write a bag of a unit at rest, z up, whose z axis drifts with its temperature."""
     rng = np.random.default_rng(3)
@@ -53,6 +54,7 @@ def resting(
     counts = np.zeros((n, 3))
     counts[:, 2] = K * GRAVITY + SLOPE * (celsius - 20.0) + error
     counts += noise * rng.standard_normal((n, 3))
+    counts[:, ['xyz'.index(axis) for axis in dead]] = 0.0
     # A working sensor never repeats a value for long, and repeated values are rejected.
     counts[::2, 0] += 1e-9
     if shaken_s:
@@ -406,6 +408,19 @@ def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(r
     hot = resting(tmp_path / 'hot', upper + 2.0)
     (note,) = replay(hot, CLAIMING, tmp_path / 'hot.mcap').notes
     assert note == f'board temperature +2.00 K {CONTINUED}'
+
+
+def test_an_axis_that_is_dead_in_a_rest_is_named(tmp_path):
+    # WHY: the norm of a unit at rest hardly shows an axis across gravity, and a bag with an axis
+    # that repeated one number for an hour was judged as valid.
+    bag = resting(tmp_path / 'dead.mcap', 20.0, noise=5.0, dead='y')
+    density = (5.0 / K * np.sqrt(0.1),) * 3
+    noisy = corrected_by(SLOPE, noise_density_m_s2_sqrt_hz=density)
+    noisy = dataclasses.replace(noisy, unit=dataclasses.replace(noisy.unit, cycle_time_s=0.1))
+    with pytest.raises(RecordingError, match=r'dead\.mcap: y reads 0 to the bit for 0\.'):
+        judged(bag, noisy)
+    # An axis whose noise is below the step of the converter may repeat one number.
+    assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))
 
 
 def test_windows_are_written_as_a_table(tmp_path):

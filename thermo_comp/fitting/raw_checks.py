@@ -11,6 +11,7 @@ import numpy as np
 
 from ..recording.overview import KELVINS
 from ..text import counted
+from ..typing import Bools
 from ..unit.calibration import POPULATION, Calibration
 from ..unit.gravity import STANDARD_GRAVITY
 from .data_checks import Finding, advice
@@ -74,7 +75,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         )
         yield advice('stuck', text)
     if dead := list(_dead_axes(bags)):
-        text = '; '.join(axis.text for axis in dead)
+        text = '; '.join(f'{axis.bag}: {axis.text}' for axis in dead)
         yield Finding('stuck', 'refusal', f'{text}: {_why_dead(bags, dead)}')
     means = np.concatenate([interval.mean for bag in bags for interval in bag.intervals])
     size = float(np.median(np.linalg.norm(means, axis=1)))
@@ -135,8 +136,9 @@ def _judge_units(
 
 
 class _DeadAxis(NamedTuple):
-    """An axis that is constant throughout a rest: the reading, and a description."""
+    """An axis that is constant throughout a rest of a bag: its reading, and a description."""
 
+    bag: str
     axis: int
     value: float
     text: str
@@ -163,20 +165,26 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
     Find axes that are constant throughout a rest, but not in most of the rests, or that are
     constant in every rest while another axis is not.
     """
-    rests = [(bag.source.name, rest) for bag in bags for rest in bag.intervals]
-    alive = np.array([rest.sample_sd > 0.0 for _, rest in rests])
+    rests = [rest for bag in bags for rest in bag.intervals]
+    alive = np.array([rest.sample_sd > 0.0 for rest in rests])
     usual = 2 * alive.sum(axis=0) >= len(rests)
     if len(rests) > 1 and usual.any():
-        has_reading = np.any([rest.mean[0] != 0.0 for _, rest in rests], axis=0)
+        has_reading = np.any([rest.mean[0] != 0.0 for rest in rests], axis=0)
         usual |= has_reading & ~alive.any(axis=0)
-    for (name, rest), is_alive in zip(rests, alive, strict=True):
-        is_dead = ~is_alive & usual & (np.ptp(rest.mean, axis=0) == 0.0)
-        # The samples of a working axis show noise or drift within a thousand samples.
-        for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
-            hours = (rest.end_ns - rest.start_ns) / 3600e9
-            value = float(rest.mean[0, axis])
-            text = f'{name}: {"xyz"[axis]} reads {value:g} to the bit for {hours:.2g} h'
-            yield _DeadAxis(int(axis), value, text)
+    return constant_axes(bags, usual)
+
+
+def constant_axes(bags: Sequence[ReducedBag], usual: Bools) -> Iterator[_DeadAxis]:
+    """Find axes that are constant throughout a rest, of the axes that `usual`ly are not, (3,)."""
+    for bag in bags:
+        for rest in bag.intervals:
+            is_dead = ~(rest.sample_sd > 0.0) & usual & (np.ptp(rest.mean, axis=0) == 0.0)
+            # The samples of a working axis show noise or drift within a thousand samples.
+            for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
+                hours = (rest.end_ns - rest.start_ns) / 3600e9
+                value = float(rest.mean[0, axis])
+                text = f'{"xyz"[axis]} reads {value:g} to the bit for {hours:.2g} h'
+                yield _DeadAxis(bag.source.name, int(axis), value, text)
 
 
 def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:

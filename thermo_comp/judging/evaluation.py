@@ -14,6 +14,7 @@ from ..errors import RecordingError
 from ..fitting.joining import joined
 from ..fitting.known_force import USUAL_FORCE, ForceOptions
 from ..fitting.options import COUNTS_FULL_SCALE
+from ..fitting.raw_checks import constant_axes
 from ..fitting.reduction import ReducedBag, reduce_source
 from ..fitting.sources import digest, recording_source
 from ..recording.blocks import Role
@@ -30,6 +31,8 @@ from .windows import WINDOW_S, corrected_windows, sum_length
 
 # Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
 _NOISES = 4.0
+# Smallest sd of the noise of a sample whose axis is never constant in a rest [counts].
+_DEAD_NOISE = 0.5
 # Smallest significant change of a constant between calibrations, in standard deviations.
 _SIGNIFICANT_SDS = 3.0
 
@@ -87,8 +90,20 @@ def open_bags(
                 'with --topic board=TOPIC',
                 path=str(path),
             )
+        if calibrations and (dead := _dead_axes(bag, calibrations[0])):
+            raise RecordingError(f'{dead}: the axis is dead there', path=str(path))
         bags.append(bag)
     return joined(bags)
+
+
+def _dead_axes(bag: ReducedBag, calibration: Calibration) -> str:
+    """Describe the axes of counts that are constant in a rest although they have noise."""
+    unit, density = calibration.unit, np.array(calibration.noise_density_m_s2_sqrt_hz)
+    if unit.input != 'counts':
+        return ''
+    scale = np.array([axis.scale_factor for axis in calibration.axes])
+    usual = density * scale / np.sqrt(unit.cycle_time_s) > _DEAD_NOISE
+    return '; '.join(axis.text for axis in constant_axes([bag], usual))
 
 
 def judge_bags(
