@@ -149,7 +149,7 @@ def test_thermometers_that_lag_board_and_case(sensors):
 def test_slow_tilts_of_a_support_are_no_second_stage_of_a_lag():
     # WHY: second stages, shares of the gradient and mounting offsets of 5 mg explained tilts of 60
     # urad within 4 h: the error in another program was 5.8 mg, for a cubic by hand 0.27 mg.
-    _, study = slow_drift(2)
+    _, study, _ = slow_drift(2)
     calibration = strangers.fitted(study)
     parts = {part.part for part in calibration.response if part.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
