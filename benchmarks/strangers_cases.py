@@ -342,23 +342,28 @@ def coarse_thermometer(number: int) -> Iterator[Study]:
 
 
 def slow_drift(number: int) -> Iterator[Study]:
-    """Let the bias walk within each bag, or the support tilt."""
-    for kind in ('bias', 'support'):
+    """Let the bias walk in each bag, the support tilt, or a bias of 1 mg decay within 10 min."""
+    for kind, grade, full_scale, rate_hz, ways in (
+        ('bias', navigation, 8388607.0, 0.5, (HALF, HELD)),
+        ('support', navigation, 8388607.0, 0.5, (HALF, HELD)),
+        ('power-on', consumer_grade, 32767.0, 10.0, (WARM, WARM_HELD)),
+    ):
         rng = rng_of('slow-drift', kind, number)
-        unit = navigation(rng)
-        fit, held = (
-            tuple(
-                _drifting(bag, unit, kind, rng)
-                for bag in positions(unit, way, spread(n, rng), rng)
-            )
-            for way, n in ((HALF, 12), (HELD, 3))
-        )
-        yield Study(kind, fit, one_test(held), FULL_SCALE)
+        unit = grade(rng)
+        parts = []
+        for way, n in zip(ways, (12, 3), strict=True):
+            bags = positions(unit, way, spread(n, rng), rng, rate_hz=rate_hz)
+            parts.append(tuple(_drifting(bag, unit, kind, rng) for bag in bags))
+        yield Study(kind, parts[0], one_test(parts[1]), {'full_scale': full_scale})
 
 
 def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
     """Add a walk of the bias, 20 ug per square root of an hour, or tilts of 60 urad in 4 h."""
     force = np.ones((len(bag.samples), 1)) * bag.force
+    if kind == 'power-on':
+        decay = 1e3 * UG * rng_of('decay', unit.bias.tolist()).standard_normal(3)
+        change = np.exp(-bag.time_s[:, None] / 600.0) * decay
+        return replace(bag, samples=np.rint(bag.samples + unit.counts * change))
     step = 20.0 * UG * np.sqrt(2.0 / 3600.0)  # in the 2 s from one sample to the next
     change = np.cumsum(step * rng.standard_normal(force.shape), axis=0)
     if kind == 'support':
@@ -426,11 +431,9 @@ def quadratic(number: int) -> Iterator[Study]:
 def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60.0) -> Floats:
     """
     Return the Cramer-Rao bound of the bias at the reference temperature, shape (3,), for a unit
-    whose bias and scale factor are parabolas.
-
-    The unknowns are the constants, the parabolas of bias and scale, and the direction of each
-    position. The data are the means of the three axes over windows that are short compared with
-    the program.
+    whose bias and scale factor are parabolas. The unknowns are the constants, the parabolas of
+    bias and scale, and the direction of each position; the data are means of the three axes over
+    windows that are short compared with the program.
     """
     n = len(up)
     tangents = np.array([np.linalg.svd(attitude[None])[2][1:] for attitude in up])

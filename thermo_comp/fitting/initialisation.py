@@ -44,6 +44,7 @@ class Problem:
 
     start: initial calibration of the triad, without effects of temperature
     up: directions of the positions, shape (n_positions, 3)
+    is_by_settled: whether the expected error of the settled bias limits the choice of a model
     """
 
     bags: Sequence[ReducedBag]
@@ -51,6 +52,7 @@ class Problem:
     start: ConstantCalibration
     up: Floats
     progress: Callable[[float], None]
+    is_by_settled: bool = False
 
 
 def regress(windows: ThermalWindows, problem: Problem) -> Fit:
@@ -100,6 +102,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         # model tilts would absorb errors of the two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     data = replace(data, has_prior=known is not None)
+    if not problem.is_by_settled:
+        data = replace(data, settled=None)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)

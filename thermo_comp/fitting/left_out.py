@@ -27,7 +27,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,6 +44,8 @@ _EQUAL = 0.1
 # Errors of up to 1.7 times the noise count as noise: in a soak, changes of the temperature by
 # hundredths of a kelvin, whose lag is not known, add to the white noise.
 _AS_NOISE = 1.7
+# Number of windows that are sufficient for the mean sd of the bias.
+_N_SEEN = 500
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,8 @@ class Score:
     halves: drift of left-out halves of the program, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window by a coarse board thermometer, RMS of the axes [m/s^2]
+    settled: expected error of the bias at settled temperatures [m/s^2], see `settled_error`; 0 if
+        it is not compared
     """
 
     positions: Folds
@@ -134,6 +138,7 @@ class Score:
     halves: Folds
     noise: float = 0.0
     by_thermometer: float = 0.0
+    settled: float = 0.0
 
     @property
     def kinds(self) -> tuple[Folds, Folds, Folds]:
@@ -145,6 +150,11 @@ class Score:
         """RMS of the left-out drift, the larger of the RMS over positions and over sections."""
         known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
         return max(known, default=float('nan'))
+
+    @property
+    def exceeds_noise(self) -> bool:
+        """Whether neither noise nor errors of a coarse thermometer explain the left-out drift."""
+        return self.rms > _AS_NOISE * float(np.hypot(self.noise, self.by_thermometer))
 
     @property
     def is_by_thermometer(self) -> bool:
@@ -180,6 +190,8 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     # The RMS error of left-out halves of the program may rise by a quarter, about its scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if is_worse_by_norms(before, after) or is_worse_by_halves:
+        return 0.0
+    if after.exceeds_noise and after.settled > before.settled:
         return 0.0
     total = sum(gain for gain, _ in drift)
     is_sure = bool(must_gain) and all(gain > error for gain, error in must_gain)
@@ -243,7 +255,42 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
     by_thermometer = thermometer_error_of(regression.windows, scale, beyond_noise=True)
     errors = white_noise_of(regression.windows, scale), by_thermometer
     rms = (float(np.sqrt(np.mean(error**2))) for error in errors)
-    return Score(positions, sections, norms, force, drift, by_halves, *rms)
+    score = Score(positions, sections, norms, force, drift, by_halves, *rms)
+    settled = regression.windows.settled
+    if settled is None:
+        return score
+    return replace(score, settled=settled_error(regression, posterior, score, settled))
+
+
+def settled_error(
+    regression: Regression, posterior: Posterior, score: Score, settled: Floats
+) -> float:
+    """
+    Return the expected error of the bias at constant temperatures, after all lags have settled
+    [m/s^2]; it is infinite for a model without a curve. `settled`: columns, shape (k, m).
+
+    Bags that all begin at one temperature show lags only together with the temperature itself, so
+    their settled bias is an extrapolation. Its error is the sd of the settled bias, and the
+    left-out drift beyond the noise, enlarged as the sd of the settled bias exceeds that in the
+    windows.
+    """
+    if not posterior.layout.used[0].any():
+        return np.inf
+    seen = regression.columns[:: max(len(regression.columns) // _N_SEEN, 1)]
+    sd, seen_sd = (
+        _sd_of_changes(posterior, columns - columns.mean(axis=0))
+        for columns in (settled / regression.rms, seen)
+    )
+    noise = np.hypot(score.noise, score.by_thermometer)
+    excess = np.sqrt(max(np.nan_to_num(score.rms) ** 2 - noise**2, 0.0))
+    return float(np.hypot(sd, excess * max(sd / seen_sd, 1.0)))
+
+
+def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
+    """RMS sd of the bias of three axes for columns, shape (k, m) [m/s^2]."""
+    parts = posterior.layout.by_weights(columns, np.zeros(3))
+    square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
+    return float(np.sqrt(square / (3 * len(columns))))
 
 
 def _by_positions(

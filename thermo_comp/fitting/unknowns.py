@@ -65,6 +65,8 @@ class Windows:
     board: temperature of the board [degC] and the variance of its estimate [K^2], shape (n, 2), or
         None if unknown
     board_noise: sd of the noise of a reading of the board's thermometer [K]
+    settled: values of the columns at constant temperatures over the range of the windows, when all
+        lags have settled, shape (k, m), or None if unknown
     """
 
     position: Ints
@@ -88,6 +90,7 @@ class Windows:
     has_prior: bool = False
     board: Floats | None = None
     board_noise: float = 0.0
+    settled: Floats | None = None
 
     @property
     def n_positions(self) -> int:

@@ -41,6 +41,8 @@ PART_SUMS = ('board', 'product', 'square')
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
 #: Smallest number of windows of a short rest: fewer windows do not determine the rest's noise.
 FEWEST_WINDOWS = 20
+# Number of temperatures at which the settled columns are evaluated.
+_N_SETTLED = 9
 #: Number of sections of equal length into which a position is divided. The bags repeat the
 #: chamber's program, so a section is the same part of the program in all positions.
 N_SECTIONS = 6
@@ -245,7 +247,7 @@ def thermal_windows(
     position, bag_of = np.repeat(np.arange(len(parts)), sizes), np.repeat(numbers, sizes)
     temperature, rate, weight, gradient = rows.thermal[:, [0, 2, 3, 4]].T
     return ThermalWindows(
-        *(model, _windows(model, spec, rows, position, bag_of)),
+        *(model, _windows(model, spec, rows, position, bag_of, table)),
         *(temperature, rate, weight, gradient),
         raw=rows.thermal[:, 5:],
         angular_rate=rows.angular_rate,
@@ -294,7 +296,9 @@ def _rows(
     )
 
 
-def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints) -> Windows:
+def _windows(
+    model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints, table: ColumnTable
+) -> Windows:
     """Make the data of the regression from windows of all rests."""
     curves = model.part_curves
     groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
@@ -321,6 +325,7 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
     kelvins = _kelvins(model, rows.columns, rows.thermal[:, 5:], t, gradient)
     # The columns of a curve over a part's temperature have at most one lag, the lag of the part.
     lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
+    settled = _settled(model, spec, rows, table)
     return Windows(
         position=position,
         bag=bag,
@@ -339,7 +344,24 @@ def _windows(model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: I
         acts_on=acts_on,
         board=rows.thermal[:, :2],
         board_noise=model.detector.board.noise_sd_c,
+        settled=np.hstack((settled, settled @ curves.sums.T)),
     )
+
+
+def _settled(model: Model, spec: MemorySpec, rows: _Rows, table: ColumnTable) -> Floats:
+    """
+    Return the columns at constant temperatures over the range of the windows, with settled lags
+    and the median gradient at rest, shape (k, m).
+    """
+    board, is_static = rows.thermal[:, 0], rows.thermal[:, 3] <= 0.5
+    some = is_static if is_static.any() else np.ones_like(is_static)
+    states = np.zeros((Layout(spec).width, _N_SETTLED))
+    states[BOARD] = np.linspace(board.min(), board.max(), _N_SETTLED)
+    states[GRADIENT] = np.median(rows.thermal[some, 4])
+    weight = np.zeros(_N_SETTLED)
+    curves = model.sets.columns(states[BOARD] - model.reference_temperature, weight)
+    factors, _ = table.factors(states[BOARD], weight)
+    return np.asarray(np.vstack((curves, table.raw(states) * factors)).T)
 
 
 def _sections(position: Ints, time: Floats) -> Ints:
