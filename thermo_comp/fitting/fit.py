@@ -34,16 +34,16 @@ from .gyroscope import RateRow, add_gyroscope
 from .initial_triad import within_positions
 from .initialisation import Problem, initial_triad
 from .joining import joined
-from .left_out import settled_error
 from .missing_readings import judge_missing
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of, offset_sd_of
 from .reduction import ReducedBag, reduce_source
+from .refit_checks import extrapolates, in_pieces, is_better_with_tilts, may_have_slow_tilts
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
-from .windows import CURVE, FEWEST_WINDOWS
+from .windows import FEWEST_WINDOWS
 
 Progress = Callable[[float], None]
 
@@ -202,15 +202,15 @@ def _fit_one_environment(
     elif known.unit.serial == first.calibration.unit.serial and not first.fit.windows.data.forces:
         excluded, is_changed = contradiction(first.fit.windows, known, options)
     if not excluded:
-        return _by_settled_bias(first, bags, options, progress)
+        return _refined(first, bags, options, progress)
     kept = [bag for k, bag in enumerate(bags) if k not in excluded]
     refit = first
     is_updated = is_changed and not kept
     if kept:
         refit = _fit(kept, options, progress)
         if known is None and not is_better_without(first.fit, refit.fit, excluded[0]):
-            return _by_settled_bias(first, bags, options, progress)
-        refit = _by_settled_bias(refit, kept, options, progress)
+            return _refined(first, bags, options, progress)
+        refit = _refined(refit, kept, options, progress)
     elif known is not None and not is_updated:
         # If all bags contradict the prior's effects of temperature, and the constants have not
         # changed, the bags are of another environment and cannot update the prior.
@@ -228,31 +228,30 @@ def _fit_one_environment(
     )
 
 
-def _by_settled_bias(
+def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
     """
-    Fit again if the chosen model leaves more than noise, and its settled bias has a larger error
-    than that of a smaller model; this error then limits the choice, too. Otherwise a drift after
-    power-on, which no thermometer shows, is taken for a lag of the temperature.
+    Fit again without an effect that the bags do not show, or with slow tilts of the supports, if
+    the chosen model seems to lack them, see `refit_checks`.
     """
-    fit, settled = result.fit, result.fit.windows.data.settled
-    trials = fit.selected.trials
-    chosen = next((trial for trial in trials if trial.is_chosen), None)
-    if options.prior is not None or chosen is None or settled is None:
+    if options.prior is not None or options.model == 'golovach':
         return result
-    if not chosen.score.exceeds_noise:
+    if extrapolates(result.fit):
+        result = _fit(bags, options, progress, is_by_settled=True)
+    if not may_have_slow_tilts(result.fit):
         return result
-    smaller = [
-        trial for trial in trials if trial.groups == (CURVE,) or {*trial.groups} < {*chosen.groups}
-    ]
-    error, *errors = (
-        settled_error(fit.regression, trial.posterior, trial.score, settled)
-        for trial in (chosen, *smaller)
-    )
-    if not min(errors, default=np.inf) < error < np.inf:
+    pieces = [in_pieces(bag) for bag in bags]
+    if sum(len(bag.intervals) for bag in pieces) == sum(len(bag.intervals) for bag in bags):
         return result
-    return _fit(bags, options, progress, is_by_settled=True)
+    tilted = _fit(pieces, options, progress, has_pieces=True)
+    if not is_better_with_tilts(result.fit, tilted.fit):
+        return result
+    text = 'left-out norms are smaller if the supports may tilt from hour to hour: each hour of a '
+    finding = Finding('tilt', 'advice', f'{text}rest counts as a rest with its own attitude')
+    calibration = with_notes(tilted.calibration, [finding])
+    findings = (*tilted.findings, finding)
+    return replace(tilted, calibration=calibration, findings=findings, bags=tuple(bags))
 
 
 def _fit(
@@ -261,10 +260,11 @@ def _fit(
     progress: Progress,
     *,
     is_by_settled: bool = False,
+    has_pieces: bool = False,
 ) -> FitResult:
     """
-    Fit a calibration to bags whose readings at zero force are near 0; `is_by_settled`: whether the
-    expected error of the settled bias limits the choice of a model.
+    Fit a calibration to bags whose readings at zero force are near 0; for `is_by_settled` and
+    `has_pieces` see `Problem`.
     """
     bags, findings = _judged(bags, options)
     windows = windows_of(bags, model_of(bags, options), options)
@@ -278,7 +278,9 @@ def _fit(
     findings += enforce(data_checks.judge_windows(windows, up, has_case, known), options)
     findings += judge_missing(windows)
     progress(0.7)
-    fit = regressed(windows, Problem(bags, options, start, up, progress, is_by_settled))
+    fit = regressed(
+        windows, Problem(bags, options, start, up, progress, is_by_settled, has_pieces)
+    )
     selected, terms = choose(fit.regression, fit.selected, options)
     fit = fit._replace(selected=selected)
     offset_sd = 0.0 if known is None else offset_sd_of(known)

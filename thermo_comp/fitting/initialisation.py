@@ -45,6 +45,7 @@ class Problem:
     start: initial calibration of the triad, without effects of temperature
     up: directions of the positions, shape (n_positions, 3)
     is_by_settled: whether the expected error of the settled bias limits the choice of a model
+    has_pieces: whether the positions are pieces of rests, see `refit_checks`
     """
 
     bags: Sequence[ReducedBag]
@@ -53,6 +54,7 @@ class Problem:
     up: Floats
     progress: Callable[[float], None]
     is_by_settled: bool = False
+    has_pieces: bool = False
 
 
 def regress(windows: ThermalWindows, problem: Problem) -> Fit:
@@ -69,7 +71,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
         is_settled = is_steady & rests.is_without_drift(data, problem.start.scale)
         is_settled &= rests.is_bench(windows, problem.up)
         windows = replace(windows, data=rests.constant_in(data, is_steady, is_settled))
-    if not rests.is_constant(windows, windows.data.position):
+    if problem.has_pieces or not rests.is_constant(windows, windows.data.position):
         return _regress(windows, problem)
     # In a soak a lag of unknown size and the remaining drift of the temperature change the
     # readings by similar amounts, so only the norms of the positions determine the curve.

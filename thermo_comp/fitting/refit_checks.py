@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the checks of a chosen model for effects that no column has: a drift after power-on, and slow
+tilts of the supports. The fit is repeated if a check finds such an effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..typing import Floats
+from .left_out import settled_error
+from .reduction import ReducedBag, StillInterval
+from .selection import Fit
+from .unknowns import Windows
+from .windows import CURVE
+
+# Length of a piece of a rest in which a slow tilt of the support is constant [s].
+_PIECE_S = 3600.0
+# Slow tilts are tried if the drifts of left-out positions, averaged over the pieces, exceed six
+# times their white noise and a tenth of the error of the left-out norms: other drifts are small.
+_SLOW_DRIFT, _PART_OF_NORMS = 6.0, 0.1
+# Smallest number of positions whose norms the others determine: with fewer, the gain by slow tilts
+# has no reliable standard error.
+_FEWEST_NORMS = 6
+# Smallest gain of the left-out norms by slow tilts, a log ratio of mean squares: 14 % of an RMS.
+_TILT_GAIN = 0.3
+
+
+def extrapolates(fit: Fit) -> bool:
+    """
+    Whether the chosen model leaves more than noise, and its settled bias has a larger expected
+    error than that of a smaller model, see `left_out.settled_error`.
+    """
+    settled, trials = fit.windows.data.settled, fit.selected.trials
+    chosen = next((trial for trial in trials if trial.is_chosen), None)
+    if chosen is None or settled is None or not chosen.score.exceeds_noise:
+        return False
+    smaller = [
+        trial for trial in trials if trial.groups == (CURVE,) or {*trial.groups} < {*chosen.groups}
+    ]
+    error, *errors = (
+        settled_error(fit.regression, trial.posterior, trial.score, settled)
+        for trial in (chosen, *smaller)
+    )
+    return bool(min(errors, default=np.inf) < error < np.inf)
+
+
+def may_have_slow_tilts(fit: Fit) -> bool:
+    """
+    Whether the drifts of left-out positions are not only noise, and are a part of the error of
+    their norms. Slow tilts of a support change the axes across gravity, and hardly the norms.
+    """
+    score, data = fit.selected.score, fit.windows.data
+    if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
+        return False
+    drift, n_windows = _slow_drift(data, score.drift)
+    least = max(_SLOW_DRIFT * score.noise / n_windows**0.5, _PART_OF_NORMS * score.norms.rms)
+    return bool(drift > least)
+
+
+def _slow_drift(data: Windows, drift: Floats) -> tuple[float, float]:
+    """
+    Return the RMS over the axes of the means of drifts over each hour of a position, and the mean
+    number of windows per hour; `drift`: drift of each window, NaN if unknown, shape (n, 3).
+    """
+    known = np.isfinite(drift).all(axis=1)
+    if not known.any():
+        return 0.0, 1.0
+    hour = np.floor((data.time - data.time[data.edges[:-1]][data.position]) / _PIECE_S)
+    _, piece = np.unique(np.stack((data.position, hour))[:, known], axis=1, return_inverse=True)
+    count = np.bincount(piece)
+    means = [np.bincount(piece, axis[known]) / count for axis in drift.T]
+    square = np.average(np.mean(np.square(means), axis=0), weights=count)
+    return float(np.sqrt(square)), float(np.mean(count))
+
+
+def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
+    """Whether the left-out norms decrease if the supports may tilt from hour to hour."""
+    before, after = fit.selected.score.norms, tilted.selected.score.norms
+    n_common = np.sum(np.isfinite(before.square) & np.isfinite(after.square))
+    gain = before.gain_of(after)
+    return bool(n_common >= _FEWEST_NORMS and gain and gain[0] > max(gain[1], _TILT_GAIN))
+
+
+def in_pieces(bag: ReducedBag) -> ReducedBag:
+    """
+    Divide the rests of a bag into pieces of equal numbers of windows, nearest to an hour each.
+    Each piece has its own attitude, as if the support had tilted between the pieces.
+    """
+    pieces = [piece for rest in bag.intervals for piece in _pieces(rest, bag.window_s)]
+    return replace(bag, intervals=tuple(pieces))
+
+
+def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
+    n = len(rest.time)
+    edges = np.linspace(0, n, max(round(n * window_s / _PIECE_S), 1) + 1).round().astype(int)
+    for first, last in pairwise(edges.tolist()):
+        rows = slice(first, last)
+        yield replace(
+            rest,
+            start_ns=rest.start_ns + round(first * window_s * 1e9),
+            end_ns=rest.end_ns if last == n else rest.start_ns + round(last * window_s * 1e9),
+            begin_s=rest.begin_s + first * window_s,
+            n_whole=min(max(rest.n_whole - first, 0), last - first),
+            time=rest.time[rows],
+            count=rest.count[rows],
+            mean=rest.mean[rows],
+            angular_rate=None if rest.angular_rate is None else rest.angular_rate[rows],
+        )
