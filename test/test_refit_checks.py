@@ -2,17 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The checks of a chosen model: rests in pieces of an hour, and supports that tilt slowly."""
 
+import sys
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import strangers
 from hypothesis import given
 from hypothesis import strategies as st
-from position_helpers import Rest
+from position_helpers import GRAVITY, Rest
 from strangers_baselines import minutes
 from strangers_cases import slow_drift
 
+from thermo_comp.errors import FitError
+from thermo_comp.fitting.options import FitOptions
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.refit_checks import in_pieces
+
+# The package exports a function of the same name.
+fit_module = sys.modules['thermo_comp.fitting.fit']
 
 
 @given(n_minutes=st.integers(10, 400), window_s=st.sampled_from([30.0, 60.0]))
@@ -31,6 +39,25 @@ def test_the_pieces_of_a_rest_are_the_rest(n_minutes, window_s):
     assert len(hours) == len(bag.intervals) or (min(hours) > 0.66 and max(hours) < 1.51)
     assert pieces.intervals[0].start_ns == bag.intervals[0].start_ns
     assert pieces.intervals[-1].end_ns == bag.intervals[-1].end_ns
+
+
+def test_a_refused_second_fit_keeps_the_first(rng, monkeypatch):
+    # WHY: pieces of rests may determine less than the rests, and their fit may be refused.
+    first_fit = fit_module._fit
+
+    def refusing(*args, **given):
+        if any(given.values()):
+            raise FitError('refused')
+        return first_fit(*args, **given)
+
+    rest = Rest(rng).source()
+    options = FitOptions(gravity=GRAVITY, input='m/s^2')
+    expected = fit_module.fit([rest], options)
+    monkeypatch.setattr(fit_module, '_fit', refusing)
+    monkeypatch.setattr(fit_module, 'extrapolates', lambda _: True)
+    monkeypatch.setattr(fit_module, 'may_have_slow_tilts', lambda _: True)
+    monkeypatch.setattr(fit_module, 'in_pieces', lambda bag: replace(bag, intervals=()))
+    assert fit_module.fit([rest], options).residuals == expected.residuals
 
 
 @pytest.mark.slow

@@ -238,20 +238,30 @@ def _refined(
     if options.prior is not None or options.model == 'golovach':
         return result
     if extrapolates(result.fit):
-        result = _fit(bags, options, progress, is_by_settled=True)
+        result = _tried(bags, options, progress, is_by_settled=True) or result
     if not may_have_slow_tilts(result.fit):
         return result
     pieces = [in_pieces(bag) for bag in bags]
     if sum(len(bag.intervals) for bag in pieces) == sum(len(bag.intervals) for bag in bags):
         return result
-    tilted = _fit(pieces, options, progress, has_pieces=True)
-    if not is_better_with_tilts(result.fit, tilted.fit):
+    tilted = _tried(pieces, options, progress, has_pieces=True)
+    if tilted is None or not is_better_with_tilts(result.fit, tilted.fit):
         return result
     text = 'left-out norms are smaller if the supports may tilt from hour to hour: each hour of a '
     finding = Finding('tilt', 'advice', f'{text}rest counts as a rest with its own attitude')
     calibration = with_notes(tilted.calibration, [finding])
     findings = (*tilted.findings, finding)
     return replace(tilted, calibration=calibration, findings=findings, bags=tuple(bags))
+
+
+def _tried(
+    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress, **given: bool
+) -> FitResult | None:
+    """Fit once more; return None if this fit is refused, as the fit before it was not."""
+    try:
+        return _fit(bags, options, progress, **given)
+    except (FitError, np.linalg.LinAlgError):
+        return None
 
 
 def _fit(

@@ -283,7 +283,9 @@ def settled_error(
     )
     noise = np.hypot(score.noise, score.by_thermometer)
     excess = np.sqrt(max(np.nan_to_num(score.rms) ** 2 - noise**2, 0.0))
-    return float(np.hypot(sd, excess * max(sd / seen_sd, 1.0)))
+    # The columns are constant in the windows if the temperature hardly changes.
+    growth = max(sd / seen_sd, 1.0) if seen_sd else 1.0
+    return float(np.hypot(sd, excess * growth))
 
 
 def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
