@@ -360,8 +360,9 @@ def test_a_decay_after_power_on_is_no_lag():
         for way, n in ((WARM, 12), (WARM_HELD, 4))
     )
     study = Study('', fit, one_test(held), {'full_scale': 32767.0})
-    # A decay that the fit leaves has an RMS of 0.32 mg over the 95 min of the bags.
-    assert judged(strangers.fitted(study), study).vector < 1.5 * 320.0
+    # A decay that the fit leaves has an RMS of 0.32 mg over the 95 min of the bags. Its mean moves
+    # the constants, and is smaller.
+    assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 
 def lags_of(calibration):

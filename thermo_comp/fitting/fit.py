@@ -22,7 +22,7 @@ from ..text import valid_serial
 from ..typing import Floats
 from ..unit.calibration import Axes, AxisReference, Calibration, Unit
 from ..unit.gravity import STANDARD_GRAVITY
-from . import data_checks, raw_checks
+from . import data_checks, raw_checks, refit_checks
 from .alternatives import model_of, regressed, windows_of
 from .assembly import build_calibration
 from .claim import claim_of
@@ -39,7 +39,6 @@ from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of, offset_sd_of
 from .reduction import ReducedBag, reduce_source
-from .refit_checks import extrapolates, in_pieces, is_better_with_tilts, may_have_slow_tilts
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
@@ -232,26 +231,27 @@ def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
     """
-    Fit again without an effect that the bags do not show, or with slow tilts of the supports, if
-    the chosen model seems to lack them, see `refit_checks`.
+    Fit again without an effect that the bags do not show, or with slow tilts, see `refit_checks`.
     """
     if options.prior is not None or options.model == 'golovach':
         return result
-    if extrapolates(result.fit):
+    if refit_checks.extrapolates(result.fit):
         result = _tried(bags, options, progress, is_by_settled=True) or result
-    if not may_have_slow_tilts(result.fit):
+    if not refit_checks.may_have_slow_tilts(result.fit):
         return result
-    pieces = [in_pieces(bag) for bag in bags]
+    pieces = [refit_checks.in_pieces(bag) for bag in bags]
     if sum(len(bag.intervals) for bag in pieces) == sum(len(bag.intervals) for bag in bags):
         return result
     tilted = _tried(pieces, options, progress, has_pieces=True)
-    if tilted is None or not is_better_with_tilts(result.fit, tilted.fit):
+    if tilted is None or not refit_checks.is_better_with_tilts(result.fit, tilted.fit):
         return result
-    text = 'left-out norms are smaller if the supports may tilt from hour to hour: each hour of a '
-    finding = Finding('tilt', 'advice', f'{text}rest counts as a rest with its own attitude')
-    calibration = with_notes(tilted.calibration, [finding])
-    findings = (*tilted.findings, finding)
-    return replace(tilted, calibration=calibration, findings=findings, bags=tuple(bags))
+    return replace(
+        tilted,
+        calibration=with_notes(tilted.calibration, [refit_checks.SLOW_TILTS]),
+        positions=refit_checks.of_whole_rests(tilted.positions, bags),
+        findings=(*tilted.findings, refit_checks.SLOW_TILTS),
+        bags=tuple(bags),
+    )
 
 
 def _tried(

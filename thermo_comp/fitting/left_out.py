@@ -35,6 +35,7 @@ from ..typing import Floats, Ints
 from .elimination import inverse_root
 from .initial_triad import thermometer_error_of, white_noise_of
 from .regression import Point, Posterior, Regression
+from .settled_bias import settled_error
 from .unknowns import State
 
 # Smallest number of windows of a position for a score of the position's drift.
@@ -44,8 +45,6 @@ _EQUAL = 0.1
 # Errors of up to 1.7 times the noise count as noise: in a soak, changes of the temperature by
 # hundredths of a kelvin, whose lag is not known, add to the white noise.
 _AS_NOISE = 1.7
-# Number of windows that are sufficient for the mean sd of the bias.
-_N_SEEN = 500
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ class Score:
     halves: drift of left-out halves of the program, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window by a coarse board thermometer, RMS of the axes [m/s^2]
-    settled: expected error of the bias at settled temperatures [m/s^2], see `settled_error`; 0 if
+    settled: expected error of the bias at settled temperatures [m/s^2], see `settled_bias`; 0 if
         it is not compared
     """
 
@@ -155,6 +154,12 @@ class Score:
     def exceeds_noise(self) -> bool:
         """Whether neither noise nor errors of a coarse thermometer explain the left-out drift."""
         return self.rms > _AS_NOISE * float(np.hypot(self.noise, self.by_thermometer))
+
+    @property
+    def excess(self) -> float:
+        """RMS of the left-out drift beyond noise and thermometer [m/s^2]; 0 if it is unknown."""
+        square = self.rms**2 - self.noise**2 - self.by_thermometer**2
+        return float(np.sqrt(square)) if square > 0.0 else 0.0
 
     @property
     def is_by_thermometer(self) -> bool:
@@ -259,40 +264,7 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
     settled = regression.windows.settled
     if settled is None:
         return score
-    return replace(score, settled=settled_error(regression, posterior, score, settled))
-
-
-def settled_error(
-    regression: Regression, posterior: Posterior, score: Score, settled: Floats
-) -> float:
-    """
-    Return the expected error of the bias at constant temperatures, after all lags have settled
-    [m/s^2]; it is infinite for a model without a curve. `settled`: columns, shape (k, m).
-
-    Bags that all begin at one temperature show lags only together with the temperature itself, so
-    their settled bias is an extrapolation. Its error is the sd of the settled bias, and the
-    left-out drift beyond the noise, enlarged as the sd of the settled bias exceeds that in the
-    windows.
-    """
-    if not posterior.layout.used[0].any():
-        return np.inf
-    seen = regression.columns[:: max(len(regression.columns) // _N_SEEN, 1)]
-    sd, seen_sd = (
-        _sd_of_changes(posterior, columns - columns.mean(axis=0))
-        for columns in (settled / regression.rms, seen)
-    )
-    noise = np.hypot(score.noise, score.by_thermometer)
-    excess = np.sqrt(max(np.nan_to_num(score.rms) ** 2 - noise**2, 0.0))
-    # The columns are constant in the windows if the temperature hardly changes.
-    growth = max(sd / seen_sd, 1.0) if seen_sd else 1.0
-    return float(np.hypot(sd, excess * growth))
-
-
-def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
-    """RMS sd of the bias of three axes for columns, shape (k, m) [m/s^2]."""
-    parts = posterior.layout.by_weights(columns, np.zeros(3))
-    square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
-    return float(np.sqrt(square / (3 * len(columns))))
+    return replace(score, settled=settled_error(regression, posterior, score.excess, settled))
 
 
 def _by_positions(

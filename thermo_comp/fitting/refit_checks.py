@@ -7,16 +7,18 @@ tilts of the supports. The fit is repeated if a check finds such an effect.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 
 from ..typing import Floats
-from .left_out import settled_error
+from .data_checks import advice
+from .evidence import PositionReport
 from .reduction import ReducedBag, StillInterval
 from .selection import Fit
+from .settled_bias import settled_error
 from .unknowns import Windows
 from .windows import CURVE
 
@@ -30,12 +32,17 @@ _SLOW_DRIFT, _PART_OF_NORMS = 6.0, 0.1
 _FEWEST_NORMS = 6
 # Smallest gain of the left-out norms by slow tilts, a log ratio of mean squares: 14 % of an RMS.
 _TILT_GAIN = 0.3
+SLOW_TILTS = advice(
+    'tilt',
+    'left-out norms are smaller if the supports may tilt from hour to hour: each hour of a rest '
+    'was fitted with its own attitude',
+)
 
 
 def extrapolates(fit: Fit) -> bool:
     """
     Whether the chosen model leaves more than noise, and its settled bias has a larger expected
-    error than that of a smaller model, see `left_out.settled_error`.
+    error than that of a smaller model, see `settled_bias`.
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next((trial for trial in trials if trial.is_chosen), None)
@@ -45,7 +52,7 @@ def extrapolates(fit: Fit) -> bool:
         trial for trial in trials if trial.groups == (CURVE,) or {*trial.groups} < {*chosen.groups}
     ]
     error, *errors = (
-        settled_error(fit.regression, trial.posterior, trial.score, settled)
+        settled_error(fit.regression, trial.posterior, trial.score.excess, settled)
         for trial in (chosen, *smaller)
     )
     return bool(min(errors, default=np.inf) < error < np.inf)
@@ -97,9 +104,13 @@ def in_pieces(bag: ReducedBag) -> ReducedBag:
     return replace(bag, intervals=tuple(pieces))
 
 
+def _n_pieces(n_windows: int, window_s: float) -> int:
+    return max(round(n_windows * window_s / _PIECE_S), 1)
+
+
 def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
     n = len(rest.time)
-    edges = np.linspace(0, n, max(round(n * window_s / _PIECE_S), 1) + 1).round().astype(int)
+    edges = np.linspace(0, n, _n_pieces(n, window_s) + 1).round().astype(int)
     for first, last in pairwise(edges.tolist()):
         rows = slice(first, last)
         yield replace(
@@ -113,3 +124,34 @@ def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
             mean=rest.mean[rows],
             angular_rate=None if rest.angular_rate is None else rest.angular_rate[rows],
         )
+
+
+def of_whole_rests(
+    pieces: Sequence[PositionReport], bags: Sequence[ReducedBag]
+) -> tuple[PositionReport, ...]:
+    """Join the reports of the pieces of each rest: the mean attitude, and RMS of all pieces."""
+    result, left = [], iter(pieces)
+    for bag in bags:
+        for rest in bag.intervals:
+            parts = list(islice(left, _n_pieces(len(rest.time), bag.window_s)))
+            share = np.array([part.duration_s for part in parts])
+            up = share @ np.array([part.up for part in parts])
+            x, y, z = (up / np.linalg.norm(up)).tolist()
+            in_sample, left_out = (
+                float(np.sqrt(np.average(np.square(rms), weights=share)))
+                for rms in (
+                    [part.residual_rms for part in parts],
+                    [part.left_out_rms for part in parts],
+                )
+            )
+            result.append(
+                PositionReport(
+                    source=bag.source.name,
+                    start_ns=rest.start_ns,
+                    duration_s=(rest.end_ns - rest.start_ns) * 1e-9,
+                    up=(x, y, z),
+                    residual_rms=in_sample,
+                    left_out_rms=left_out,
+                )
+            )
+    return tuple(result)

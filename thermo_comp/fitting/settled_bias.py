@@ -1,0 +1,48 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the expected error of the bias at constant temperatures, after all lags have settled.
+
+Bags that all begin at one temperature show lags only together with the temperature itself, so
+their settled bias is an extrapolation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..typing import Floats
+from .regression import Posterior, Regression
+
+# Number of windows that are sufficient for the mean sd of the bias.
+_N_SEEN = 500
+
+
+def settled_error(
+    regression: Regression, posterior: Posterior, excess: float, settled: Floats
+) -> float:
+    """
+    Return the expected error of the settled bias [m/s^2]; it is infinite for a model without a
+    curve.
+
+    The error is the sd of the settled bias, and the left-out drift beyond the noise, `excess`
+    [m/s^2], enlarged as the sd of the settled bias exceeds that in the windows. `settled`: columns
+    at settled temperatures, shape (k, m).
+    """
+    if not posterior.layout.used[0].any():
+        return np.inf
+    seen = regression.columns[:: max(len(regression.columns) // _N_SEEN, 1)]
+    sd, seen_sd = (
+        _sd_of_changes(posterior, columns - columns.mean(axis=0))
+        for columns in (settled / regression.rms, seen)
+    )
+    # The columns are constant in the windows if the temperature hardly changes.
+    growth = max(sd / seen_sd, 1.0) if seen_sd else 1.0
+    return float(np.hypot(sd, excess * growth))
+
+
+def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
+    """RMS sd of the bias of three axes for columns, shape (k, m) [m/s^2]."""
+    parts = posterior.layout.by_weights(columns, np.zeros(3))
+    square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
+    return float(np.sqrt(square / (3 * len(columns))))
