@@ -144,14 +144,7 @@ def of_whole_rests(
                     [part.left_out_rms for part in parts],
                 )
             )
-            result.append(
-                PositionReport(
-                    source=bag.source.name,
-                    start_ns=rest.start_ns,
-                    duration_s=(rest.end_ns - rest.start_ns) * 1e-9,
-                    up=(x, y, z),
-                    residual_rms=in_sample,
-                    left_out_rms=left_out,
-                )
-            )
+            duration_s = (rest.end_ns - rest.start_ns) * 1e-9
+            new = replace(parts[0], duration_s=duration_s, up=(x, y, z))
+            result.append(replace(new, residual_rms=in_sample, left_out_rms=left_out))
     return tuple(result)
