@@ -18,6 +18,7 @@ from ..unit.calibration import (
     AxisReference,
     AxisSet,
     Calibration,
+    LackOfFit,
     RegimeSet,
     ResponseTerm,
     Unit,
@@ -45,6 +46,7 @@ from .thermal_ranges import (
     valid_range,
 )
 from .unknowns import State
+from .unseen_axes import with_unseen_axes
 from .windows import PART, Model, ThermalWindows
 
 
@@ -114,7 +116,9 @@ def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[Regi
     rates = valid_range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
     # The sd of mounting offset plus slow noise of each axis [m/s^2].
     slow = np.sqrt(claim.offset_sd**2 + prior.sigma**2 * prior.noise.variance).tolist()
-    lacks = lack_of_fit(fit, claim) if fit.regression.gravity else ((), ())
+    lacks: Sequence[tuple[LackOfFit, ...]] = ((), ())
+    if fit.regression.gravity:
+        lacks = with_unseen_axes(fit, lack_of_fit(fit, claim), known)
     result = []
     for k, (family, lack) in enumerate(zip(windows.model.sets.families, lacks, strict=True)):
         zero = (0.0,) * family.n_free

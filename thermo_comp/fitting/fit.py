@@ -42,6 +42,7 @@ from .reduction import ReducedBag, reduce_source
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
+from .unseen_axes import judge_unseen_axes
 from .windows import FEWEST_WINDOWS
 
 Progress = Callable[[float], None]
@@ -327,6 +328,7 @@ def _fit(
         raise _unusable(error, fit.posterior.state.up) from error
     least = least_known(calibration, fit.posterior.state.up)
     unseen = [*data_checks.judge_coverage(least), *judge_terms(calibration)]
+    unseen += judge_unseen_axes(fit, known)
     return FitResult(
         calibration=with_notes(calibration, unseen),
         fit=fit,

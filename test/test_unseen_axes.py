@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The claim for axes that no position had along gravity at some temperatures."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import strangers
+from strangers_baselines import minutes
+from strangers_cases import FULL_SCALE, Study, positions
+from strangers_units import navigation, program, rng_of, spread
+
+from thermo_comp.fitting import unseen_axes
+from thermo_comp.unit.calibration import LackOfFit
+
+WARM = program(20, 20, (35, 1, 45), (5, 1, 45), (20, 1, 5))
+COLD = program(0, 20, (-25, 1, 45), (0, 1, 30))
+HELD = program(-5, 20, (-22, 1, 45), (-8, 1, 20))
+#: Slopes of the scale factors of y and z below 5 degC [1/K].
+KINK = np.array([0.0, 1e-5, -1e-5])
+
+
+def fit_of(temperature, up, position, slope=1e-5, gravity=10.0):
+    """Return what the functions read of a fit: one column of a curve, the scale's slope."""
+    windows = SimpleNamespace(
+        temperature=np.asarray(temperature, dtype=float),
+        data=SimpleNamespace(
+            position=np.asarray(position), groups=('curve',), kelvins=np.array([1.0])
+        ),
+    )
+    weights = np.zeros((2, 3, 1))
+    weights[1] = slope
+    state = SimpleNamespace(up=np.asarray(up, dtype=float), weights=weights)
+    return SimpleNamespace(
+        windows=windows,
+        regression=SimpleNamespace(gravity=gravity),
+        posterior=SimpleNamespace(state=state),
+    )
+
+
+def prior_of(lower, upper, *lacks):
+    regime = SimpleNamespace(temperature_range_c=(lower, upper), lack_of_fit=lacks)
+    return SimpleNamespace(regime_sets=lambda: (regime, regime))
+
+
+def test_only_axes_along_gravity_are_known_at_new_temperatures():
+    # Six faces from 0 to 40 degC, and x up from -40 to 0 degC.
+    faces = [*np.eye(3), *-np.eye(3), np.eye(3)[0]]
+    fit = fit_of([0, 40] * 6 + [-40, 0], faces, np.repeat(np.arange(7), 2))
+    (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), None)
+    assert [point.temperature_c for point in lack] == pytest.approx([-40, -31, -22, -13, -4])
+    for point in lack:
+        # The scale curve continues without error by a tenth of 40 K; beyond, the slope has an sd
+        # of half of 10 ppm/K.
+        sd = 0.5e-5 * 10.0 * (-4.0 - point.temperature_c)
+        assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
+    (finding,) = unseen_axes.judge_unseen_axes(fit, None)
+    assert 'below -4 degC no position has gravity along y and z' in finding.message
+
+
+@pytest.mark.parametrize(
+    'up', [[[0.58, 0.58, 0.58], [-0.6, 0.6, 0.53]], [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]
+)
+def test_nothing_is_added_where_all_positions_show_the_same_axes(up):
+    fit = fit_of([0, 40, -40, 0], [up[0], up[1]], [0, 0, 1, 1])
+    only_x = np.allclose(up, [1.0, 0.0, 0.0])
+    assert unseen_axes.with_unseen_axes(fit, ((), ()), None) == [(), ()]
+    assert unseen_axes.judge_unseen_axes(fit, None) == []
+    # A prior knows all axes in its range, also those that no position shows.
+    (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), prior_of(0.0, 40.0))
+    assert bool(lack) == only_x
+
+
+def test_the_lack_of_fit_of_a_prior_holds_for_axes_that_are_not_seen_again():
+    lacks = LackOfFit(0.0, (1e-3, 1e-3, 1e-3)), LackOfFit(40.0, (1e-3, 1e-3, 1e-3))
+    fit = fit_of([10, 30], [[1.0, 0.0, 0.0]], [0, 0])
+    new = (LackOfFit(20.0, (2e-4, 2e-4, 2e-3)),)
+    (points, _) = unseen_axes.with_unseen_axes(fit, (new, new), prior_of(0.0, 40.0, *lacks))
+    by_temperature = {point.temperature_c: point.sd_m_s2 for point in points}
+    assert by_temperature[20.0] == pytest.approx((2e-4, 1e-3, 2e-3))
+    assert by_temperature[0.0] == pytest.approx((1e-3, 1e-3, 2e-3))
+
+
+def kinked(bag, unit):
+    """Add a change of the scale factors of y and z below 5 degC."""
+    board = np.interp(bag.time_s, *bag.temperatures['board'])[:, np.newaxis]
+    change = bag.force * np.minimum(board - 5.0, 0.0) * KINK
+    return replace(bag, samples=np.rint(bag.samples + unit.counts * change))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('number', [1, 2])
+@pytest.mark.parametrize('is_prior', [False, True])
+def test_one_cold_bag_does_not_claim_the_scale_factors_of_all_axes(number, is_prior):
+    # WHY: 138 ug were left at a claimed 14 ug.
+    rng = rng_of('unseen axes', number)
+    unit = navigation(rng)
+    warm = positions(unit, WARM, spread(12, rng), rng)
+    (cold,) = positions(unit, COLD, np.eye(3)[:1], rng)
+    cold = replace(kinked(cold, unit), name='cold')
+    held = tuple(kinked(bag, unit) for bag in positions(unit, HELD, spread(6, rng), rng))
+    prior = None
+    if is_prior:
+        prior = strangers.fitted(Study('', tuple(warm), {}, FULL_SCALE))
+    bags = (cold,) if is_prior else (*warm, cold)
+    study = Study('', bags, {'': held}, FULL_SCALE)
+    calibration = strangers.fitted(study, prior)
+    score = strangers.scored(study, calibration, {'': [minutes(bag) for bag in held]})['']
+    assert score.vector > 50.0
+    assert score.ratio < 2.0

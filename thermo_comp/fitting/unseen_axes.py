@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 thermo_comp contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Owns the error of an axis at temperatures at which no position had gravity along this axis.
+
+The drift of a bias shows in each attitude, but a scale factor shows in |f| only where gravity acts
+along its axis. A recording in one attitude at new temperatures therefore extends the range of all
+axes, and determines the scale factor of one axis there. The scale factors of the other axes are
+extrapolated: their error is part of the lack of fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..typing import Floats
+from ..unit.calibration import Calibration, LackOfFit
+from .data_checks import Finding, advice
+from .selection import Fit
+from .thermal_ranges import Range, union
+from .windows import CURVE, PART
+
+#: Least share of gravity along an axis in a position that determines the axis' scale factor. At a
+#: half, the error of |f| is a quarter of the scale factor's error.
+LEAST_SHARE = 0.5
+#: Share of the temperature range of an axis by which its scale curve continues without error. The
+#: ranges of the positions of one test differ by about this share.
+FREE_SHARE = 0.1
+
+
+def with_unseen_axes(
+    fit: Fit, lacks: Sequence[tuple[LackOfFit, ...]], known: Calibration | None
+) -> list[tuple[LackOfFit, ...]]:
+    """
+    Add the error of axes at temperatures at which no position determines their scale factor.
+
+    `lacks`: lack of fit of each regime by left-out data; `known`: calibration that was the prior.
+    The lack of fit of the prior holds for an axis at temperatures at which no new position
+    determines the axis' scale factor.
+    """
+    (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)
+    slope = _unknown_slope(fit) * fit.regression.gravity
+    ends = _ends(fit, known)
+    # The variance is linear between the temperatures, and five of them follow the square.
+    between = [
+        np.linspace(edge, end, 5)
+        for edge, end in zip((lower.max(), upper.min()), ends, strict=True)
+        if ends[0] < edge < ends[1]
+    ]
+    result = []
+    for k, lack in enumerate(lacks):
+        of_prior = known.regime_sets()[k].lack_of_fit if known else ()
+        points = [point.temperature_c for point in (*lack, *of_prior)]
+        at = np.unique(np.concatenate((*between, points)))[:, np.newaxis]
+        is_new = (new_lower <= at) & (at <= new_upper)
+        variance = _variance(lack, at[:, 0])
+        before = _variance(of_prior, at[:, 0])
+        variance = np.where(is_new, variance, np.maximum(variance, before))
+        kelvins = np.maximum(np.maximum(lower - at, at - upper), 0.0)
+        sd = np.sqrt(variance + (slope * kelvins) ** 2)
+        rows = np.hstack((at, sd)).tolist() if sd.any() else []
+        result.append(tuple(LackOfFit(celsius, (x, y, z)) for celsius, x, y, z in rows))
+    return result
+
+
+def judge_unseen_axes(fit: Fit, known: Calibration | None) -> list[Finding]:
+    """Advise a position at temperatures at which no position determines an axis' scale factor."""
+    if not fit.regression.gravity:
+        return []
+    findings = []
+    lower, upper = _known_ranges(fit, known)
+    first, last = _ends(fit, known)
+    for where, end, edge, is_unseen in (
+        ('below', first, lower[lower > first].max(initial=first), lower > first),
+        ('above', last, upper[upper < last].min(initial=last), upper < last),
+    ):
+        if is_unseen.any():
+            names = ' and '.join('xyz'[axis] for axis in np.flatnonzero(is_unseen))
+            text = (
+                f'{where} {edge:.0f} degC no position has gravity along {names}: the scale factor '
+                f'of {names} is extrapolated to {end:.0f} degC, and the published uncertainty '
+                f'includes this error. Record a position with {names} up in this range'
+            )
+            findings.append(advice('axes', text))
+    return findings
+
+
+def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
+    """
+    Return the ends of the ranges of board temperature in which the scale factor of each axis is
+    known, shape (2, 3) [degC]; infinite for an axis that no position determines at any
+    temperature, as its covariance is that of the fit's prior.
+    """
+    lower, upper = _seen(fit, known)
+    reach = FREE_SHARE * (upper - lower)
+    is_seen = lower <= upper
+    return np.where(is_seen, (lower - reach, upper + reach), [[-np.inf], [np.inf]])
+
+
+def _seen(fit: Fit, known: Calibration | None) -> Floats:
+    """
+    Return the lowest and the highest board temperature of the positions with gravity along each
+    axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) for none.
+    """
+    temperature = fit.windows.temperature[:, np.newaxis]
+    is_along = np.abs(fit.posterior.state.up) >= LEAST_SHARE
+    is_seen = is_along[fit.windows.data.position]
+    lower = np.where(is_seen, temperature, np.inf).min(axis=0)
+    upper = np.where(is_seen, temperature, -np.inf).max(axis=0)
+    for regime in known.regime_sets() if known else ():
+        lower = np.minimum(lower, regime.temperature_range_c[0])
+        upper = np.maximum(upper, regime.temperature_range_c[1])
+    return np.array((lower, upper))
+
+
+def _ends(fit: Fit, known: Calibration | None) -> Range:
+    """Return the lowest and the highest board temperature of all windows and of a prior [degC]."""
+    temperature = fit.windows.temperature
+    ranges = [regime.temperature_range_c for regime in known.regime_sets()] if known else []
+    return union([(float(temperature.min()), float(temperature.max())), *ranges])
+
+
+def _unknown_slope(fit: Fit) -> float:
+    """
+    Return the sd of the unknown slope of a scale factor [1/K]: half of the slope of the scale
+    curves, RMS of the axes.
+    """
+    windows, state = fit.windows.data, fit.posterior.state
+    is_curve = np.isin(windows.groups, (CURVE, PART)) & (windows.kelvins > 0.0)
+    slopes = state.weights[1][:, is_curve] / windows.kelvins[is_curve]
+    return 0.5 * float(np.sqrt(np.mean(np.sum(slopes**2, axis=1))))
+
+
+def _variance(points: Sequence[LackOfFit], at: Floats) -> Floats:
+    """Return the variance of a lack of fit at board temperatures, shape (n, 3) [m^2/s^4]."""
+    if not points:
+        return np.zeros((len(at), 3))
+    celsius = [point.temperature_c for point in points]
+    variances = np.square([point.sd_m_s2 for point in points])
+    return np.column_stack([np.interp(at, celsius, axis) for axis in variances.T])
