@@ -60,6 +60,15 @@ def test_the_reports_of_pieces_become_those_of_rests(rng):
     assert whole.left_out_rms == pytest.approx(10.0 * np.sqrt(12.5))
 
 
+def test_a_rest_of_one_sample_has_a_report(rng):
+    # WHY: the first rest of a real recording had one sample, and its fit ended in a division by 0.
+    bag = reduce_source(Rest(rng, duration_s=600.0, rate_hz=2.0).source(), full_scale=None)
+    (rest,) = bag.intervals
+    one = replace(rest, end_ns=rest.start_ns, time=rest.time[:1])
+    report = PositionReport('rest', rest.start_ns, 0.0, (0.0, 0.0, 1.0), 3.0, 30.0)
+    assert of_whole_rests([report], [replace(bag, intervals=(one,))]) == (report,)
+
+
 def test_a_refused_second_fit_keeps_the_first(rng, monkeypatch):
     # WHY: pieces of rests may determine less than the rests, and their fit may be refused.
     first_fit = fit_module._fit

@@ -134,7 +134,8 @@ def of_whole_rests(
     for bag in bags:
         for rest in bag.intervals:
             parts = list(islice(left, _n_pieces(len(rest.time), bag.window_s)))
-            share = np.array([part.duration_s for part in parts])
+            # A rest of one sample has a window, and a duration of 0.
+            share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()
             in_sample, left_out = (
