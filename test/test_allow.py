@@ -150,6 +150,19 @@ def test_likely_mistakes_are_refused_by_name(rng, spoil, name, text):
     assert name == 'unmeasured' or 'unmeasured' not in findings
 
 
+def test_rests_without_noise_advise_the_parameter_of_the_node(rng):
+    # WHY: the node takes equal samples for a stuck converter: it dropped 60 % of those at rest.
+    rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]
+    for rest in rests[:2]:
+        # The drift of 40 mg changes the samples by steps of 4 mg.
+        drift = 40.0 * MG * np.linspace(0.0, 1.0, len(rest.accel))[:, np.newaxis]
+        rest.accel = np.rint((rest.accel + drift) / (4.0 * MG)) * 4.0 * MG
+    findings = {note.name: note.message for note in fit(sources_of(rests), FORCE).findings}
+    assert 'at rest all samples are equal for half a second or' in findings['stuck']
+    assert 'in 2 of 7 rests' in findings['stuck']
+    assert 'set stuck_timeout of the node to 0' in findings['stuck']
+
+
 def test_an_axis_that_is_dead_in_one_position_is_named(rng):
     # WHY: in one position the y axis read exactly 3000 for hours, and the missing drift of y was
     # attributed to all other positions.

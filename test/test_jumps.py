@@ -23,6 +23,16 @@ def test_a_quiet_rest_has_no_jump(rng):
     assert look(Rest(rng)) == ()
 
 
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('sd', [0.05, 0.1, 0.2, 0.5])
+def test_steps_of_a_coarse_converter_are_no_jumps(rng, sd):
+    # WHY: samples that are mostly equal at rest ended in a division by zero.
+    rest = Rest(rng, sd=4.0 * sd * MG)
+    drift = 20.0 * MG * np.linspace(0.0, 1.0, len(rest.accel))
+    rest.accel = np.rint((rest.accel + drift[:, np.newaxis]) / (4.0 * MG)) * 4.0 * MG
+    assert look(rest) == ()
+
+
 @pytest.mark.parametrize('with_gyro', [False, True])
 def test_jump_along_gravity(rng, with_gyro):
     rest = Rest(rng)

@@ -78,12 +78,22 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
     beside = _beside_gaps(bag, gaps, [margin_s] * len(gaps))
+    if beside and not quiet_sd.all():
+        # Samples that are equal at rest have at least the error of rounding.
+        quiet_sd = np.maximum(quiet_sd, [_rounding_sd(axis) for axis in np.vstack(beside).T[1:4]])
     # If the noise is correlated, the level beside a gap is the mean over a time above `margin_s`.
     margins = [max(_margin(part, quiet_sd), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)
     jumps = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(beside, gaps, strict=True))
     return tuple(jump for jump in jumps if jump is not None)
+
+
+def _rounding_sd(values: Floats) -> float:
+    """Return the sd by the rounding of samples, shape (n,), to their smallest change."""
+    changes = np.abs(np.diff(values))
+    least = np.min(changes[changes > 0.0], initial=np.inf)
+    return float(least / 12.0**0.5) if np.isfinite(least) else 1e-9
 
 
 def _beside_gaps(

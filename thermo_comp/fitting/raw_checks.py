@@ -68,10 +68,14 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             f'the unit was still for only {100.0 * still:.0f} % of the time; vibration or '
             'handling in the other time was cut out',
         )
-    if not any(interval.sample_sd.any() for bag in bags for interval in bag.intervals):
+    rests = [interval for bag in bags for interval in bag.intervals]
+    if n_equal := sum(not rest.sample_sd.any() for rest in rests):
+        share = '' if n_equal == len(rests) else f' in {n_equal} of {len(rests)} rests'
         text = (
-            'at rest all samples are equal, without any noise: does the driver repeat '
-            'one reading, or is the resolution of the sensor too coarse?'
+            f'at rest all samples are equal for half a second or longer{share}, without any '
+            'noise: does the driver repeat one reading, or is the resolution of the sensor too '
+            'coarse? If it is, set stuck_timeout of the node to 0, or the node drops samples that '
+            'stay equal for 2 s'
         )
         yield advice('stuck', text)
     if dead := list(_dead_axes(bags)):

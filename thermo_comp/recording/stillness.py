@@ -170,7 +170,9 @@ class CellAccumulator:
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
         mean = total / count[:, None]
-        spread = np.maximum(square - count[:, None] * mean**2, 0.0)
+        # The difference of two large sums has a rounding error: equal samples have no variance.
+        spread = square - count[:, None] * mean**2
+        spread[spread < np.finfo(np.float64).eps * count[:, None] * square] = 0.0
         variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
         rate, rate_variance = (
             x[:, 3:] if x.shape[1] > 3 else np.zeros((len(x), 3)) for x in (mean, variance)
