@@ -3,6 +3,7 @@
 """Each named refusal of a fit can be overridden by its name; the fit gives a calibration."""
 
 import re
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -193,3 +194,19 @@ def spoilt(rng, spoil):
     for rest in rests:
         spoil(rest)
     return sources_of(rests)
+
+
+@pytest.mark.parametrize(('n', 'n_prior', 'step'), [(8, 6, 1e-2), (2, 1, 1e-4)])
+def test_steps_far_above_the_noise_end_in_a_calibration_or_a_sentence(rng, n, n_prior, step):
+    # WHY: constant samples of an axis had a noise of 1e-8 m/s^2 in the fit, and the equations of
+    # an update by such bags ended in a LinAlgError.
+    rests = [Rest(rng, level=tuple(GRAVITY * up), sd=1e-5) for up in positions(n, 3)]
+    for rest in rests:
+        drift = 1e-2 * np.outer((rest.temperature(rest.time) - 25.0) / 20.0, (1.0, -0.5, 0.3))
+        rest.accel = np.rint((rest.accel + drift) / step) * step
+    sources = sources_of(rests)
+    known = fit(sources[:n_prior], FORCE).calibration
+    result = None
+    with suppress(FitError):
+        result = fit(sources[n_prior:], replace(FORCE, prior=known))
+    assert result is None or np.isfinite(result.calibration.posterior.covariance()).all()

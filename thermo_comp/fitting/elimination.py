@@ -53,6 +53,29 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     return np.asarray(factor, dtype=np.float64)
 
 
+def factored_with_prior(information: Floats, precision: Floats) -> Floats:
+    """
+    Return the lower Cholesky factor of an information matrix plus a prior's precision, shape (n,).
+
+    An information matrix is the difference of larger matrices, so that its smallest eigenvalues
+    are rounding errors. If these leave no Cholesky factor, eigenvalues of the matrix scaled to a
+    unit diagonal that are up to ten times the most negative eigenvalue count as no information.
+    """
+    places = np.diag_indices(len(information))
+    hessian = information.copy()
+    hessian[places] += precision
+    try:
+        return factored(hessian)
+    except np.linalg.LinAlgError:
+        root = np.sqrt(hessian[places])
+        values, vectors = np.linalg.eigh(information / np.outer(root, root))
+        values[values < 10.0 * abs(min(values[0], 0.0))] = 0.0
+        half = root[:, np.newaxis] * vectors * np.sqrt(values)
+        hessian = half @ half.T
+        hessian[places] += precision
+        return factored(hessian)
+
+
 def solved(factor: Floats, right: Floats) -> Floats:
     """Solve equations, given the lower Cholesky factor of their matrix; `cho_solve` is slower."""
     return np.asarray(dpotrs(factor.T, right)[0])

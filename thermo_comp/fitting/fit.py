@@ -113,7 +113,14 @@ def fit_bags(
     recordings = [_checked(bag) for bag in joined(bags)]
     # The fit multiplies many small matrices, and threads would only slow these products down.
     with threadpool_limits(1, 'blas'):
-        return _fit_about_offset(recordings, options, progress)
+        try:
+            return _fit_about_offset(recordings, options, progress)
+        except np.linalg.LinAlgError as error:
+            raise FitError(
+                'the bags do not determine the fit: its equations have no solution in double '
+                'precision. Rests of ten minutes or longer determine more; bags that update a '
+                'prior calibration can be fitted together with its bags'
+            ) from error
 
 
 def _fit_about_offset(

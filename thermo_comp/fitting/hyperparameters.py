@@ -228,8 +228,9 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # The noise is at least 1e-8 m/s^2, below any sensor's; from constant samples it would be 0.
-    least = np.full(3, 1e-8)
+    # Constant samples of an axis have no noise: the noise is at least a hundredth of that of the
+    # noisiest axis.
+    least = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
         # If no column changes within a position, slow noise explains the whole drift, and white
         # noise would be 0: it is at least that of differences of windows, where a drift cancels.

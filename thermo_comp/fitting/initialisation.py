@@ -117,7 +117,15 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
         *others, widest = informative_priors(known, regression, state, windows.model, options)
-        prior = replace(prior, column_sd=data.parts.astype(np.float64), informative=widest)
+        # A few windows may be fitted exactly: the noise is at least half of the known noise.
+        window_s = windows.typical_count * known.unit.cycle_time_s
+        least = 0.5 * float(np.min(known.noise_density_m_s2_sqrt_hz)) / window_s**0.5
+        prior = replace(
+            prior,
+            column_sd=data.parts.astype(np.float64),
+            informative=widest,
+            least_sigma=max(least, prior.least_sigma),
+        )
         if prior.offset_scale and offset_sd_of(known):
             prior = replace(prior, turn_on_sd=offset_sd_of(known))
         fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))

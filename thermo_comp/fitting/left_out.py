@@ -97,7 +97,8 @@ class Folds:
             # counts, `_EQUAL`.
             return of_sums, _EQUAL
         each = np.log(before / after)
-        without = np.log((before.sum() - before) / (after.sum() - after))
+        others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
+        without = np.subtract(*map(np.log, others))
         spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
         estimates = [(of_sums, spread), (float(each.mean()), float(each.std(ddof=1) / np.sqrt(n)))]
         if estimates[0][0] * estimates[1][0] < 0.0:

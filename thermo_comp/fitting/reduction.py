@@ -375,7 +375,9 @@ def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> lis
         around = slice(max(first, last - 4), min(stop, start + 4))
         time, mean = cells.time[around], cells.mean[around]
         variance = np.maximum(cells.variance[around], cells.quantum**2 / 12.0)
-        root = np.sqrt(np.maximum(cells.count[around, None], 1) / np.maximum(variance, 1e-300))
+        # Equal samples have no variance: their means differ by rounding, by 1e-12 of a reading.
+        variance = np.maximum(variance, (1e-12 * np.abs(mean).max()) ** 2 + 1e-300)
+        root = np.sqrt(np.maximum(cells.count[around, None], 1) / variance)
         is_same = is_calm[last:start].all() and np.all(np.diff(cells.index[around]) == 1)
         for axis in range(3) if is_same else ():
             powers = np.vander((time - time[0]) / np.ptp(time), 3) * root[:, [axis]]

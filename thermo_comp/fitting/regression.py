@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats, Ints
-from .elimination import Reduced, eliminate, factored, inverse_root, solved
+from .elimination import Reduced, eliminate, factored_with_prior, inverse_root, solved
 from .equations import Equations, last_result_kept, moved_by, without_inactive
 from .gains import Inactive
 from .layout import Layout
@@ -200,17 +200,17 @@ class Point:
         """
         n = self.layout.n_unit
         information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
+        if not np.isfinite(information).all():
+            raise np.linalg.LinAlgError('the information matrix is not finite')
         if self.prior.informative is None:
             precision = self.precision[:n]
-            hessian: Floats = information.copy()
-            hessian[np.diag_indices(n)] += precision
-            factor = factored(hessian)
+            factor = factored_with_prior(information, precision)
             return solved(factor, gradient - precision * deviation), factor
         # In units of the prior's standard deviations the normal equations are well conditioned.
         root = self.prior.informative.root
         turned = solve_triangular(root, information, trans='T')
         turned = solve_triangular(root, turned.T, trans='T')
-        factor = factored((turned + turned.T) / 2.0 + np.eye(n))
+        factor = factored_with_prior((turned + turned.T) / 2.0, np.ones(n))
         right = solve_triangular(root, gradient, trans='T') - root @ deviation
         return solve_triangular(root, solved(factor, right)), root.T @ factor
 

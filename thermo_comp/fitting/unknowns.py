@@ -229,6 +229,7 @@ class Prior:
     offset_sd: sd of the bias offset of each position and axis by mounting and turn-on [m/s^2]
     turn_on_sd: sd of the bias offset that all positions of a bag share, by its turn-on [m/s^2]
     sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
+    least_sigma: lower bound of sigma [m/s^2]; by default it is below the noise of any sensor
     noise: slow noise
     offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd [m/s^2]; 0: both
         are constant
@@ -258,6 +259,7 @@ class Prior:
     misalignment_scale: float = MISALIGNMENT_SD
     unseen_misalignment_sd: float = 0.0
     tilt_sd: float = 1e-7
+    least_sigma: float = 1e-7
     pose_sd: float = POSE_SD
     start_share: float = 1.0
     nonlinear_sd: Floats = field(default_factory=lambda: np.zeros(0))

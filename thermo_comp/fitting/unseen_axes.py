@@ -28,6 +28,8 @@ LEAST_SHARE = 0.5
 #: Share of the temperature range of an axis by which its scale curve continues without error. The
 #: ranges of the positions of one test differ by about this share.
 FREE_SHARE = 0.1
+#: Extrapolation of a scale factor above which a position is advised [K].
+LEAST_KELVINS = 2.0
 
 
 def with_unseen_axes(
@@ -72,9 +74,10 @@ def judge_unseen_axes(fit: Fit, known: Calibration | None) -> list[Finding]:
     findings = []
     lower, upper = _known_ranges(fit, known)
     first, last = _ends(fit, known)
+    below, above = lower > first + LEAST_KELVINS, upper < last - LEAST_KELVINS
     for where, end, edge, is_unseen in (
-        ('below', first, lower[lower > first].max(initial=first), lower > first),
-        ('above', last, upper[upper < last].min(initial=last), upper < last),
+        ('below', first, lower[below].max(initial=first), below),
+        ('above', last, upper[above].min(initial=last), above),
     ):
         if is_unseen.any():
             names = ' and '.join('xyz'[axis] for axis in np.flatnonzero(is_unseen))
