@@ -199,7 +199,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     elif any(column.part[1:]) and isinstance(lag, Lag):
         summands = [
             (replace(column, tau_s=tau_s, **_ALONE), share)
-            for (_, tau_s), share in lag.singles.items()
+            for (_, tau_s), share in lag.first_order_weights.items()
         ]
     if summands:
         return [

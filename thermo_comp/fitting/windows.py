@@ -282,7 +282,7 @@ def _rows(
     slopes = table.slopes(states)[0] * factors
     for k, column in enumerate(table.columns):
         if isinstance(lag := column.source, Lag):
-            by_start[k] = slopes[k] * lag.start_share(time - begin_s, np.exp)
+            by_start[k] = slopes[k] * lag.remaining_share(time - begin_s, np.exp)
     rate = interval.angular_rate if has_rate else None
     mean = partial(block_means, weight=count, first=first)
     return _Rows(

@@ -27,7 +27,7 @@ from .thermometer import Thermometer
 
 BEND_SHARES = (1.0, 10.0)  # tuned acceleration of a filter / smallest acceleration at an onset
 TUNING: Final = 1.45  # best memory of a filter / (noise sd / acceleration)^0.4, at 1 Hz
-# Noise variance / filter variance for a sensor whose noise is mostly quantization.
+# Noise variance of the rate / the filter's variance, for a sensor with mostly quantization noise.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING: Final = 5.0  # age of a filter at which its noise is stationary, in filter memories
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
@@ -95,13 +95,13 @@ class ChangeDetector:
         self._reading = nan
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
-        """Begin a soak with the rate as its baseline, with an error of at least `least_error`."""
+        """Begin a soak: the rate is its baseline, of an error of at least `least_error` [K/s]."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # a cell edge crossed before the soak would give the ramp's rate
 
     def is_following(self, stamp_ns: int) -> bool:
-        """Whether `rate` includes the reading with a given stamp."""
+        """Whether the filter of `rate` has used the reading of a stamp."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
@@ -110,9 +110,9 @@ class ChangeDetector:
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
-        Use the sensor's last accepted reading. The baseline follows the rate at a relative speed
-        `pace`, 1 in a soak and 0 in a ramp. Returns the sign of the rate's departure from the
-        baseline, 0 = none.
+        Use the sensor's last accepted reading; return the sign of the rate's departure from the
+        baseline, 0 = none. `pace`: relative speed at which the baseline follows the rate, 1 in a
+        soak, 0.25 at the onset of a ramp, 0 in a ramp.
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9

@@ -3,7 +3,7 @@
 """
 Owns the settings of thermometers, detector and tracker.
 
-Calibrations hold settings of thermometers and detector; workers of a fleet receive all settings.
+A calibration file states the settings of thermometers and detector, the user those of the tracker.
 """
 
 from dataclasses import dataclass, field
@@ -67,7 +67,7 @@ Closes = Literal['board', 'case']
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """Smallest ramp, ripple, false alarms of the detector; keys of the `detector` section."""
+    """Settings of the regime detector; keys of the section `detector` of a calibration file."""
 
     smallest_ramp_k_min: Annotated[
         float, QUANTITIES['ramp'], 'The slowest ramp that must never be missed, K/min.'
@@ -118,7 +118,7 @@ class DetectorSettings:
 
 @dataclass(frozen=True)
 class ThermalConfig:
-    """Time limits that the user sets; ValueError if a value is out of its range."""
+    """Times of the tracker that the user sets; ValueError if a value is out of its range."""
 
     #: Time over which the two sets of coefficients are blended after a change of regime [s],
     #: longer if they differ much (`Correction.gentle_transition`); 0 = the paper's hard switch.
