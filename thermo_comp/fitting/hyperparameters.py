@@ -113,13 +113,13 @@ def _updated(
         # Limit the misalignment sd to 0.03 rad: larger misalignments, as of single sensors on a
         # printed bracket, would explain the norms of six faces, to second order.
         misalignment_sd = min(new_sd, 0.03)
-    start_share = prior.start_share
+    start_ratio = prior.start_variance_ratio
     if layout.start.size:
-        # One lag state with the variance of the node's prior (`start_share` of 1) is added, so
-        # that the states of a single bag cannot make `start_share` very small.
+        # One lag state with the variance of the node's prior (a ratio of 1) is added, so that the
+        # states of a single bag cannot make `start_variance_ratio` very small.
         gamma = float(determined[layout.start].sum())
-        start_share = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
-        changes.append(float(np.abs(np.log(start_share / prior.start_share))) / 4.0)
+        start_ratio = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
+        changes.append(float(np.abs(np.log(start_ratio / prior.start_variance_ratio))) / 4.0)
     sigma = white_noise(regression, posterior)
     changes.append(float(np.abs(np.log(sigma / prior.sigma)).max()))
     return replace(
@@ -131,7 +131,7 @@ def _updated(
         pose_sd=pose_sd,
         misalignment_sd=misalignment_sd,
         sigma=sigma,
-        start_share=start_share,
+        start_variance_ratio=start_ratio,
     ), max(changes)
 
 

@@ -31,7 +31,7 @@ def jackknife_covariance(regression: Regression, posterior: Posterior) -> Floats
     if not last:
         return np.zeros((n, n))
     products = regression.products(posterior.layout.used)
-    step, factor = regression.at(posterior.state, posterior.prior, products.whole).solution
+    step, factor = regression.at(posterior.state, posterior.prior, products.of_positions).solution
     changes, ratios = [], []
     for number in range(last + 1):
         grams = products.without(np.array([number]))
