@@ -68,7 +68,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     if not has_choice or not _may_have_sets(fit.selected):
         return fit
     # The alternative detector ends the dynamic regime once the case temperature is constant; the
-    # default detector also waits for the board. Only models with two sets depend on the regime.
+    # default detector also waits for the board. Models with one set do not depend on the regime.
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
@@ -97,8 +97,7 @@ def windows_of(
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows with one lag per axis; or with a bank of time constants, if no lags are found,
-    or if all lags that are found leave a left-out drift above noise and the bank is better on
-    left-out data.
+    or if all lags found leave a left-out drift above `Parts.most_drift` and the bank is better.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -132,7 +131,7 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Name the thermometers that every bag has, except the board's, the case's first."""
+    """Return the case, then all other thermometers that every bag has, except the board."""
     recorded = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

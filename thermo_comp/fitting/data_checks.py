@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the checks of the windows of a fit and of its result, with numbers and advice.
+Owns the checks of the windows of a fit, and of the fitted calibration, with advice to the user.
 
 Only contradictory data are refused; missing data increase the posterior uncertainty. A refusal
 stops the fit unless the user allows it by name; advice goes into the result.
@@ -97,7 +97,7 @@ def judge_windows(
         )
         yield advice('case', text)
         return
-    # The case temperature leads the board's, so the gradient has the sign of the board's rate.
+    # The case leads the board in a ramp, so the gradient has the sign of the board's rate.
     moving = np.abs(_ramp_rates(windows)) > RAMP_K_MIN
     if windows.data.weight[moving].sum() >= 30.0 * windows.data.weight.max():
         correlation = float(np.corrcoef(windows.gradient[moving], windows.rate[moving])[0, 1])
@@ -236,7 +236,7 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
 
 def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator[Finding]:
     """
-    Report the assumed repeatability of mountings and turn-ons if the data do not determine it.
+    Report the assumed sd of mounting and turn-on offsets if the data do not determine this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
     are explained by nine constants, whatever the offsets; only large offsets appear in the drifts.

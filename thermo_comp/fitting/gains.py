@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the change of the log evidence if columns are removed from a fit or added to it.
+Owns the change of a fit's log evidence by the removal or the addition of columns.
 
 References
 ----------
@@ -27,9 +27,9 @@ _SQUARES = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 def log_bayes_factors(mode: Floats, covariance: Floats, places: Ints, prior_sd: Floats) -> Floats:
     """
-    Return the loss of log evidence if some weights are set to 0 (Savage-Dickey ratio, [1]_).
+    Return the loss of log evidence if k weights are set to 0 (Savage-Dickey ratio, [1]_), (n,).
 
-    `places`, `prior_sd`: places and prior sd of the weights of each of n cases, shape (n, k)
+    `places`, `prior_sd`: indices and prior sd of the weights in each of n cases, shape (n, k)
     """
     means = mode[places]
     blocks = covariance[places[:, :, None], places[:, None, :]]
@@ -48,8 +48,8 @@ class Inactive:
     Sparsity and quality factors of inactive columns, given the active ones [2]_.
 
     part, column: part (0: bias, 1: scale) and column of each of k inactive columns, shape (k,)
-    S: sparsity factor, the information about the weights, shape (3 k, 3 k), by column, then axis
-    Q: quality factor, the gradient by the weights, shape (3 k,)
+    S: sparsity factor: information about the weights, ordered by column, then axis, (3 k, 3 k)
+    Q: quality factor: gradient of the log likelihood by the weights, shape (3 k,)
     """
 
     part: Ints

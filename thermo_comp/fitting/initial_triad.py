@@ -3,9 +3,9 @@
 """
 Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
 
-The means of the positions lie on an ellipsoid, which is fitted without temperature by least
-squares on ``|f| - g``. The initial values of the least-squares fit follow from the extremes of the
-means on each axis.
+The mean readings of the positions lie on an ellipsoid, which is fitted without temperature by
+least squares on ``|f| - g``. The initial values of bias and scale follow from the extremes of the
+mean readings on each axis.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .unknowns import BIAS_SD, SCALE_SD, Windows
 
 @dataclass(frozen=True)
 class ConstantCalibration:
-    """The triad at one temperature: bias [input units], scale [input units per m/s^2], M."""
+    """Constants at one temperature: bias [input units], scale [input units per m/s^2], M."""
 
     bias: Floats
     scale: Floats
@@ -165,7 +165,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     Return the error of the windows of each axis by the board's thermometer [m/s^2], shape (3,):
     the sd of the temperature times the slope of the samples over temperature within the positions.
 
-    `beyond_noise`: take the variance beyond that of a reading's noise, as by coarse steps or long
+    `beyond_noise`: use the variance less that of a reading's noise, as by coarse steps or long
     intervals
     """
     if windows.board is None:
@@ -175,7 +175,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     change = within_positions(windows.board[:, :1], windows.position)
     power = np.maximum(np.add.reduceat(change**2, first), 1e-12)
     along = np.add.reduceat(change * drift, first)
-    # White noise alone explains one squared noise of each position.
+    # White noise alone explains one squared noise in `along**2 / power` of each position.
     square = along**2 / power - white_noise_of(windows, scale) ** 2
     slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
     variance = float(windows.board[:, 1].mean()) - beyond_noise * windows.board_noise**2

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the uncertainty by effects that the model lacks: a jackknife over the sections of the program.
+Owns the covariance by effects that the model lacks: a jackknife over the sections of the program.
 
 The covariance of a fit contains the errors by noise alone. If the model lacks an effect, each
 section of the program requires other weights, and the error in another program is as large as the

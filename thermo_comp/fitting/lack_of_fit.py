@@ -25,7 +25,7 @@ from .unknowns import State
 
 
 def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:
-    """Return the lack of fit of the static and of the dynamic regime; () for none."""
+    """Return the lack of fit at some temperatures in the static and the dynamic regime, or ()."""
     windows, regression, selected = fit[:3]
     prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
     noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.variance)
@@ -44,7 +44,7 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
 def drift_variance(
     regression: Regression, state: State, layout: Layout, covariance: Floats
 ) -> Floats:
-    """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
+    """Return the variance of each window's drift by a covariance of the unit's unknowns."""
     position = regression.windows.position
     columns = within_positions(regression.columns, position)
     by_weights = layout.by_weights(columns, regression.effects(state).force[position])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the options of a fit: their checks, local gravity, families of curves.
+Owns the options of a fit and their checks, normal gravity, and the choice of curve families.
 
 An error of the local gravity changes all three scale factors by the same ratio and is not visible
 in the residuals, so the user must state gravity.
