@@ -134,8 +134,8 @@ class ReducedBag:
 
 class _Pass:
     """
-    One pass over the blocks of a source: cells of the samples, readings, causes that can explain
-    the lack of a rest; `has_rate`: whether all blocks have a finite angular rate.
+    One pass over the blocks of a source: cells of the samples, temperature readings, possible
+    causes of a lack of rests; `has_rate`: whether all blocks have a finite angular rate.
     """
 
     def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
@@ -201,13 +201,12 @@ def reduce_source(
         return usual
     share = usual.n_still_cells / usual.n_cells
     if share < 0.95 and source.force is None:
-        # If rests are interrupted, shorter cells are used if shorter cells add 5 % of the bag to
-        # the rests.
+        # Shorter cells are used if they increase the time at rest by more than 5 % of the bag.
         shorter, _ = reduced(10)
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
     if share < 0.5:
-        # If rests are short, shorter cells are used if shorter cells show six attitudes.
+        # Cells of 5 samples are used if the rests that they show have six attitudes or more.
         shorter, _ = reduced(5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)
@@ -288,7 +287,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     """
     Keep plausible readings with rising stamps; average readings that are less than 0.2 s apart.
 
-    No thermometer is faster than 0.2 s, and the tracker's loop over readings, in Python, is slow.
+    No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
     """
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))

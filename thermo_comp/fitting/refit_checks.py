@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the checks of a chosen model for effects that no column has: a drift after power-on, and slow
-tilts of the supports. The fit is repeated if a check finds such an effect.
+Owns the checks of a chosen model for effects that no column describes: a drift after power-on, and
+slow tilts of the supports. The fit is repeated if a check finds such an effect.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from .windows import CURVE
 
 # Length of a piece of a rest in which a slow tilt of the support is constant [s].
 _PIECE_S = 3600.0
-# Slow tilts are tried if the drifts of left-out positions, averaged over the pieces, exceed six
-# times their white noise and a tenth of the error of the left-out norms: other drifts are small.
+# Slow tilts are tried if the drift of left-out positions, averaged over each piece, exceeds these
+# multiples of the white noise of the average, and of the error of the left-out norms.
 _SLOW_DRIFT, _PART_OF_NORMS = 6.0, 0.1
-# Smallest number of positions whose norms the others determine: with fewer, the gain by slow tilts
-# has no reliable standard error.
+# Smallest number of positions with left-out norms: the norms of fewer positions give no reliable
+# standard error of the gain by slow tilts.
 _FEWEST_NORMS = 6
-# Smallest gain of the left-out norms by slow tilts, a log ratio of mean squares: 14 % of an RMS.
+# Smallest log gain of the mean square left-out norm by slow tilts: 14 % of the RMS.
 _TILT_GAIN = 0.3
 SLOW_TILTS = advice(
     'tilt',
@@ -60,8 +60,8 @@ def extrapolates(fit: Fit) -> bool:
 
 def may_have_slow_tilts(fit: Fit) -> bool:
     """
-    Whether the drifts of left-out positions are not only noise, and are a part of the error of
-    their norms. Slow tilts of a support change the axes across gravity, and hardly the norms.
+    Whether the drifts of left-out positions exceed noise and a tenth of the error of left-out
+    norms. Slow tilts of a support change the axes across gravity, and hardly the norms.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
@@ -129,7 +129,7 @@ def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
 def of_whole_rests(
     pieces: Sequence[PositionReport], bags: Sequence[ReducedBag]
 ) -> tuple[PositionReport, ...]:
-    """Join the reports of the pieces of each rest: the mean attitude, and RMS of all pieces."""
+    """Join the reports of the pieces of each rest: mean attitude, and RMS over the pieces."""
     result, left = [], iter(pieces)
     for bag in bags:
         for rest in bag.intervals:

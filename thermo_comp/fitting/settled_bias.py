@@ -14,7 +14,7 @@ import numpy as np
 from ..typing import Floats
 from .regression import Posterior, Regression
 
-# Number of windows that are sufficient for the mean sd of the bias.
+# Number of windows that are sufficient for the mean sd of the bias in the windows.
 _N_SEEN = 500
 
 
@@ -42,7 +42,7 @@ def settled_error(
 
 
 def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
-    """RMS sd of the bias of three axes for columns, shape (k, m) [m/s^2]."""
+    """Return the RMS sd of the bias [m/s^2] of three axes by columns, shape (k, m)."""
     parts = posterior.layout.by_weights(columns, np.zeros(3))
     square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
     return float(np.sqrt(square / (3 * len(columns))))

@@ -41,7 +41,7 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 
 def temperature_range(windows: ThermalWindows) -> Range:
-    """Return the valid range of board temperatures."""
+    """Return the valid range of board temperatures [degC]."""
     # The calibration of a test at one temperature is valid within 0.5 K, or within 50 K without a
     # thermometer, because then the covariance of the slope covers the unknown curve.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
@@ -87,7 +87,7 @@ def rest_gradient_range(
 
 def measured_board_lag(windows: ThermalWindows) -> float:
     """
-    Return the lag of the board behind the case [s], negative if the board leads, NaN without ramps
+    Return the lag of the board behind the case [s], negative if the board leads; NaN without ramps
     or without a case temperature.
     """
     return _slope_of_gradient(windows) if _has_gradients(windows) else np.nan

@@ -22,8 +22,8 @@ from .selection import Fit
 from .thermal_ranges import Range, union
 from .windows import CURVE, PART
 
-#: Least share of gravity along an axis in a position that determines the axis' scale factor. At a
-#: half, the error of |f| is a quarter of the scale factor's error.
+#: Smallest share of gravity along an axis in a position that determines the axis' scale factor. At
+#: a half, the error of |f| is a quarter of the scale factor's error.
 LEAST_SHARE = 0.5
 #: Share of the temperature range of an axis by which its scale curve continues without error. The
 #: ranges of the positions of one test differ by about this share.
@@ -43,7 +43,7 @@ def with_unseen_axes(
     (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, known)
-    # The variance is linear between the temperatures, and five of them follow the square.
+    # The variance is interpolated linearly; five temperatures approximate the square.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)
