@@ -73,8 +73,8 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves limit the number of columns, so they are not compared between two detectors
-    # with the same columns.
+    # Left-out halves limit the number of columns, so they do not count in the comparison of two
+    # detectors with the same columns.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -112,7 +112,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _better(fit: Fit | None, other: Fit) -> Fit:
-    """Return the first fit, if it exists and the other fit is not better on left-out data."""
+    """Return `other` if it is better than `fit` on left-out data, or there is no `fit`."""
     return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit
 
 

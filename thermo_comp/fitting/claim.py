@@ -226,7 +226,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
     # Few temperatures do not determine all powers of a curve. One attitude does not separate the
-    # drifts of bias and scale factor, so bias and scale factor may each have the columns of both.
+    # drifts of bias and scale factor, so each may have the columns that either has.
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -251,7 +251,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
         unseen = 0.5 * of_curve
         typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
         sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
-    # All lags together have at most the effect of one lag: they share its prior variance.
+    # All lags together have at most the effect of one lag: the lags share the variance of one lag.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)

@@ -83,7 +83,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Find the direction farthest from all of `up`, (n, 3), and the nearest one's angle [deg]."""
+    """Return the direction of largest angle to the nearest of `up`, (n, 3); the angle [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))

@@ -147,8 +147,8 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,); 0 where the rate is noise: the
-    mean temperature changes by less than half of the rate from one window to the next.
+    Return the rate of the board temperature [K/min], shape (n,); 0 where the rate is noise, as the
+    mean temperature of the windows changes by less than half of the rate.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
@@ -168,7 +168,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             'the effect of a ramp is unknown; record ramps between the soaks',
         )
         steps = np.diff(np.sort(windows.temperature))
-        # Soaks at one temperature of a chamber differ by less than 1 K, or a tenth of the span.
+        # Soaks at one chamber temperature differ by less than 1 K, or a tenth of the span.
         is_gap = steps > max(1.0, 0.1 * steps.sum())
         n = 1 + int(is_gap.sum())
         # A slow drift of the temperature through a range is not a soak.
@@ -320,9 +320,9 @@ def judge_result(
 
     slow: sd of the bias that no temperature explains [m/s^2]
     span: span of the board temperature [K]
-    drift: RMS of the residuals about their means in the positions [m/s^2]
+    drift: RMS of ``|f| - g`` about the means of the positions [m/s^2]
     noise: white noise of a window [m/s^2]
-    is_changed: whether the evidence is for a change of the unit since the prior calibration
+    is_changed: whether the evidence favours a far wider prior than the given calibration
     """
     overall = rows[-1]
     raw, fitted, left_out = (

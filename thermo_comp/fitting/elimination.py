@@ -27,8 +27,8 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     Return the lower Cholesky factors of matrices that are positive definite except for rounding,
     shape (..., n, n).
 
-    The matrix is scaled to a unit diagonal, or by the root of `diagonal`, shape (..., n), if it is
-    given; then the smallest jitter with which a factor exists is added to the diagonal.
+    The matrix is scaled to a unit diagonal, or by the root of a given `diagonal`, shape (..., n);
+    then the smallest jitter with which a factor exists is added to the scaled diagonal.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)

@@ -46,8 +46,8 @@ def contradicting_bag(fit: Fit) -> list[int]:
     Find the bag that may be of another environment: a list of one bag, or an empty list.
 
     A bag is suspect if its left-out drift is far above both the median of all bags and the white
-    noise of a window. A bag is also suspect if its drift is the only one that the other bags do
-    not determine, and the median drift is far above the noise.
+    noise of a window. A bag is also suspect if its drift alone is not determined by the
+    other bags, and the median drift is far above the noise.
     """
     square = _square_of_bags(fit)
     known = np.isfinite(square)

@@ -73,8 +73,8 @@ class ResidualRow:
 
 def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     """
-    Return statistics of the residuals after each step of the correction and, for each window, its
-    ``|f| - g`` in sample and its left-out error [m/s^2], shape (n,).
+    Return statistics of the residuals after each step of the correction and, of each window,
+    ``|f| - g`` in sample and the left-out error [m/s^2], shape (n,).
     """
     windows, regression, selected, state = *fit[:3], fit.posterior.state
     steps = [

@@ -42,7 +42,7 @@ STUDENT_NU = 4.0
 LEAST_GAIN = 1.0
 #: Gain in log evidence from which a model is clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
-#: Variance of the logarithm of a prior sd in its log-normal hyperprior: its sd is a factor of ten.
+#: Variance of the log of a prior sd in the log-normal hyperprior, whose sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
 
 
@@ -94,8 +94,8 @@ def _updated(
     changes.append(change)
     turn_on_sd = prior.turn_on_sd
     if prior.informative is None:
-        # A prior calibration states the sd of turn-ons, which the few turn-ons of its update do
-        # not determine beside the ageing of the bias.
+        # A prior calibration states the sd of turn-on offsets, which the few turn-ons of an update
+        # do not separate from the ageing of the bias.
         turn_on_sd, change = _offset_sd(posterior, turn_on_sd, posterior.layout.turn_on)
         changes.append(change)
     tilt_sd, change = _tilt_sd(posterior, float(regression.windows.kelvins[0]))
@@ -104,8 +104,8 @@ def _updated(
     changes.append(change)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly, so the built-in prior counts as a fourth,
-        # and the sd changes only if the data determine more than one element of M.
+        # Three elements of M determine their sd poorly, so the built-in sd counts as a fourth
+        # element, and the sd changes only if the data determine more than one element of M.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
@@ -228,11 +228,11 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # The noise is at least 1e-8 m/s^2, below any sensor's; from constant samples it would be 0.
+    # The white noise is at least 1e-8 m/s^2, below any sensor's: constant samples would give 0.
     least = np.full(3, 1e-8)
     if not regression.windows.has_drifts:
-        # If no column changes within a position, slow noise explains the whole drift, and white
-        # noise would be 0: it is at least that of differences of windows, where a drift cancels.
+        # If no column changes within a position, slow noise explains the whole drift. The white
+        # noise is then at least that by differences of windows, in which a drift cancels.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 

@@ -44,7 +44,7 @@ def constant_calibration(
     means: Floats, gravity: float | Floats, misalignment_sd: float
 ) -> ConstantCalibration:
     """
-    Fit the triad to position means, shape (n, 3); raises FitError if they are on no ellipsoid.
+    Fit the triad to position means, shape (n, 3); raises FitError for means on no ellipsoid.
 
     `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2];
     `misalignment_sd`: prior sd of the elements of M [rad]; 0 for axes at right angles
@@ -77,8 +77,8 @@ def constant_calibration(
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, misalignment_sd))
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # The best ellipsoid of scattered points can be very large, with a remote centre: it is
-    # rejected.
+    # The best ellipsoid of scattered points can be very large, with a remote centre, which is no
+    # calibration.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(

@@ -32,8 +32,8 @@ from .sources import angular_velocity
 _MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
 # Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8
-# Smallest significant step, in units of its sd; the search over the place of a step reaches about
-# 5 by chance.
+# Smallest significant ratio of a step to the sd of the step; the search over the place of a step
+# reaches a ratio of about 5 by chance.
 _STEP_SDS = 8.0
 
 
@@ -140,7 +140,7 @@ def _examine(
     step_sd = sd * relative_sd * _correlation(residual, sd)
     if r:
         # At least half of the step must remain in the mean level, and the change of the mean level
-        # must exceed four of its standard deviations.
+        # must exceed four standard deviations of this change.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:

@@ -192,7 +192,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
         if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
     ]
-    # The RMS error of left-out halves of the program may rise by a quarter, about its scatter.
+    # The RMS error of left-out halves of the program may rise by a quarter, its usual scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if is_worse_by_norms(before, after) or is_worse_by_halves:
         return 0.0
@@ -297,15 +297,15 @@ def _by_positions(
 
 
 def _mean(values: Floats, weights: Floats) -> Floats:
-    """Average windows like `np.average`, without its checks, which take longer than the sums."""
+    """Average windows as `np.average`, without checks, which would take longer than the sums."""
     share = weights.reshape(-1, *[1] * (values.ndim - 1))
     return np.asarray(np.sum(values * share, axis=0) / np.sum(share, axis=0))
 
 
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     """
-    Return the state of a fit after one Gauss-Newton step with changed equations, and the root of
-    its covariance, see `Posterior`; `matrix`: the changed equations of the unit's unknowns
+    Return the state after one Gauss-Newton step with other normal equations (`matrix`) of the
+    unit's unknowns, and the root of the unit's covariance, see `Posterior`.
     """
     step, factor = point.unit_step(matrix)
     step = np.pad(step, (0, point.layout.n - point.layout.n_unit))

@@ -46,8 +46,8 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError for fewer calibrations than three, or if they differ in input, reference
-    temperature, sensors or curves.
+    Raises FitError for fewer than three calibrations, or for calibrations that differ in input,
+    reference temperature, sensors or curves.
     """
     # Nonlinear terms are left out: most units have none, because a centrifuge is needed to
     # determine them.
@@ -175,7 +175,7 @@ def _without_range(column: Column) -> Column:
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return columns of the bank whose sum is (about) a given column, each with its share.
+    Return columns of the bank, with factors, whose weighted sum is (about) the given column.
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
     the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,

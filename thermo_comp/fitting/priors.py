@@ -100,7 +100,7 @@ def informative_priors(
     """
     Return candidate priors from a calibration, which the fit compares by evidence.
 
-    The last candidate is the widest; the fit begins with it. Raises FitError if the calibration
+    The last candidate is the widest, with which the fit begins. Raises FitError if the calibration
     has no covariance.
     """
     if calibration.posterior is None:

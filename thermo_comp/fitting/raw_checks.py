@@ -21,7 +21,7 @@ from .reduction import ReducedBag
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """Refuse a prior of another unit: its small uncertainties do not apply to this unit."""
+    """Refuse a prior of another unit, whose small uncertainties do not apply to this unit."""
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:

@@ -206,7 +206,7 @@ def reduce_source(
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
     if share < 0.5:
-        # Cells of 5 samples are used if the rests that they show have six attitudes or more.
+        # Cells of 5 samples are used if they give rests in six attitudes or more.
         shorter, _ = reduced(5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)
@@ -223,7 +223,7 @@ def _reduced(
     still_sd: float,
     fewest_windows: int,
 ) -> tuple[ReducedBag, float]:
-    """Reduce a source with one length of the cells; return also this length [s]."""
+    """Reduce a source, for one choice of cells; return also the length of a cell [s]."""
     reading = _Pass(source, accumulator)
     cells = reading.cells
     if source.force is None:

@@ -41,8 +41,8 @@ SLOW_TILTS = advice(
 
 def extrapolates(fit: Fit) -> bool:
     """
-    Whether the chosen model leaves more than noise, and its settled bias has a larger expected
-    error than that of a smaller model, see `settled_bias`.
+    Whether the left-out drift of the chosen model exceeds noise, and the expected error of the
+    settled bias is larger than that of a smaller model, see `settled_bias`.
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next((trial for trial in trials if trial.is_chosen), None)

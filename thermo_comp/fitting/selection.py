@@ -235,7 +235,7 @@ class Growth:
         state = posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
-            # Attitudes and offsets of rests in a pose absorb errors of the model: add them.
+            # Attitudes and offsets of rests in a pose absorb errors of the model: include both.
             by_attitude = regression.gravity * state.from_pose
             square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
         slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
@@ -286,7 +286,7 @@ def select(
     constants = first = better_start(fits)
     trials = [constants]
     if CURVE in growth.free:
-        # The curve is added without a test: it may improve the score only with other groups.
+        # The curve is added without a test, as it may improve the score only with other groups.
         if regression.windows.has_drifts:
             curve = better_start([growth.extended(fit, (CURVE,)) for fit in fits])
             downweigh(regression, curve.posterior)
@@ -340,7 +340,7 @@ def _grown(
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, with its final score, and models within one standard error of it."""
+    """Mark the chosen model, with the final score, and models within one standard error."""
     marked = []
     for trial in trials:
         is_chosen = trial.groups == chosen.groups

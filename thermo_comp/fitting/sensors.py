@@ -28,7 +28,7 @@ _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 @dataclass(frozen=True)
 class RateHistory:
-    """One thermometer's rate over one bag, on a grid of ten seconds, and its noise [K/s]."""
+    """Rate of one thermometer over one bag, on a grid of ten seconds, and the rate's sd [K/s]."""
 
     rate: Floats
     rate_sd: float
@@ -105,7 +105,7 @@ def learn_thermometer(
 
 
 def quantum_of(values: Floats) -> float:
-    """Find the quantum of a sensor's readings, shape (n,) [K]; 0 if they are not rounded."""
+    """Return the quantum [K] of a sensor's readings, shape (n,); 0 for readings not rounded."""
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0

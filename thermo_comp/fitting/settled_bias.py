@@ -22,12 +22,11 @@ def settled_error(
     regression: Regression, posterior: Posterior, excess: float, settled: Floats
 ) -> float:
     """
-    Return the expected error of the settled bias [m/s^2]; it is infinite for a model without a
-    curve.
+    Return the expected error of the settled bias [m/s^2]; infinite for a model without a curve.
 
-    The error is the sd of the settled bias, and the left-out drift beyond the noise, `excess`
-    [m/s^2], enlarged as the sd of the settled bias exceeds that in the windows. `settled`: columns
-    at settled temperatures, shape (k, m).
+    The error is the root sum of squares of the sd of the settled bias, and of the left-out drift
+    beyond the noise, `excess` [m/s^2], times the ratio of that sd to the sd in the windows, at
+    least 1. `settled`: columns at settled temperatures, shape (k, m).
     """
     if not posterior.layout.used[0].any():
         return np.inf

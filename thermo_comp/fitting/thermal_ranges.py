@@ -49,8 +49,8 @@ def temperature_range(windows: ThermalWindows) -> Range:
 
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
-    Return the first sensor's gradient in soaks and its robust scatter [K], from a prior
-    calibration if it has them, or None without the sensor or a soak.
+    Return the first sensor's gradient in soaks and the gradient's robust scatter [K], from a prior
+    calibration that states both, or None without the sensor or a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
@@ -100,7 +100,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s], or the usual lag if it was not measured."""
+    """Return the lag of the board behind the case [s], or `USUAL_BOARD_LAG_S` if implausible."""
     lag = _slope_of_gradient(windows)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 

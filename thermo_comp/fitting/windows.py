@@ -384,7 +384,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The level of the dynamic set is an effect of ramps: it corresponds to the RMS gradient [K].
+    # The level of the dynamic set is an effect of ramps, equivalent to the RMS gradient [K].
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)

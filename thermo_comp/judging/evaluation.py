@@ -199,7 +199,7 @@ class Drift:
 
     @property
     def is_sure(self) -> bool:
-        """Whether the change exceeds three of its standard deviations."""
+        """Whether the change exceeds three standard deviations (`sd`)."""
         return abs(self.change) > _SIGNIFICANT_SDS * self.sd
 
 

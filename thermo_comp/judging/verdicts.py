@@ -145,8 +145,8 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
     """
     Judge a gyroscope by windows at rest; return None without a gyroscope or angular rates.
 
-    At rest a gyroscope reads the Earth's rate and its turn-on bias, both unknown, so the changes
-    from the mean of each rest are judged, against the sd claimed for the changes.
+    At rest a gyroscope reads the unknown sum of Earth's rate and turn-on bias, so the changes from
+    the mean of each rest are judged, against the sd claimed for the changes.
     """
     windows = windows.select(np.asarray(np.isfinite(windows.gyro[:, :6]).all(axis=1)))
     if not windows.gyro.size:

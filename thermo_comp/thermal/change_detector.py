@@ -209,8 +209,8 @@ class ChangeDetector:
         reading, before = sensor.reading, self._reading
         apart = (stamp_ns - self._edge_ns) * 1e-9
         if reading == before:
-            # Since no edge of a cell has been crossed, the rate is at most one quantum per time
-            # since the last edge.
+            # As no edge of a cell was crossed, the rate is at most a quantum divided by the time
+            # since the last crossing.
             bound = self._quantum / apart
             if bound < self._baseline_error + abs(self._baseline):
                 self._baseline_error = max(min(self._baseline_error, bound), self.swing)

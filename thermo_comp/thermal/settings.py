@@ -11,9 +11,7 @@ from typing import Annotated, Final, Literal, get_args
 
 from ..quantities import QUANTITIES, NotNegative, Positive, refuse_impossible
 
-CELL_SIGMAS: Final = (
-    2.5  # quantum / noise sd above which a reading is treated as an interval, its cell
-)
+CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading counts as an interval (cell)
 # Quantum / noise sd above which noise never moves a reading: 6 sd of the difference of two
 # readings.
 WIDE_CELL_SIGMAS: Final = 8.5
