@@ -152,7 +152,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     by a prior calibration, 0 for none; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
     """
     if known_sd:
-        # Twelve positions determine the sd of their mounting offsets to a factor of 1.5.
+        # Twelve positions determine the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
     # By data sheets, turn-ons of navigation grade repeat within some 10 ug at best; mountings

@@ -48,14 +48,14 @@ def norm_columns(up: Floats) -> Floats:
 def constants_covariance(
     up: Floats, sd: Floats, misalignment_sd: float = MISALIGNMENT_SD
 ) -> Floats:
-    """Return the covariance of a triad's constants by positions `up` (n, 3) of noise `sd` [g]."""
+    """Return the covariance of a triad's constants from attitudes `up` (n, 3), noise `sd` [g]."""
     rows = norm_columns(up) / sd[:, None]
     prior_sd = np.append(PRIOR_SD[:6], [misalignment_sd] * 3)
     return np.asarray(np.linalg.inv(np.diag(prior_sd**-2) + rows.T @ rows))
 
 
 def worst_sd(covariance: Floats) -> float:
-    """Return the largest sd of the force over all attitudes and directions of its error [g]."""
+    """Return the largest sd of the force [g], over all attitudes and directions of the error."""
     columns = force_columns(_SPHERE)
     return math.sqrt(np.max(np.linalg.eigvalsh(columns @ covariance @ columns.transpose(0, 2, 1))))
 

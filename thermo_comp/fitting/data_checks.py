@@ -224,7 +224,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a position if the largest sd of |f| is 3 times its median over the positions."""
+    """Advise a position if the largest sd of |f| is 3 times the median sd in the positions."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',

@@ -158,7 +158,7 @@ class Reduced:
     def variances(self, root: Floats) -> tuple[Floats, Floats]:
         """
         Return the variances of the unknowns of positions and bags, without the prior on the sum of
-        the initial lag states; `root`: upper triangular, of the covariance of the unit's unknowns.
+        the initial lag states; `root`: upper triangular root of the unit's covariance.
         """
         bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
         by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]

@@ -233,7 +233,7 @@ def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
     """
-    Fit again without an effect that the bags do not show, or with slow tilts, see `refit_checks`.
+    Repeat a fit whose settled bias is uncertain, or whose supports may tilt, see `refit_checks`.
     """
     if options.prior is not None or options.model == 'golovach':
         return result

@@ -44,7 +44,7 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
 def drift_variance(
     regression: Regression, state: State, layout: Layout, covariance: Floats
 ) -> Floats:
-    """Return the variance of each window's drift by a covariance of the unit's unknowns."""
+    """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
     position = regression.windows.position
     columns = within_positions(regression.columns, position)
     by_weights = layout.by_weights(columns, regression.effects(state).force[position])

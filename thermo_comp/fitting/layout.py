@@ -63,7 +63,7 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Places of radius, misalignment and poses, which all axes share; last of the unit's."""
+        """Places of radius, misalignment and poses, which all axes share; the last of the unit."""
         return np.concatenate((self.radius, self.misalignment, self.pose.ravel()))
 
     @property

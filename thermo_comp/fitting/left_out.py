@@ -61,7 +61,7 @@ class Folds:
 
     @classmethod
     def of(cls, square: Floats, windows: Floats, fold: Ints) -> Folds:
-        """Average mean squares, NaN if not scored, over the positions of each fold, shape (p,)."""
+        """Average the mean squares of positions, shape (p,), NaN if not scored, over each fold."""
         known = np.isfinite(square)
         count = np.bincount(fold, np.where(known, windows, 0.0))
         total = np.bincount(fold, np.where(known, square * windows, 0.0))

@@ -140,7 +140,7 @@ def with_forces(
 
 
 def is_beyond(windows: ThermalWindows) -> bool:
-    """Whether the stated |f| differs between positions, as beyond 1 g."""
+    """Whether the stated |f| differs between positions."""
     forces = windows.data.forces
     return forces is not None and float(np.ptp(forces.sizes)) > 0.0
 
@@ -161,7 +161,7 @@ def starting_sd(forces: Forces, options: FitOptions) -> Floats:
 
 
 class _TermFits:
-    """Fits with different nonlinear coefficients, and the gain of the fit by each of these."""
+    """Fits with different nonlinear coefficients, and what a fit gains by some coefficients."""
 
     def __init__(self, regression: Regression, selected: Selected, sd: Floats) -> None:
         """Set the prior sd of the nonlinear coefficients, shape (2 k,)."""

@@ -154,7 +154,7 @@ def _parts_of(
     square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
     ratio = float(np.sqrt((square / noise**2).max()))
     x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-    # Curves alone extrapolate badly to left-out sections: drifts of 10 sd are allowed.
+    # Curves without stress terms extrapolate badly: left-out drifts of 10 sd of noise are allowed.
     is_curve = ratio <= shape.most_noise and not shape.has_stress
     return Parts((x, y, z), factors, (10.0 if is_curve else 2.0) * float(noise.mean())), ratio
 

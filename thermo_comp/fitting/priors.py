@@ -76,7 +76,7 @@ def offset_sd_of(calibration: Calibration) -> float:
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Set bias and weights of a state to a calibration's, whose scale factors are nominal."""
+    """Set bias and weights of a state to those of a calibration whose K is the nominal scale."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(

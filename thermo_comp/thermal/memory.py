@@ -167,7 +167,7 @@ class ThermalMemory:
         self.start_rate = 0.0
 
     def forget_input(self, name: str) -> None:
-        """Forget the gradient of a sensor, or all inputs if it is the board."""
+        """Forget the gradient of a sensor or, for the board, all inputs."""
         if name == BOARD_INPUT:
             self.forget()
         else:
