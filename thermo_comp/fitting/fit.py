@@ -366,7 +366,7 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
         # If the positions determine a misalignment out of range, the sensor is no accelerometer.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
-            'by the fit the angle between two of its axes is less than 60 degrees, which no '
+            'by the fit the angle between two of the axes is less than 60 degrees, which no '
             'accelerometer has: is the topic that of the accelerometer, did the axes stay the '
             'same in all positions, and are there at least 9 positions?'
         )

@@ -28,7 +28,7 @@ from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest duration of the readings on either side of a gap that give the level: [s], in samples.
+# Shortest part on either side of a gap that gives the mean level: [s], and number of samples.
 _MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
 # Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8

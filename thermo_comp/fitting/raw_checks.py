@@ -197,7 +197,7 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
     warmed = ''
     if np.isfinite(jump.temperature_change):
         warmed = (
-            f', while its temperature changed by {jump.temperature_change:+.2f} ± '
+            f', while the board temperature changed by {jump.temperature_change:+.2f} ± '
             f'{jump.temperature_change_sd:.2f} K'
         )
     return (

@@ -134,7 +134,7 @@ class Point:
     @property
     def _common_variance(self) -> float:
         """Prior variance of the sum over the bags of an initial lag state."""
-        # The mean over the bags of an initial lag state has 0.1 of the prior sd in one bag,
+        # The prior sd of an initial lag state's mean over the bags is 0.1 of the sd in one bag,
         # because a mean that differs from 0 is an effect of the unit.
         return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
 

@@ -45,8 +45,7 @@ class RegimeDetector:
     """
     State machine over the temperature estimates of the case and the board.
 
-    `direction` is -1 while cooling and +1 while heating; it is 0 in the dynamic state before the
-    direction is known, and in all other states.
+    `direction`: in the dynamic regime -1 while cooling, +1 while heating; 0 in other regimes.
     """
 
     def __init__(self, settings: DetectorSettings) -> None:
