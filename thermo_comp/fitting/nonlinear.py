@@ -33,7 +33,7 @@ from .windows import ThermalWindows
 
 # Smallest effective parameters, per coefficient, of a nonlinear term that the data determine: 0.99
 # means that the posterior sd is a tenth of the prior sd.
-_DETERMINED = 0.99
+_DETERMINED_SHARE = 0.99
 
 _Active = frozenset[int]  # indices of the nonlinear coefficients in use
 
@@ -193,7 +193,7 @@ class _TermFits:
         """Whether the data determine a nonlinear coefficient."""
         posterior = self.posterior(used)
         share = posterior.determined[posterior.layout.nonlinear[:, at]]
-        return bool(share.mean() > _DETERMINED)
+        return bool(share.mean() > _DETERMINED_SHARE)
 
     def thinned(self, used: _Active) -> _Active:
         """Remove nonlinear terms that the data determine and that lower the log evidence."""
@@ -314,7 +314,7 @@ def judge_terms(calibration: Calibration) -> Iterator[Finding]:
     undetermined = ', '.join(
         f'{term.kind} (effective parameters {term.effective_parameters:.1f} of 6)'
         for term in terms
-        if term.effective_parameters < 3.0 * _DETERMINED
+        if term.effective_parameters < 3.0 * _DETERMINED_SHARE
     )
     if undetermined:
         yield advice(

@@ -37,7 +37,7 @@ from .initial_triad import (
 from .windows import ThermalWindows
 
 # Ratio of a time constant of the columns to the next smaller time constant: half an octave.
-_STEP = 2.0**0.5
+_TAU_RATIO = 2.0**0.5
 
 
 class _Shape(NamedTuple):
@@ -70,12 +70,12 @@ class _Steps(NamedTuple):
 
 
 # Ratio of the RMS residual to white noise below which no other shape of the curves is tried.
-_EXPLAINED = 1.1
+_EXPLAINED_RATIO = 1.1
 # Shapes tried in this order: a spline of few nodes determines a lag best but has no kinks, so
 # noise must explain the residual of this spline.
 _SHAPES = (
-    _Shape(4, _EXPLAINED),
-    _Shape(4, _EXPLAINED, has_gradient=True),
+    _Shape(4, _EXPLAINED_RATIO),
+    _Shape(4, _EXPLAINED_RATIO, has_gradient=True),
     _Shape(60, 1.5),
     _Shape(60, 1.5, has_gradient=True, has_stress=True),
 )
@@ -127,7 +127,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
             continue
         if ratio < least:
             best, least = parts, ratio
-        if ratio <= _EXPLAINED:
+        if ratio <= _EXPLAINED_RATIO:
             break
     accepted = [] if best is None else [best]
     if least > _SHAPES[-1].most_noise:
@@ -333,7 +333,7 @@ class _PartCurves:
         best = min(self._tried.tolist(), key=square)
         minimum = minimize_scalar(
             lambda log_tau: float(np.log(square(float(np.exp(log_tau))))),
-            bounds=(float(np.log(best / _STEP)), float(np.log(best * _STEP))),
+            bounds=(float(np.log(best / _TAU_RATIO)), float(np.log(best * _TAU_RATIO))),
             method='bounded',
             options={'xatol': 1e-3},
         )
@@ -342,18 +342,18 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether `_STEP` times longer or shorter time constants add 5 % to the RMS residual, and the
-        lag settles to 10 % within the longest bag.
+        Whether time constants longer or shorter by `_TAU_RATIO` add 5 % to the RMS residual, and
+        the lag settles to 10 % within the longest bag.
         """
         tau, second, share, lead = lag
         if tau > float(self._age.max()) / np.log(10.0):
             return False
         others = [
             Part(ratio * tau, ratio * second, share, ratio * lead)
-            for ratio in (1.0 / _STEP, _STEP)
+            for ratio in (1.0 / _TAU_RATIO, _TAU_RATIO)
         ]
         if not tau:
-            others = [Part(float(self._tried[0]) * _STEP)]
+            others = [Part(float(self._tried[0]) * _TAU_RATIO)]
         limit = 1.05**2 * self._square(lag, axis)
         return all(self._square(other, axis) > limit for other in others)
 

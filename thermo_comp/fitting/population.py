@@ -39,7 +39,7 @@ from .thermal_ranges import union
 #: Smallest number of units of a population: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
 #: Fields of a column whose lag has one stage, no share of the gradient and no lead.
-_ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
+_ONE_STAGE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
 
 
 def population(calibrations: Sequence[Calibration]) -> Calibration:
@@ -188,7 +188,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     if not is_line and any(column.part[1:]):
         # A power of a sum of lags becomes the power of one lag, of a time constant of 1 s or more.
         behind_s = max(tau + second - column.lead_s, 1.0)
-        return _on_common_lags(replace(column, tau_s=behind_s, **_ALONE))
+        return _on_common_lags(replace(column, tau_s=behind_s, **_ONE_STAGE))
     summands: list[tuple[Column, float]] = []
     if column.sensor_share:
         of_board = replace(column, sensor_share=0.0)
@@ -196,7 +196,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         summands = [(of_board, 1.0), (of_sensor, -column.sensor_share)]
     elif any(column.part[1:]) and isinstance(lag, Lag):
         summands = [
-            (replace(column, tau_s=tau_s, **_ALONE), share)
+            (replace(column, tau_s=tau_s, **_ONE_STAGE), share)
             for (_, tau_s), share in lag.first_order_weights.items()
         ]
     if summands:

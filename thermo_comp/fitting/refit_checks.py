@@ -26,7 +26,7 @@ from .windows import CURVE
 _PIECE_S = 3600.0
 # Slow tilts are tried if the drift of left-out positions, averaged over each piece, exceeds these
 # multiples of the white noise of the average, and of the error of the left-out norms.
-_SLOW_DRIFT, _PART_OF_NORMS = 6.0, 0.1
+_DRIFT_TO_NOISE, _DRIFT_TO_NORMS = 6.0, 0.1
 # Smallest number of positions with left-out norms: the norms of fewer positions give no reliable
 # standard error of the gain by slow tilts.
 _FEWEST_NORMS = 6
@@ -67,7 +67,7 @@ def may_have_slow_tilts(fit: Fit) -> bool:
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
         return False
     drift, n_windows = _slow_drift(data, score.drift)
-    least = max(_SLOW_DRIFT * score.noise / n_windows**0.5, _PART_OF_NORMS * score.norms.rms)
+    least = max(_DRIFT_TO_NOISE * score.noise / n_windows**0.5, _DRIFT_TO_NORMS * score.norms.rms)
     return bool(drift > least)
 
 

@@ -15,7 +15,7 @@ from ..typing import Floats
 from .regression import Posterior, Regression
 
 # Number of windows that are sufficient for the mean sd of the bias in the windows.
-_N_SEEN = 500
+_N_WINDOWS = 500
 
 
 def settled_error(
@@ -30,7 +30,7 @@ def settled_error(
     """
     if not posterior.layout.used[0].any():
         return np.inf
-    seen = regression.columns[:: max(len(regression.columns) // _N_SEEN, 1)]
+    seen = regression.columns[:: max(len(regression.columns) // _N_WINDOWS, 1)]
     sd, seen_sd = (
         _sd_of_changes(posterior, columns - columns.mean(axis=0))
         for columns in (settled / regression.rms, seen)

@@ -24,10 +24,10 @@ from .windows import CURVE, PART
 
 #: Smallest share of gravity along an axis in a position that determines the axis' scale factor. At
 #: a half, the error of |f| is a quarter of the scale factor's error.
-LEAST_SHARE = 0.5
+LEAST_GRAVITY_SHARE = 0.5
 #: Share of the temperature range of an axis by which its scale curve continues without error. The
 #: ranges of the positions of one test differ by about this share.
-FREE_SHARE = 0.1
+FREE_RANGE_SHARE = 0.1
 
 
 def with_unseen_axes(
@@ -94,7 +94,7 @@ def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
     temperature, as its covariance is that of the fit's prior.
     """
     lower, upper = _seen(fit, known)
-    reach = FREE_SHARE * (upper - lower)
+    reach = FREE_RANGE_SHARE * (upper - lower)
     is_seen = lower <= upper
     return np.where(is_seen, (lower - reach, upper + reach), [[-np.inf], [np.inf]])
 
@@ -105,7 +105,7 @@ def _seen(fit: Fit, known: Calibration | None) -> Floats:
     axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) for none.
     """
     temperature = fit.windows.temperature[:, np.newaxis]
-    is_along = np.abs(fit.posterior.state.up) >= LEAST_SHARE
+    is_along = np.abs(fit.posterior.state.up) >= LEAST_GRAVITY_SHARE
     is_seen = is_along[fit.windows.data.position]
     lower = np.where(is_seen, temperature, np.inf).min(axis=0)
     upper = np.where(is_seen, temperature, -np.inf).max(axis=0)

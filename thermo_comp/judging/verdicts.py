@@ -24,7 +24,7 @@ WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
 # Largest ratio of a |f| to the next smaller |f| of the windows, for both to be one level of |f|.
-_NEXT_LEVEL = 1.02
+_LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
 
@@ -105,7 +105,7 @@ def by_force(windows: Windows, claimed: Floats) -> dict[float, Section]:
     if windows.is_usual.all():
         return {}
     order = np.argsort(windows.size, kind='stable')
-    steps = np.flatnonzero(windows.size[order][1:] > _NEXT_LEVEL * windows.size[order][:-1]) + 1
+    steps = np.flatnonzero(windows.size[order][1:] > _LEVEL_RATIO * windows.size[order][:-1]) + 1
     values = windows.raw_residual, windows.residual, claimed
     levels = np.split(order, steps)
     return {float(windows.size[rows].mean()): _section(*values, rows) for rows in levels}

@@ -29,9 +29,9 @@ BEND_SHARES = (1.0, 10.0)  # tuned acceleration of a filter / smallest accelerat
 TUNING: Final = 1.45  # best memory of a filter / (noise sd / acceleration)^0.4, at 1 Hz
 # Noise variance of the rate / the filter's variance, for a sensor with mostly quantization noise.
 CELL_NOISE_SHARE: Final = 0.4
-SETTLING: Final = 5.0  # age of a filter at which its noise is stationary, in filter memories
+SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
-LARGEST_BASELINE: Final = 0.25  # largest rate of the soak's baseline / rate of the smallest ramp
+LARGEST_BASELINE_SHARE: Final = 0.25  # largest baseline rate of a soak / smallest ramp's rate
 SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
 SWING_SIGMAS: Final = 3.0  # noise subtracted from an observed swing of the rate, in sd
 # Time constant with which the swing of the rate decays, in sensor lags.
@@ -50,7 +50,7 @@ class ChangeDetector:
         self, sensor: ThermometerSettings, smallest_rate: float, ripple: float, false_alarms: float
     ) -> None:
         self._largest_swing = 0.5 * smallest_rate
-        self._largest_baseline = LARGEST_BASELINE * smallest_rate
+        self._largest_baseline = LARGEST_BASELINE_SHARE * smallest_rate
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
@@ -172,7 +172,7 @@ class ChangeDetector:
             self._thresholds.insert(0, squared * share)
             self._noise_share = share
         self._edge_margin = sqrt(squared) * self._edge_noise
-        self._settled_s = SETTLING * math.pow(self._noise * dt / self._powers[0], 0.25)
+        self._settled_s = SETTLING_MEMORIES * math.pow(self._noise * dt / self._powers[0], 0.25)
 
     def _watch_filters(
         self, dt: float, measured: float, variance: float, low: float, high: float

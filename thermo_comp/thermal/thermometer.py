@@ -39,7 +39,7 @@ COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
 # Horizon of linear extrapolation [reading intervals]; beyond it the temperature is held.
 HORIZON_INTERVALS: Final = 5.0
-LONGEST_STEP: Final = 0.125  # longest step of a prediction / lag of the sensor
+LONGEST_STEP_SHARE: Final = 0.125  # longest step of a prediction / lag of the sensor
 NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
 # The filters of the two modes are written out in floats: a matrix library costs more per call.
@@ -128,7 +128,7 @@ class Thermometer:
         bent = mix(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
         # The transition of `predict` holds for times much shorter than the lag: a long interval is
         # predicted in steps.
-        n_steps = 1 + int(dt / (LONGEST_STEP * lag))
+        n_steps = 1 + int(dt / (LONGEST_STEP_SHARE * lag))
         for _ in range(n_steps):
             quiet = predict(quiet, dt / n_steps, lag, self._quiet_power)
             bent = predict(bent, dt / n_steps, lag, self._bending_power)
