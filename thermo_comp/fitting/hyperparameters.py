@@ -137,7 +137,7 @@ def _updated(
 
 def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
     """
-    Move the sd of the supports' tilts towards the mode; return also the change of log sd.
+    Move the sd of the supports' tilts towards the mode; return also a third of log sd's change.
 
     `kelvins`: RMS of the board temperature about the reference [K]
     """

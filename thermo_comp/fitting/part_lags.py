@@ -163,7 +163,7 @@ class _PartCurves:
     """
     Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
 
-    Every k-th window is used, so that `n_windows` windows or more are left, if there are as many.
+    Every k-th window is used, with the largest k that leaves `n_windows` windows or more.
     """
 
     def __init__(

@@ -78,7 +78,7 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite or out of order
     n_cells, n_still_cells: number of cells in the bag, and in its rests
-    window_s: length of a window [s]; longer than the option if the samples are slow
+    window_s: length of a window [s]; above the requested length if the samples are slow
     cycle_s: typical interval between samples [s]
     middle: code at zero force of the samples if the codes are unsigned, else 0
     max_abs: largest magnitude of a reading without outliers, see `_max_abs` [input units]

@@ -235,7 +235,7 @@ class Growth:
         state = posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
-            # Attitudes and offsets of rests in a pose absorb errors of the model: include both.
+            # Attitudes and offsets of rests in a pose absorb errors of the model: add their power.
             by_attitude = regression.gravity * state.from_pose
             square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
         slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)

@@ -35,7 +35,7 @@ def settled_error(
         _sd_of_changes(posterior, columns - columns.mean(axis=0))
         for columns in (settled / regression.rms, seen)
     )
-    # The columns are constant in the windows if the temperature hardly changes.
+    # `seen_sd` is 0 if the temperature, and with it every column, is constant in the windows.
     growth = max(sd / seen_sd, 1.0) if seen_sd else 1.0
     return float(np.hypot(sd, excess * growth))
 

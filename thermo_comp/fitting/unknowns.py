@@ -221,7 +221,7 @@ class Prior:
     """
     Standard deviations of the prior of the unknowns, and the noises of the windows.
 
-    bias_sd: sd of the bias [m/s^2], shape (3,); its mean is 0
+    bias_sd: sd of the bias [m/s^2], about a mean of 0, shape (3,)
     scale_mean, scale_sd: mean of the scale ratio kappa of each axis, shape (3,), and its sd
     misalignment_sd: sd of the elements of M [rad]
     column_sd: sd of the weights of the columns, each divided by its RMS, in the bias [m/s^2] and

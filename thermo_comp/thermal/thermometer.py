@@ -6,9 +6,9 @@ Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stampe
 Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, in which the
 acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
 acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
-the mixture of the quiet and the bending filter; its variance includes their difference. If a
-sensor's quantum exceeds its noise, a changed reading is a precise measurement of the edge between
-two cells, and an unchanged reading only bounds the temperature by its cell [3]_.
+the mixture of the quiet and the bending filter, with the variance of a mixture. If a sensor's
+quantum exceeds the noise, a changed reading is a precise measurement of the edge between two
+cells, and an unchanged reading only bounds the temperature by the cell [3]_.
 
 References
 ----------
