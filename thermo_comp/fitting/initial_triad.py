@@ -183,7 +183,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
 
 
 def within_positions(values: Floats, position: Ints) -> Floats:
-    """Subtract from the values of each window, shape (n, k), their mean in its position."""
+    """Subtract from values of windows, shape (n, k), the mean over the position of the window."""
     _, where, count = np.unique(position, return_inverse=True, return_counts=True)
     total = np.zeros((len(count), values.shape[1]))
     np.add.at(total, where, values)

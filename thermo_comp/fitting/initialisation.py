@@ -202,8 +202,8 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 
 def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:
     """
-    Return the prior of the constants during the selection of the columns: five times the largest
-    error of a norm, at least 5 % and at most 100 % of the prior's sd. In an incomplete model,
+    Return the prior of the constants during the selection of the columns: its sd is five times the
+    largest error of a norm, but 5 % to 100 % of the sd of `prior`. In an incomplete model,
     constants that few attitudes do not determine would change by large amounts.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)

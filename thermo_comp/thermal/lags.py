@@ -17,8 +17,8 @@ a lead theta the transfer function of the part is ``(1 + theta s) / (1 + tau s)`
 ``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``.
 
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v G`` between them, with ``G = T_s - T``. The lag behind ``T + v G`` is the lag
-of the board less v times the lag of the gradient.
+temperature ``T + v G`` between them, with ``G = T_s - T``. The state is
+then ``m = T - L(T + v G)``: that of the board, ``T - L(T)``, less v times ``L(G)``.
 """
 
 import math
