@@ -60,7 +60,7 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
         thermal, now_ns = compensator.thermal, compensator.now_ns or 0
         if thermal.is_unmeasured:
             return (*thermal.sample(now_ns), 0.0, 0.0)[:7], []
-        return thermal.sample(now_ns), thermal.tracker.memory.start_shares(now_ns)
+        return thermal.sample(now_ns), thermal.tracker.memory.remaining_shares(now_ns)
 
     finder = gather.RestFinder(
         correction.K[:, 0], np.array(correction.noise), calibration.unit.full_scale, state_now

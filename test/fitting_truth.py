@@ -181,7 +181,7 @@ def mode_of(regression, state, prior):
     point = regression.at(solution.state, prior)
     for _ in range(6):
         step, _ = point.solution
-        point = point.moved(step)
+        point = point.with_step(step)
     return regression.solve(point.state, prior, n_steps=0)
 
 

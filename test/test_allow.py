@@ -136,7 +136,7 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
             dropping_out,
             'unmeasured',
             r'^2\d % .* has no temperatures .* stick, or drop out\? bag\d: temperature/board '
-            'reads nothing new for 20[0-2] s$',
+            'has no new value for 20[0-2] s$',
         ),
         # WHY: a fit of readings in whole degrees, which first changed after a soak, was refused
         # with the question whether the clocks are the same.

@@ -127,7 +127,9 @@ def states_of(unit, rng, n=5):
         if kind != 'accel':
             tracker.read(kind, stamp, value)
         if k % (4800 // n) == 4799 // n:
-            collected.append((stamp, tracker.sample(stamp), tracker.memory.start_shares(stamp)))
+            collected.append(
+                (stamp, tracker.sample(stamp), tracker.memory.remaining_shares(stamp))
+            )
     return tracker, collected
 
 

@@ -36,7 +36,7 @@ def test_a_degenerate_input_ends_with_a_sentence_in_bounded_memory(name, command
         ('stamps all zero', 'all its samples are stamped 0 s: the driver does not stamp them'),
         ('worn on a wrist', 'as if worn or driven: the unit must rest in each position'),
         ('a drive', 'worn, driven or shaken?'),
-        ('axes that lean', 'the angle between two of its axes is less than 60 degrees'),
+        ('axes that lean', 'the angle between two of the axes is less than 60 degrees'),
     ],
 )
 def test_the_cause_of_a_refusal_is_named_in_the_users_words(name, text, tmp_path, cli):

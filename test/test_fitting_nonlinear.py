@@ -14,7 +14,7 @@ from triads import triad
 from thermo_comp.errors import FitError, ThermoCompError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.claim import claim_of
-from thermo_comp.fitting.equations import moved_by
+from thermo_comp.fitting.equations import with_step
 from thermo_comp.fitting.known_force import (
     MAGNITUDE,
     ROTATION,
@@ -96,7 +96,7 @@ def test_derivatives_of_nonlinear_terms_equal_differences(rng):
                 step = np.zeros(layout.n)
                 step[place] = 1e-6
                 above, below = (
-                    regression.misfit(moved_by(state, sign * step, layout), base)[p, axis]
+                    regression.misfit(with_step(state, sign * step, layout), base)[p, axis]
                     for sign in (1.0, -1.0)
                 )
                 expected = (below - above) / 2e-6

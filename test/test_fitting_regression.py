@@ -103,9 +103,9 @@ class Dense:
             state.offset.ravel() / prior.offset_sd,
             state.tilt.ravel() / prior.tilt_sd,
             state.turn_on.ravel() / prior.turn_on_sd,
-            state.start.ravel() / np.sqrt(prior.start_share),
+            state.start.ravel() / np.sqrt(prior.start_variance_ratio),
             # The prior sd of the mean initial lag state of all bags is 0.1 of that of one bag.
-            state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_share)),
+            state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_variance_ratio)),
         ]
         if len(state.pose):
             posed = state.pose_of[state.pose_of >= 0]
@@ -155,7 +155,7 @@ def solved(request):
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
-    prior = prior_of(truth, start_share=0.7, pose_sd=POSE_SD, **narrow)
+    prior = prior_of(truth, start_variance_ratio=0.7, pose_sd=POSE_SD, **narrow)
     return regression, prior, mode_of(regression, state, prior)
 
 
@@ -176,8 +176,8 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
     regression, prior, fitted = solved
     np.testing.assert_allclose(regression.start_root @ regression.start_root.T, START, atol=1e-12)
     beside = []
-    for share in (prior.start_share, 0.1):
-        wide = replace(prior, start_share=share)
+    for share in (prior.start_variance_ratio, 0.1):
+        wide = replace(prior, start_variance_ratio=share)
         mode = mode_of(regression, fitted.state, wide)
         dense = Dense(regression, wide, mode)
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
@@ -194,7 +194,7 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
     # The prior of the mean initial lag state adds a constant, equal for both values of
-    # `start_share`.
+    # `start_variance_ratio`.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 

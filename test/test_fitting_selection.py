@@ -350,7 +350,7 @@ def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, up
     truth = Truth(start_sd=start_sd)
     windows, up = table_of(truth, 18, np.random.default_rng(9), n_windows=60)
     _, chosen = selected_of(truth, windows, up)
-    assert lower <= chosen.posterior.prior.start_share <= upper
+    assert lower <= chosen.posterior.prior.start_variance_ratio <= upper
     assert chosen_groups(chosen) == {'curve', 'board'}
 
 

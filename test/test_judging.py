@@ -299,7 +299,7 @@ class TestVerdict:
         judgement = judge(windows, imported)
         assert judgement.verdict == 'no claim'
         assert not judgement.is_valid
-        assert 'give the largest RMS with --tolerance' in judgement.reason
+        assert 'give the largest accepted RMS with --tolerance' in judgement.reason
         assert np.isnan(judgement.sections['all'].claimed_rms)
         assert judge(windows, imported, 60.0 * MICRO_G).verdict == 'valid'
         assert judge(windows, imported, 40.0 * MICRO_G).verdict == 'recalibrate'

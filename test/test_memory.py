@@ -133,7 +133,7 @@ def test_the_lag_of_a_part_between_board_and_sensor(rng):
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
-    assert late.start_shares(700 * SECOND_NS)[0] == lag.start_share(100.0)
+    assert late.remaining_shares(700 * SECOND_NS)[0] == lag.remaining_share(100.0)
 
 
 @pytest.mark.parametrize('second_s', [0.0, 150.0])
@@ -186,7 +186,7 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
         a, b = TWO_STAGES.shares
         late = a * first + (parts[:, 1] - a * parts[:, 0]) * math.exp(-age / tau[1])
         share = math.sqrt(np.mean(late**2) / np.mean(parts[:, 1] ** 2))
-        assert TWO_STAGES.start_share(age) == pytest.approx(share, rel=0.05)
+        assert TWO_STAGES.remaining_share(age) == pytest.approx(share, rel=0.05)
         assert b < 0.0 < share < 1.0
 
 
@@ -264,10 +264,10 @@ def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
 
 def test_initial_lag_states_decay_with_their_time_constants():
     memory = ThermalMemory(MemorySpec(lags=(('board', 60.0), ('board', 600.0), ('case', 600.0))))
-    assert memory.start_shares(5) == [1.0, 1.0, 1.0]
+    assert memory.remaining_shares(5) == [1.0, 1.0, 1.0]
     memory.board_step(0, 20.0)
     memory.banks['case'].step(300 * SECOND_NS, 2.0)
-    shares = memory.start_shares(600 * SECOND_NS)
+    shares = memory.remaining_shares(600 * SECOND_NS)
     assert shares == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])
 
 

@@ -11,7 +11,7 @@ from position_helpers import START_NS
 
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.coverage import rough_centre
-from thermo_comp.fitting.fit import about
+from thermo_comp.fitting.fit import with_code_offset
 from thermo_comp.simulation.campaign import positions
 
 GRAVITY = 9.80665
@@ -98,7 +98,7 @@ def test_unsigned_words_at_their_limits_are_saturated(rng):
 
 
 def test_the_offset_of_a_prior_is_used(rng, plain):
-    known = about(plain.calibration, np.full(3, 32768.0))
+    known = with_code_offset(plain.calibration, np.full(3, 32768.0))
     up = np.array((0.6, 0.0, 0.8))
     result = fit([source(words_of([up], rng) + 32768.0)], replace(OPTIONS, prior=known))
     np.testing.assert_allclose(constants(result)[0], 32768.0 + BIAS, atol=2.0)

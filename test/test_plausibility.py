@@ -68,8 +68,8 @@ def test_a_wrong_first_reading_leaves_no_trace(sensor, wrong):
                 without.read(name, second * SECOND_NS, celsius)
     state = tracker.sample(900 * SECOND_NS)
     np.testing.assert_allclose(state, without.sample(900 * SECOND_NS), rtol=1e-9, atol=1e-12)
-    shares = tracker.memory.start_shares(900 * SECOND_NS)
-    assert shares == without.memory.start_shares(900 * SECOND_NS)
+    shares = tracker.memory.remaining_shares(900 * SECOND_NS)
+    assert shares == without.memory.remaining_shares(900 * SECOND_NS)
     assert tracker.checks['board'].fault is tracker.checks['case'].fault is Fault.NONE
 
 

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the fit of a calibration: bags of a thermal test, positions at rest, regression, left-out
-errors.
-"""
+"""Owns the fit of a calibration to the positions at rest in the bags of a thermal test."""
 
 from .evidence import ResidualRow
 from .fit import FitResult, fit, fit_bags, reduce_bag

@@ -68,13 +68,13 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     if not has_choice or not _may_have_sets(fit.selected):
         return fit
     # The alternative detector ends the dynamic regime once the case temperature is constant; the
-    # default detector also waits for the board. Only models with two sets depend on the regime.
+    # default detector also waits for the board. Models with one set do not depend on the regime.
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves limit the number of columns, so they are not compared between two detectors
-    # with the same columns.
+    # Left-out halves limit the number of columns, so they do not count in the comparison of two
+    # detectors with the same columns.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -97,8 +97,7 @@ def windows_of(
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows with one lag per axis; or with a bank of time constants, if no lags are found,
-    or if all lags that are found leave a left-out drift above noise and the bank is better on
-    left-out data.
+    or if all lags found leave a left-out drift above `Parts.most_drift` and the bank is better.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -113,7 +112,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _better(fit: Fit | None, other: Fit) -> Fit:
-    """Return the first fit, if it exists and the other fit is not better on left-out data."""
+    """Return `other` if it is better than `fit` on left-out data, or there is no `fit`."""
     return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit
 
 
@@ -132,7 +131,7 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Name the thermometers that every bag has, except the board's, the case's first."""
+    """Return the case, then all other thermometers that every bag has, except the board."""
     recorded = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the conversion of a posterior into the Calibration that the compensator applies."""
+"""Owns the conversion of a fit's posterior into the calibration that the node applies."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def build_calibration(
     """
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Response columns that have a weight, or only an entry in the covariance.
+    # Response columns that have a weight, or only a variance in the covariance.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
@@ -156,9 +156,9 @@ def _valid_columns(
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
         if k in of_parts and column.term.order % 2:
-            # A part lags as far in cooling as in warming: odd powers of its lag have both signs.
+            # A part lags in cooling as in heating, so an odd power of its lag has both signs.
             valid = union((valid, (-valid[1], -valid[0])))
-        # A column used only in the curves over parts' temperatures gets the group of these curves.
+        # A column that only curves over parts' temperatures use gets the group of these curves.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
@@ -219,7 +219,7 @@ def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the order of the posterior; the level of each scale is 0."""
+    """Return the parameters in the order of the file's posterior, with levels of the scale 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):

@@ -7,7 +7,7 @@ do not determine, and by the effects that the model lacks.
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. The weight of a fit in the mixture is its
 evidence, limited by the evidence of the positions' norms, times a half-Student prior of the offset
-sd. The covariance includes the sd of gravity, as an error of the same ratio in all scale factors.
+sd. The covariance includes the sd of gravity, an error by the same ratio of all scale factors.
 `jackknife` adds the variance due to effects that the model lacks.
 
 References
@@ -117,7 +117,7 @@ def _over_offsets(
     mountings and turn-ons, the sd of the offset of a new mounting after a new turn-on [m/s^2], and
     the variance of the offset of a single turn-on, which is no unknown of the regression.
 
-    `offset_sd`: sd of a mounting's offset [m/s^2]; `known_sd`: offset sd by a prior calibration
+    `offset_sd`: sd of a mounting's offset; `known_sd`: offset sd by a prior calibration [m/s^2]
     """
     windows, scale = regression.windows, posterior.prior.offset_scale
     n_mountings = int(windows.mounting[-1]) + 1
@@ -145,14 +145,14 @@ def _over_offsets(
 
 def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Floats]:
     """
-    Return values of the sd of the offsets of mountings or turn-ons [m/s^2], and their log prior
-    density per step of the logarithm.
+    Return the values tried of the sd of the offsets of mountings or turn-ons [m/s^2], and the log
+    prior density of log sd at these values.
 
     `scale`: scale of the fit's prior of offsets, 3 times the noise in 1 Hz; `known_sd`: offset sd
     by a prior calibration, 0 for none; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
     """
     if known_sd:
-        # Twelve positions determine the sd of their mounting offsets to a factor of 1.5.
+        # Twelve positions determine the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
     # By data sheets, turn-ons of navigation grade repeat within some 10 ug at best; mountings
@@ -170,7 +170,7 @@ def _student(x: Floats) -> Floats:
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
-    """Return the places of the unit's unknowns in a layout with more columns, (n_unit,)."""
+    """Return the unit's unknowns as indices in a layout with more columns, (n_unit,)."""
     places = np.empty(layout.n_unit, dtype=np.int64)
     for name in ('kappa', 'bias', 'weights', 'nonlinear', 'shared'):
         at = getattr(layout, name)
@@ -226,7 +226,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
     # Few temperatures do not determine all powers of a curve. One attitude does not separate the
-    # drifts of bias and scale factor, so bias and scale factor may each have the columns of both.
+    # drifts of bias and scale factor, so each may have the columns that either has.
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -251,7 +251,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
         unseen = 0.5 * of_curve
         typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
         sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
-    # All lags together have at most the effect of one lag: they share its prior variance.
+    # All lags together have at most the effect of one lag: the lags share the variance of one lag.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
@@ -267,8 +267,8 @@ def _over_mountings(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
     """
-    Return covariance and offset sd of the mixture of fits over the sd of mounting offsets, given
-    values of this sd and their log prior density, (k,).
+    Return covariance and offset sd [m/s^2] of the mixture of fits over the sd of mounting offsets,
+    given values of this sd (`tried`) and their log prior density, (k,).
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
@@ -298,8 +298,8 @@ def _over_turn_ons(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
     """
-    Return the covariance of the mixture of fits over the sd of turn-ons, and the mean variance of
-    a turn-on; arguments as in `_over_mountings`.
+    Return the covariance of the mixture of fits over the sd of turn-on offsets, and the mean
+    variance of a turn-on offset; arguments as in `_over_mountings`.
     """
     fits = [
         regression.solve(
@@ -334,7 +334,7 @@ def _excess_over_priors(
     regression: Regression, posterior: Posterior, informative: Sequence[InformativePrior]
 ) -> Floats:
     """
-    Return by how much the covariance of a mixture of fits exceeds that of the most probable fit.
+    Return the excess of the covariance of a mixture of fits over that of the most probable fit.
     The fits assume different ageings since the prior calibration, because a few rests do not show
     which constants have aged.
     """

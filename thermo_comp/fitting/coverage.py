@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the design of a test's positions: directions, resulting covariance of the constants, next
-direction.
+Owns the covariance of a triad's constants by the directions of a test's positions, and the next
+direction to record.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
 bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. With equations
@@ -48,14 +48,14 @@ def norm_columns(up: Floats) -> Floats:
 def constants_covariance(
     up: Floats, sd: Floats, misalignment_sd: float = MISALIGNMENT_SD
 ) -> Floats:
-    """Return the covariance of a triad's constants by positions `up` (n, 3) of noise `sd` [g]."""
+    """Return the covariance of a triad's constants from attitudes `up` (n, 3), noise `sd` [g]."""
     rows = norm_columns(up) / sd[:, None]
     prior_sd = np.append(PRIOR_SD[:6], [misalignment_sd] * 3)
     return np.asarray(np.linalg.inv(np.diag(prior_sd**-2) + rows.T @ rows))
 
 
 def worst_sd(covariance: Floats) -> float:
-    """Return the largest sd of the force over all attitudes and directions of its error [g]."""
+    """Return the largest sd of the force [g], over all attitudes and directions of the error."""
     columns = force_columns(_SPHERE)
     return math.sqrt(np.max(np.linalg.eigvalsh(columns @ covariance @ columns.transpose(0, 2, 1))))
 
@@ -83,7 +83,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Find the direction farthest from all of `up` (n, 3), and its angle to the nearest [deg]."""
+    """Return the direction of largest angle to the nearest of `up`, (n, 3); the angle [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
@@ -142,7 +142,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd of a constant per unit of noise of |f|, for directions (n, 3)."""
+    """Return the largest sd of a constant per noise sd of |f|, for directions (n, 3)."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -168,7 +168,7 @@ def best_rests(candidates: list[Floats]) -> int:
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """Fit constants to rests; return the largest sd of a constant by the scatter of norms [g]."""
+    """Fit constants to rests; return a constant's largest sd [g], by the scatter of the norms."""
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf
@@ -208,7 +208,7 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
     layout, axes = parameter_layout(calibration), calibration.axes
     levels = [block.static for block in (*layout.bias, *layout.scale)]
     places = [*levels, *range(layout.misalignment, layout.misalignment + 3)]
-    # A calibrated bias or scale that is too large makes the corrected force too small.
+    # Signs: a calibrated bias or scale that is too large makes the corrected force too small.
     unit = np.array([-1.0 / axis.scale_factor for axis in (axes.x, axes.y, axes.z)])
     unit = np.concatenate((unit, np.repeat((-1.0, 1.0), 3) * calibration.gravity_m_s2))
     covariance = calibration.posterior.covariance()[np.ix_(places, places)] * np.outer(unit, unit)
@@ -228,7 +228,7 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
 
 
 def direction_text(up: Floats) -> str:
-    """Describe an attitude to a user: the axes that point up, and the axes' readings in g."""
+    """Describe an attitude: the axes that point up, and the reading of each axis in g."""
     signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
     size = np.abs(up)
     axes = [sign for sign, share in zip(signs, size, strict=True) if share > 0.1]

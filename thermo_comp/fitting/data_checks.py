@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the checks of the windows of a fit and of its result, with numbers and advice.
+Owns the checks of the windows of a fit, and of the fitted calibration, with advice to the user.
 
 Only contradictory data are refused; missing data increase the posterior uncertainty. A refusal
 stops the fit unless the user allows it by name; advice goes into the result.
@@ -97,7 +97,7 @@ def judge_windows(
         )
         yield advice('case', text)
         return
-    # The case temperature leads the board's, so the gradient has the sign of the board's rate.
+    # The case leads the board in a ramp, so the gradient has the sign of the board's rate.
     moving = np.abs(_ramp_rates(windows)) > RAMP_K_MIN
     if windows.data.weight[moving].sum() >= 30.0 * windows.data.weight.max():
         correlation = float(np.corrcoef(windows.gradient[moving], windows.rate[moving])[0, 1])
@@ -147,8 +147,8 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,); 0 where the rate is noise: the
-    mean temperature changes by less than half of the rate from one window to the next.
+    Return the rate of the board temperature [K/min], shape (n,); 0 where the rate is noise, as the
+    mean temperature of the windows changes by less than half of the rate.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
@@ -168,7 +168,7 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
             'the effect of a ramp is unknown; record ramps between the soaks',
         )
         steps = np.diff(np.sort(windows.temperature))
-        # Soaks at one temperature of a chamber differ by less than 1 K, or a tenth of the span.
+        # Soaks at one chamber temperature differ by less than 1 K, or a tenth of the span.
         is_gap = steps > max(1.0, 0.1 * steps.sum())
         n = 1 + int(is_gap.sum())
         # A slow drift of the temperature through a range is not a soak.
@@ -224,7 +224,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a position if the largest sd of |f| is 3 times its median over the positions."""
+    """Advise a position if the largest sd of |f| is 3 times the median sd in the positions."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',
@@ -236,7 +236,7 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
 
 def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator[Finding]:
     """
-    Report the assumed repeatability of mountings and turn-ons if the data do not determine it.
+    Report the assumed sd of mounting and turn-on offsets if the data do not determine this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
     are explained by nine constants, whatever the offsets; only large offsets appear in the drifts.
@@ -320,9 +320,9 @@ def judge_result(
 
     slow: sd of the bias that no temperature explains [m/s^2]
     span: span of the board temperature [K]
-    drift: RMS of the residuals about their means in the positions [m/s^2]
+    drift: RMS of ``|f| - g`` about the means of the positions [m/s^2]
     noise: white noise of a window [m/s^2]
-    is_changed: whether the evidence is for a change of the unit since the prior calibration
+    is_changed: whether the evidence favours a far wider prior than the given calibration
     """
     overall = rows[-1]
     raw, fitted, left_out = (

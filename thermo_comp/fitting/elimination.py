@@ -27,8 +27,8 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     Return the lower Cholesky factors of matrices that are positive definite except for rounding,
     shape (..., n, n).
 
-    The matrix is scaled to a unit diagonal, or by the root of `diagonal`, shape (..., n), if it is
-    given; then the smallest jitter with which a factor exists is added to the diagonal.
+    The matrix is scaled to a unit diagonal, or by the root of a given `diagonal`, shape (..., n);
+    then the smallest jitter with which a factor exists is added to the scaled diagonal.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)
@@ -77,12 +77,12 @@ def factored_with_prior(information: Floats, precision: Floats) -> Floats:
 
 
 def solved(factor: Floats, right: Floats) -> Floats:
-    """Solve equations, given the lower Cholesky factor of their matrix; `cho_solve` is slower."""
+    """Solve equations by the lower Cholesky factor of their matrix, faster than `cho_solve`."""
     return np.asarray(dpotrs(factor.T, right)[0])
 
 
 def inverse_root(factor: Floats) -> Floats:
-    """Return the upper triangular root of the inverse of a matrix, given its lower factor."""
+    """Return the upper triangular root of a matrix's inverse, given its lower Cholesky factor."""
     return np.asarray(dtrtri(factor.T)[0])
 
 
@@ -92,24 +92,24 @@ class Blocks:
     Eliminated blocks of the normal equations, of equal size: of all positions or of all bags.
 
     root: inverse of each block's Cholesky factor, shape (n, k, k)
-    turned: `root` times the cross block with the remaining unknowns and, in the last column, times
-        the gradient, shape (n, k, m + 1)
+    whitened: `root` times the cross block with the remaining unknowns and, in the last column,
+        times the gradient, shape (n, k, m + 1)
     """
 
     root: Floats
-    turned: Floats
+    whitened: Floats
 
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
-        """Eliminate blocks, given their cross blocks and gradients; see `factored`."""
-        # `numpy.linalg.inv` of all factors at once is slower: it ignores that they are triangular.
+        """Eliminate blocks by cross blocks and gradients; `diagonal`: see `factored`."""
+        # `numpy.linalg.inv` of all factors is slower: it does not use that they are triangular.
         root = np.stack([inverse_root(factor).T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
     @cached_property
     def solved(self) -> Floats:
         """Inverse of each block times its cross block and its gradient, shape (n, k, m + 1)."""
-        return np.asarray(np.swapaxes(self.root, 1, 2) @ self.turned)
+        return np.asarray(np.swapaxes(self.root, 1, 2) @ self.whitened)
 
     @property
     def inverse(self) -> Floats:
@@ -149,9 +149,9 @@ class Reduced:
     common: Blocks | None = None
 
     @property
-    def whole(self) -> Floats:
-        """The Hessian including the prior on the sum of the initial lag states."""
-        return self.matrix if self.common is None else self.matrix + _square(self.common.turned)
+    def full_matrix(self) -> Floats:
+        """`matrix`, with the prior on the sum of the initial lag states added to the Hessian."""
+        return self.matrix if self.common is None else self.matrix + _square(self.common.whitened)
 
     @property
     def log_determinant(self) -> float:
@@ -181,7 +181,7 @@ class Reduced:
     def variances(self, root: Floats) -> tuple[Floats, Floats]:
         """
         Return the variances of the unknowns of positions and bags, without the prior on the sum of
-        the initial lag states; `root`: upper triangular, of the covariance of the unit's unknowns.
+        the initial lag states; `root`: upper triangular root of the unit's covariance.
         """
         bag, r, solved = self.layout.bag, len(self.bags.root[0]), self.positions.solved
         by_unit, by_starts = self.bags.solved[..., :-1], solved[..., :r]
@@ -192,25 +192,27 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return the Hessian `whole` without some positions, given their normal equations."""
+        """Return `full_matrix` without some positions, given the normal equations of these."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)
         rest = _of_bags(others.astype(np.float64), self.shares, self.of_bag_prior[:, at])
-        gone = _of_unit(normal.unit, self.layout) - _square(self.positions.turned[places][..., r:])
-        return np.asarray(self.whole - gone + _square(self.bags.turned[at]) - _square(rest.turned))
+        left_out = _of_unit(normal.unit, self.layout)
+        left_out -= _square(self.positions.whitened[places][..., r:])
+        remaining = self.full_matrix - left_out + _square(self.bags.whitened[at])
+        return np.asarray(remaining - _square(rest.whitened))
 
-    def beside(self, rows: Floats) -> tuple[Floats, Floats]:
+    def eliminate_from(self, rows: Floats) -> tuple[Floats, Floats]:
         """
         Eliminate positions and bags from the equations of further unknowns, m of each axis.
 
         `rows`: normal equations of the further unknowns with the unknowns of the fit and the
         residual, shape (n_positions, 3, m, k + 1). Returns the reduction of the Hessian of the
-        further unknowns by the elimination, shape (3 m, 3 m), and, after the elimination, their
-        cross block with the unit and their gradient, shape (n + 1, 3 m).
+        further unknowns by the elimination, shape (3 m, 3 m), and the cross block of the further
+        unknowns with the unit, and their gradient, after the elimination, shape (n + 1, 3 m).
         """
-        layout, turned = self.layout, self.positions.turned
-        n_positions, n_own, _ = turned.shape
+        layout, whitened = self.layout, self.positions.whitened
+        n_positions, n_own, _ = whitened.shape
         n_local, r, m = layout.n_local, layout.of_bag.shape[1], rows.shape[2]
         local = np.zeros((n_positions, n_own + r, m, 3))
         unit = np.zeros((layout.n_unit + 1, m, 3))
@@ -220,18 +222,18 @@ class Reduced:
             unit[layout.unit[axis], :, axis] = each[:, n_local:].sum(axis=0)
         local = local.reshape(n_positions, n_own + r, 3 * m)
         of_positions = self.positions.root @ local[:, :n_own]
-        starts = local[:, n_own:] - np.swapaxes(turned[..., :r], 1, 2) @ of_positions
+        starts = local[:, n_own:] - np.swapaxes(whitened[..., :r], 1, 2) @ of_positions
         of_bags = self.bags.root @ np.tensordot(_membership(layout), starts, 1)
         cross = unit.reshape(-1, 3 * m)
-        cross -= _summed(turned[..., r:], of_positions) + _summed(self.bags.turned, of_bags)
-        gone = _square(of_positions, of_bags)
+        cross -= _summed(whitened[..., r:], of_positions) + _summed(self.bags.whitened, of_bags)
+        reduction = _square(of_positions, of_bags)
         if self.common is not None:
             # The prior on the sum of the initial lag states adds information to the equations.
             starts = (np.swapaxes(self.bags.root, 1, 2) @ of_bags).sum(axis=0)
             of_sum = self.common.root @ starts[: layout.start.shape[1]]
-            cross += _summed(self.common.turned, of_sum)
-            gone -= _square(of_sum)
-        return gone, cross
+            cross += _summed(self.common.whitened, of_sum)
+            reduction -= _square(of_sum)
+        return reduction, cross
 
 
 def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floats) -> Reduced:
@@ -258,12 +260,12 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floa
     block[:, index, index] += np.einsum('pii->pi', block) <= 0.0
     positions = Blocks.of(block, cross)
     diagonal = np.einsum('pii->pi', starts[..., :r])
-    starts = starts - np.swapaxes(positions.turned[..., :r], 1, 2) @ positions.turned
+    starts = starts - np.swapaxes(positions.whitened[..., :r], 1, 2) @ positions.whitened
     shares = (starts, diagonal)
     prior = np.stack((precision, precision * deviation))[:, layout.of_bag]
     bags = _of_bags(_membership(layout), shares, prior)
     matrix = _of_unit(normal.unit, layout)
-    matrix -= _square(positions.turned[..., r:], bags.turned)
+    matrix -= _square(positions.whitened[..., r:], bags.whitened)
     return Reduced(layout, prior, matrix, positions, shares, bags)
 
 
@@ -273,18 +275,20 @@ def _membership(layout: Layout) -> Floats:
 
 
 def _of_unit(normal: Floats, layout: Layout) -> Floats:
-    """Add up the equations of the unit's unknowns, given for each axis, shape (3, k, k)."""
+    """Add up the normal equations of the unit's unknowns, given by axis, shape (3, k, k)."""
     result = np.zeros((layout.n_unit + 1, layout.n_unit + 1))
     for equations, at in zip(normal, layout.unit, strict=True):
         result[at[:, None], at] += equations
     return result
 
 
-def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
-    """Eliminate the unknowns of bags; `among`: positions of each bag, shape (m, n)."""
+def _of_bags(members: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
+    """Eliminate the unknowns of bags; `members`: 1 for each position of a bag, else 0, (m, n)."""
     if not shares[0].size:
-        return Blocks(np.zeros((len(among), 0, 0)), np.zeros((len(among), *shares[0].shape[1:])))
-    sums, diagonals = (np.tensordot(among, share, 1) for share in shares)
+        return Blocks(
+            np.zeros((len(members), 0, 0)), np.zeros((len(members), *shares[0].shape[1:]))
+        )
+    sums, diagonals = (np.tensordot(members, share, 1) for share in shares)
     r = diagonals.shape[1]
     block, cross = sums[..., :r], sums[..., r:]
     block[:, np.arange(r), np.arange(r)] += prior[0]
@@ -295,13 +299,13 @@ def _of_bags(among: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blo
 def _variance(derivatives: Floats, root: Floats) -> Floats:
     """Return the variances of linear functions, shape (n, k), of the unit's unknowns."""
     rows = derivatives.reshape(-1, len(root))
-    turned = dtrmm(1.0, root, rows.T, trans_a=True)
-    return np.asarray(np.sum(turned**2, axis=0).reshape(derivatives.shape[:2]))
+    scaled = dtrmm(1.0, root, rows.T, trans_a=True)
+    return np.asarray(np.sum(scaled**2, axis=0).reshape(derivatives.shape[:2]))
 
 
-def _square(*turned: Floats) -> Floats:
+def _square(*blocks: Floats) -> Floats:
     """Return the reduction of the remaining equations by the elimination of blocks, (k, k)."""
-    rows = np.concatenate([block.reshape(-1, block.shape[2]) for block in turned])
+    rows = np.concatenate([block.reshape(-1, block.shape[2]) for block in blocks])
     return np.asarray(rows.T @ rows)
 
 

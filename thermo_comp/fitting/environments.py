@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the exclusion of bags of another environment, and the error that is published for them.
+Owns the exclusion of bags that were recorded in another thermal environment, such as still air,
+and the error that the calibration states for these bags.
 
 In still air the board temperature follows the case temperature by another law than in a chamber
-with a fan. The bias of an axis without its own thermometer depends on the environment, and no set
-of coefficients describes two environments. A fit that includes a bag of still air has a larger
-error in a chamber with a fan. The fit excludes a bag of another environment and publishes the
-error of its correction as a lack of fit.
+with a fan. The bias of an axis without its own thermometer depends on the environment, so no set
+of coefficients describes two environments: a bag of still air would increase the error in a
+chamber with a fan. The error of the correction in an excluded bag is published as a lack of fit.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def contradicting_bag(fit: Fit) -> list[int]:
     Find the bag that may be of another environment: a list of one bag, or an empty list.
 
     A bag is suspect if its left-out drift is far above both the median of all bags and the white
-    noise of a window. A bag is also suspect if its drift is the only one that the other bags do
-    not determine, and the median drift is far above the noise.
+    noise of a window. A bag is also suspect if its drift alone is not determined by the
+    other bags, and the median drift is far above the noise.
     """
     square = _square_of_bags(fit)
     known = np.isfinite(square)
@@ -69,7 +69,7 @@ def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
 
 
 def _square_of_bags(fit: Fit) -> Floats:
-    """Mean square of the left-out drift of each bag, shape (n_bags,), NaN where it is unknown."""
+    """Mean square of each bag's left-out drift [(m/s^2)^2], (n_bags,); NaN if unknown."""
     data, folds = fit.windows.data, fit.selected.score.positions
     bag = data.bag_of_position[np.flatnonzero(np.diff(data.mounting, prepend=-1))]
     return Folds.of(folds.square, folds.windows, bag).square
@@ -79,8 +79,7 @@ class Contradiction(NamedTuple):
     """
     Bags that contradict a calibration of the same unit.
 
-    bags: bags whose drift contradicts it: with the unit's parameters fixed, no initial lag states
-        of the bag explain the drift
+    bags: bags whose drift no initial lag states explain, with the unit's parameters fixed
     is_changed: whether |f| misses gravity by far more than the drift and the claimed sd of |f|, so
         that the constants have changed as well
     """

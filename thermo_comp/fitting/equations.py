@@ -6,12 +6,13 @@ Owns the measurement equation of the windows, and its linearisation.
 Equation of window w of position p and axis i, in m/s^2 of the nominal scale factor K0::
 
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + o_b + kappa (A l_p)_i g + noise,
-    a = (A u_p)_i g,  A = M^-1,  l_p across u_p: tilt of the support,  o_b: offset of the turn-on
+    a = (A u_p)_i g,  A = M^-1,  kappa: scale factor / K0,  b: bias,  u_p: attitude,
+    l_p across u_p: tilt of the support,  o_p, o_b: bias offsets of the position, of the turn-on
 
-B and S are columns of the table in `unit.columns`, each divided by its RMS. With g = 0 the terms
-b, B beta and o_p remain, and the equation is that of an angular rate. If |f| differs between
-positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added
-(`forces`). All terms are linear combinations of the base series of the windows (`series`).
+B and S are columns of the table in `unit.columns`, each divided by its RMS, with the weights beta
+and s. With g = 0 the terms b, B beta and o_p remain: the equation of an angular rate. If |f|
+differs between positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t)
+n_j(a)`` are added (`forces`). All terms are linear combinations of the base series (`series`).
 """
 
 from __future__ import annotations
@@ -129,8 +130,8 @@ class Equations(Series):
             nonlinear = np.ones(self.n_coefficients, dtype=bool)
         key = used.tobytes() + nonlinear.tobytes()
         if key not in self._layouts:
-            moved = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
-            n_tilts, n_starts = self.windows.tilt.shape[1], self.start_root.shape[1] * moved
+            has_lags = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
+            n_tilts, n_starts = self.windows.tilt.shape[1], self.start_root.shape[1] * has_lags
             self._layouts[key] = lay_out(
                 *(used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces),
                 pose_of=self.windows.pose,
@@ -142,9 +143,9 @@ class Equations(Series):
     def effects(self, state: State) -> Effects:
         """Return the specific force along each axis and its nonlinear terms."""
         force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
-        turned = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
+        along_axes = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
         sizes = np.reshape(self._norm(state), (-1, 1, 1))
-        by_rotation = sizes * (state.kappa[:, None] * turned)
+        by_rotation = sizes * (state.kappa[:, None] * along_axes)
         if self.forces is None:
             nonlinear = np.zeros((2, 2, *force.shape))
         else:
@@ -203,7 +204,7 @@ class Equations(Series):
         result[:, :, base.t, 1] = bend_by_t[..., None]
         result[:, :, base.t, 2] = slope_by_t[..., None]
         if n_starts:
-            weight = (on_bias + without_bias[..., None] * on_scale)[..., base.moved, None]
+            weight = (on_bias + without_bias[..., None] * on_scale)[..., base.lagged, None]
             result[:, :, base.at_start, 3:-1] = weight * self.start_root[base.lag]
         result[..., -1] = self.misfit(state, base)
         return result
@@ -230,8 +231,8 @@ class Equations(Series):
         result = np.zeros((len(state.up), 3, 3))
         # Rows and columns of the three free elements of the inverse of M.
         rows, columns = [1, 2, 2], [0, 0, 1]
-        turned = (self._norm(state) * state.up)[:, columns]
-        result[:, rows, [0, 1, 2]] = state.kappa[rows] * turned
+        components = (self._norm(state) * state.up)[:, columns]
+        result[:, rows, [0, 1, 2]] = state.kappa[rows] * components
         return result
 
     def misfit(self, state: State, base: Base) -> Floats:
@@ -252,7 +253,7 @@ class Equations(Series):
         """Measured minus predicted readings of all windows, shape (n, 3) [m/s^2]."""
         base, position = self.products(layout.used).base, self.windows.position
         series = self.of(base)
-        series[:, 1 + base.moved] += self.starts(state, base)[position] * series[:, base.at_start]
+        series[:, 1 + base.lagged] += self.starts(state, base)[position] * series[:, base.at_start]
         return np.asarray(np.einsum('nb,nib->ni', series, self.misfit(state, base)[position]))
 
     def force(self, state: State, rows: slice = slice(None)) -> Floats:
@@ -271,7 +272,7 @@ class Equations(Series):
 
     @last_result_kept
     def precision(self, prior: Prior, layout: Layout) -> Floats:
-        """Return inverse prior variances, shape (n,); 0 for unknowns with an informative prior."""
+        """Return inverse prior variances, (n,); 0 for unknowns with an informative prior."""
         result = np.zeros(layout.n)
         result[layout.kappa] = prior.scale_sd**-2
         result[layout.bias] = prior.bias_sd**-2.0
@@ -289,7 +290,7 @@ class Equations(Series):
             result[: layout.n_unit] = 0.0
         result[layout.offset] = prior.offset_sd**-2
         result[layout.tilt] = prior.tilt_sd**-2
-        result[layout.start] = 1.0 / prior.start_share
+        result[layout.start] = 1.0 / prior.start_variance_ratio
         result[layout.turn_on] = prior.turn_on_sd**-2
         # The prior of attitudes is flat, so its precision is 0. An angular rate does not depend on
         # the attitude, and a precision of 1 keeps the attitude's equations regular.
@@ -300,7 +301,7 @@ class Equations(Series):
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
-        """Return the unknowns less their prior mean, which is 0 except for the unit's, (n,)."""
+        """Return the unknowns less their prior mean, 0 except for the unit's, shape (n,)."""
         result = as_vector(state, layout)
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean
@@ -337,18 +338,18 @@ def without_inactive(state: State, layout: Layout) -> State:
     return replace(state, **zeroed)
 
 
-def moved_by(state: State, step: Floats, layout: Layout) -> State:
+def with_step(state: State, step: Floats, layout: Layout) -> State:
     """Add a step to a state; inactive weights and coefficients are set to 0."""
     padded = np.append(step, 0.0)
     turn, pose = padded[layout.up], state.pose
     if layout.pose.size:
         is_posed = layout.pose_of >= 0
         turn[is_posed] += step[layout.pose[layout.pose_of[is_posed]]]
-        turned = np.einsum('kij,kj->ki', state.pose_tangents, step[layout.pose])
-        pose = _unit_vector(pose + turned)
+        rotation = np.einsum('kij,kj->ki', state.pose_tangents, step[layout.pose])
+        pose = _unit_vector(pose + rotation)
     up = _unit_vector(state.up + np.einsum('pij,pj->pi', state.tangents, turn))
-    moved = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
-    return without_inactive(replace(state, up=up, pose=pose, **moved), layout)
+    added = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
+    return without_inactive(replace(state, up=up, pose=pose, **added), layout)
 
 
 def _poses(up: Floats, pose_of: Ints | None, n_poses: int) -> Floats:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the evidence that a fit reports: the residuals of each position, the residuals with constants,
-curves and response added in turn, and the contribution of each group of columns.
+Owns the statistics that a fit reports: the residuals of each position, the residuals with
+constants, curves and response added in turn, and the contribution of each group of columns.
 
-Each position has two residuals: in sample, and with the unit's parameters fitted without this
-position, which estimates the error in a new attitude.
+Each position has two residuals: in sample, that is, by the fit of all positions; and left out,
+by a fit without this position, which estimates the error in a new attitude.
 """
 
 from __future__ import annotations
@@ -57,11 +57,10 @@ class ResidualRow:
 
     section: regime of the windows, ``static``, ``dynamic`` or ``all``
     raw: corrected with the constants at the reference temperature
-    one_set: corrected with one curve for both regimes; no values if each regime has a separate
-        curve
+    one_set: corrected with one curve for both regimes; empty if each regime has its own curve
     two_sets: corrected with a curve for each regime
-    fitted: corrected with the calibration, on the data of the fit
-    left_out: corrected without using the corrected data in the fit, see `left_out_error`
+    fitted: corrected with the calibration, in sample
+    left_out: corrected by fits without the corrected data, see `left_out_error`
     """
 
     section: str
@@ -74,8 +73,8 @@ class ResidualRow:
 
 def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     """
-    Return statistics of the residuals after each step of the correction and, for each window, its
-    ``|f| - g`` in sample and its left-out error [m/s^2], shape (n,).
+    Return statistics of the residuals after each step of the correction and, of each window,
+    ``|f| - g`` in sample and the left-out error [m/s^2], shape (n,).
     """
     windows, regression, selected, state = *fit[:3], fit.posterior.state
     steps = [
@@ -117,7 +116,7 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
 
 
 def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...]) -> State:
-    """Fit again with some groups of columns only, under a flat prior of their weights."""
+    """Fit again with some groups of columns only, under an almost flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
     # The residuals of a model with few groups are mostly model error, so the fit has white noise
     # alone and no mounting offsets.

@@ -114,7 +114,7 @@ def fit_bags(
     # The fit multiplies many small matrices, and threads would only slow these products down.
     with threadpool_limits(1, 'blas'):
         try:
-            return _fit_about_offset(recordings, options, progress)
+            return _fit_without_code_offset(recordings, options, progress)
         except np.linalg.LinAlgError as error:
             raise FitError(
                 'the bags do not determine the fit: its equations have no solution in double '
@@ -123,7 +123,7 @@ def fit_bags(
             ) from error
 
 
-def _fit_about_offset(
+def _fit_without_code_offset(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
     offset = find_offset(bags, options)
@@ -136,12 +136,12 @@ def _fit_about_offset(
         'advice',
         f'zero force reads {codes} counts (x y z), {how}: the fit subtracts this offset',
     )
-    prior = options.prior and about(options.prior, -offset)
-    centred_bags = [centred(bag, offset) for bag in bags]
+    prior = options.prior and with_code_offset(options.prior, -offset)
+    centred_bags = [without_code_offset(bag, offset) for bag in bags]
     result = _fit_one_environment(centred_bags, replace(options, prior=prior), progress)
     return replace(
         result,
-        calibration=with_notes(about(result.calibration, offset), [finding]),
+        calibration=with_notes(with_code_offset(result.calibration, offset), [finding]),
         findings=(finding, *result.findings),
         bags=tuple(bags),
     )
@@ -165,29 +165,29 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
     return np.rint(rough_centre(np.array(means)))
 
 
-def centred(bag: ReducedBag, offset: Floats) -> ReducedBag:
+def without_code_offset(bag: ReducedBag, offset: Floats) -> ReducedBag:
     """Subtract the codes at zero force from a bag and from the blocks of its source."""
 
-    def moved() -> Iterator[Any]:
+    def blocks() -> Iterator[Any]:
         for block in bag.source.blocks():
             yield replace(cast(Any, block), accel=block.accel - offset)
 
     intervals = tuple(replace(interval, mean=interval.mean - offset) for interval in bag.intervals)
-    return replace(bag, source=replace(bag.source, blocks=moved), intervals=intervals)
+    return replace(bag, source=replace(bag.source, blocks=blocks), intervals=intervals)
 
 
-def about(calibration: Calibration, offset: Floats) -> Calibration:
+def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
     """Convert a calibration of codes less their offset into a calibration of the codes."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
         # The full scale of unsigned codes of the default length, 16 bits.
         full_scale = 2.0 * COUNTS_FULL_SCALE + 1.0
-    moved = (
+    axes = (
         AxisReference(axis.scale_factor, axis.bias + by)
         for axis, by in zip(calibration.axes, offset.tolist(), strict=True)
     )
-    return replace(calibration, unit=replace(unit, full_scale=full_scale), axes=Axes(*moved))
+    return replace(calibration, unit=replace(unit, full_scale=full_scale), axes=Axes(*axes))
 
 
 def with_notes(calibration: Calibration, findings: Iterable[Finding]) -> Calibration:
@@ -223,9 +223,10 @@ def _fit_one_environment(
         # changed, the bags are of another environment and cannot update the prior.
         provenance = first.calibration.provenance
         refit = replace(first, calibration=replace(known, provenance=provenance))
-    others, gone = 'the other bags' if known is None else 'the prior', [bags[k] for k in excluded]
+    others = 'the other bags' if known is None else 'the prior'
+    left_out = [bags[k] for k in excluded]
     calibration, finding = with_excluded_error(
-        refit.calibration, gone, others, is_updated=is_updated
+        refit.calibration, left_out, others, is_updated=is_updated
     )
     return replace(
         refit,
@@ -239,7 +240,7 @@ def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
     """
-    Fit again without an effect that the bags do not show, or with slow tilts, see `refit_checks`.
+    Repeat a fit whose settled bias is uncertain, or whose supports may tilt, see `refit_checks`.
     """
     if options.prior is not None or options.model == 'golovach':
         return result
@@ -265,7 +266,7 @@ def _refined(
 def _tried(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress, **given: bool
 ) -> FitResult | None:
-    """Fit once more; return None if this fit is refused, as the fit before it was not."""
+    """Fit the bags with other assumptions; return None if this fit is refused."""
     try:
         return _fit(bags, options, progress, **given)
     except (FitError, np.linalg.LinAlgError):
@@ -372,7 +373,7 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
         # If the positions determine a misalignment out of range, the sensor is no accelerometer.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
-            'by the fit the angle between two of its axes is less than 60 degrees, which no '
+            'by the fit the angle between two of the axes is less than 60 degrees, which no '
             'accelerometer has: is the topic that of the accelerometer, did the axes stay the '
             'same in all positions, and are there at least 9 positions?'
         )

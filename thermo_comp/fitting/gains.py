@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the change of the log evidence if columns are removed from a fit or added to it.
+Owns the change of a fit's log evidence by the removal or the addition of columns.
 
 References
 ----------
@@ -22,14 +22,14 @@ from ..typing import Bools, Floats, Ints
 
 # Squares of the candidate values of a common factor of the columns' prior sd; the candidate with
 # the largest gain is used.
-_SQUARES = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
+_SQUARED_FACTORS = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 
 def log_bayes_factors(mode: Floats, covariance: Floats, places: Ints, prior_sd: Floats) -> Floats:
     """
-    Return the loss of log evidence if some weights are set to 0 (Savage-Dickey ratio, [1]_).
+    Return the loss of log evidence if k weights are set to 0 (Savage-Dickey ratio, [1]_), (n,).
 
-    `places`, `prior_sd`: places and prior sd of the weights of each of n cases, shape (n, k)
+    `places`, `prior_sd`: indices and prior sd of the weights in each of n cases, shape (n, k)
     """
     means = mode[places]
     blocks = covariance[places[:, :, None], places[:, None, :]]
@@ -48,8 +48,8 @@ class Inactive:
     Sparsity and quality factors of inactive columns, given the active ones [2]_.
 
     part, column: part (0: bias, 1: scale) and column of each of k inactive columns, shape (k,)
-    S: sparsity factor, the information about the weights, shape (3 k, 3 k), by column, then axis
-    Q: quality factor, the gradient by the weights, shape (3 k,)
+    S: sparsity factor: information about the weights, ordered by column, then axis, (3 k, 3 k)
+    Q: quality factor: gradient of the log likelihood by the weights, shape (3 k,)
     """
 
     part: Ints
@@ -73,7 +73,7 @@ class Inactive:
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)
         S, along = np.linalg.eigh(S)
-        s, q2 = _SQUARES * np.maximum(S, 0.0), _SQUARES * (along.T @ Q) ** 2
+        s, q2 = _SQUARED_FACTORS * np.maximum(S, 0.0), _SQUARED_FACTORS * (along.T @ Q) ** 2
         return 0.5 * float((q2 / (1.0 + s) - np.log1p(s)).sum(axis=1).max(initial=0.0))
 
     def chosen(self, column_sd: Floats, wanted: Bools, least: float, most: int) -> Bools:
@@ -86,15 +86,15 @@ class Inactive:
         S, Q, column = self._in_prior_sd(column_sd, wanted)
         result = np.zeros_like(wanted)
         for _ in range(most if len(Q) else 0):
-            s, q2 = _SQUARES * np.maximum(np.diag(S), 0.0), _SQUARES * Q**2
-            gains = np.zeros((len(_SQUARES), len(wanted)))
+            s, q2 = _SQUARED_FACTORS * np.maximum(np.diag(S), 0.0), _SQUARED_FACTORS * Q**2
+            gains = np.zeros((len(_SQUARED_FACTORS), len(wanted)))
             np.add.at(gains.T, column, 0.5 * (q2 / (1.0 + s) - np.log1p(s)).T)
             factor, best = np.unravel_index(int(np.argmax(gains)), gains.shape)
             if gains[factor, best] < least:
                 break
             result[best] = True
             at = np.flatnonzero(column == best)
-            block = S[np.ix_(at, at)] + np.eye(len(at)) / _SQUARES[factor]
+            block = S[np.ix_(at, at)] + np.eye(len(at)) / _SQUARED_FACTORS[factor]
             solved = np.linalg.solve(block, np.column_stack((S[at], Q[at])))
             S, Q = S - S[:, at] @ solved[:, :-1], Q - S[:, at] @ solved[:, -1]
             S[at], S[:, at], Q[at] = 0.0, 0.0, 0.0

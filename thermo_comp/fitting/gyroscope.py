@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fit of the gyroscope: the angular rate at rest, with the columns of the accelerometer.
+Owns the fit of a gyroscope's bias to the angular rate at rest, over the accelerometer's columns.
 
 A gyroscope at rest measures the component of the Earth's rate in its attitude, plus a bias that
-changes at each turn-on. The regression has one constant offset of the rate in each position as an
-unknown. Changes of the rate within a position determine the effect of temperature; the mean rate
-over the positions determines the constant bias. The regression is that of the accelerometer with
-gravity 0, in rad/s in place of m/s^2.
+changes at each turn-on. A constant offset of the rate in each position is an unknown of the
+regression. Changes of the rate within a position determine the effect of temperature; the mean
+rate over the positions determines the constant bias. The regression is that of the accelerometer
+with gravity 0, in rad/s in place of m/s^2.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def add_gyroscope(
         offset_scale=earth_sd,
     )
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
-    # The positions determine the sd of the offsets, so `claim_of` does not marginalise the sd.
+    # The positions determine the sd of the offsets: `claim_of` does not marginalise this sd.
     fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
     chosen = replace(fit.posterior, prior=fixed_sd)
     claim = claim_of(regression, chosen, lacks_effects=fit.selected.lacks_effects)

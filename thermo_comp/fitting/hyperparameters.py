@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of prior standard deviations and noises, and drops columns of small gain.
+Owns the estimation of prior sd and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation for the bias of all axes and one for the scale, found
-by MacKay's fixed point with a log-normal hyperprior per kelvin. The mode of log evidence plus
+by MacKay's fixed point [1]_ with a log-normal hyperprior per kelvin. The mode of log evidence plus
 hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w the
 weights of the column, sd0 and tau^2 centre and variance of the hyperprior. The sd of a column
 about which the data have no information stays at the centre sd0 of the hyperprior.
@@ -42,7 +42,7 @@ STUDENT_NU = 4.0
 LEAST_GAIN = 1.0
 #: Gain in log evidence from which a model is clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
-#: Variance of the logarithm of a prior sd in its log-normal hyperprior: its sd is a factor of ten.
+#: Variance of the log of a prior sd in the log-normal hyperprior, whose sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
 
 
@@ -51,10 +51,10 @@ class Candidates:
     """
     The columns that may take part in a model.
 
-    typical, largest: centre of the hyperprior and upper bound of each column's prior sd, in units
-        of its RMS, shape (2, m); 0 for a column that may not take part
+    typical, largest: centre of the hyperprior and upper bound of `Prior.column_sd`, in the bias
+        [m/s^2] and in the scale (relative), (2, m); 0 for a column that may not take part
     forced: columns that are always kept, shape (m,)
-    fixed: columns that are always kept, with their prior sd, shape (2, m)
+    fixed: columns that are always kept, with a constant prior sd, shape (2, m)
     """
 
     typical: Floats
@@ -66,7 +66,7 @@ class Candidates:
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
 ) -> Posterior:
-    """Repeat the fixed point until no logarithm of a standard deviation changes by over 0.05."""
+    """Iterate all prior sd and noises until the log of none changes by more than 0.05."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
@@ -79,7 +79,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: Posterior, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move each sd towards its fixed point; return also the largest change of the log of an sd."""
+    """Move all prior sd and noises towards their modes; return also the largest log change."""
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     sd, determined = prior.column_sd, posterior.determined
     moves = (sd > 0.0) & ~candidates.fixed
@@ -94,8 +94,8 @@ def _updated(
     changes.append(change)
     turn_on_sd = prior.turn_on_sd
     if prior.informative is None:
-        # A prior calibration states the sd of turn-ons, which the few turn-ons of its update do
-        # not determine beside the ageing of the bias.
+        # A prior calibration states the sd of turn-on offsets, which the few turn-ons of an update
+        # do not separate from the ageing of the bias.
         turn_on_sd, change = _offset_sd(posterior, turn_on_sd, posterior.layout.turn_on)
         changes.append(change)
     tilt_sd, change = _tilt_sd(posterior, float(regression.windows.kelvins[0]))
@@ -104,8 +104,8 @@ def _updated(
     changes.append(change)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly, so the built-in prior counts as a fourth,
-        # and the sd changes only if the data determine more than one element of M.
+        # Three elements of M determine their sd poorly, so the built-in sd counts as a fourth
+        # element, and the sd changes only if the data determine more than one element of M.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
@@ -113,13 +113,13 @@ def _updated(
         # Limit the misalignment sd to 0.03 rad: larger misalignments, as of single sensors on a
         # printed bracket, would explain the norms of six faces, to second order.
         misalignment_sd = min(new_sd, 0.03)
-    start_share = prior.start_share
+    start_ratio = prior.start_variance_ratio
     if layout.start.size:
-        # One lag state with the variance of the node's prior (`start_share` of 1) is added, so
-        # that the states of a single bag cannot make `start_share` very small.
+        # One lag state with the variance of the node's prior (a ratio of 1) is added, so that the
+        # states of a single bag cannot make `start_variance_ratio` very small.
         gamma = float(determined[layout.start].sum())
-        start_share = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
-        changes.append(float(np.abs(np.log(start_share / prior.start_share))) / 4.0)
+        start_ratio = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
+        changes.append(float(np.abs(np.log(start_ratio / prior.start_variance_ratio))) / 4.0)
     sigma = white_noise(regression, posterior)
     changes.append(float(np.abs(np.log(sigma / prior.sigma)).max()))
     return replace(
@@ -131,13 +131,13 @@ def _updated(
         pose_sd=pose_sd,
         misalignment_sd=misalignment_sd,
         sigma=sigma,
-        start_share=start_share,
+        start_variance_ratio=start_ratio,
     ), max(changes)
 
 
 def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
     """
-    Move the sd of the supports' tilts towards its mode; return also the change of its logarithm.
+    Move the sd of the supports' tilts towards the mode; return also a third of log sd's change.
 
     `kelvins`: RMS of the board temperature about the reference [K]
     """
@@ -156,8 +156,8 @@ def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
 
 def _pose_sd(posterior: Posterior) -> tuple[float, float]:
     """
-    Move the sd of the attitudes about their poses towards its mode; return also the change of
-    its logarithm.
+    Move the sd of the attitudes about their poses towards the mode; return also the change of the
+    logarithm of the sd.
     """
     sd, layout = posterior.prior.pose_sd, posterior.layout
     if not layout.pose.size:
@@ -185,9 +185,9 @@ def _toward(
 
 def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, float]:
     """
-    Move the sd of the offsets of mountings or turn-ons, the unknowns at `places`, towards its
-    mode, under a half-Student prior; return also the change of its logarithm, 0 if the data do not
-    determine the offsets.
+    Move the sd of the offsets of mountings or turn-ons, the unknowns at `places`, towards the mode
+    under a half-Student prior; return also the change of log sd, 0 if the data do not determine
+    the offsets.
     """
     scale = posterior.prior.offset_scale
     if scale <= 0.0 or not places.size:
@@ -232,8 +232,8 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     # noisiest axis.
     least = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
-        # If no column changes within a position, slow noise explains the whole drift, and white
-        # noise would be 0: it is at least that of differences of windows, where a drift cancels.
+        # If no column changes within a position, slow noise explains the whole drift. The white
+        # noise is then at least that by differences of windows, in which a drift cancels.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 
@@ -292,7 +292,7 @@ def _likeliest(
 def pruned_fit(
     regression: Regression, posterior: Posterior, candidates: Candidates, rounds: int = 25
 ) -> Posterior:
-    """Drop columns of small gain, as long as the log evidence falls by less than `LEAST_GAIN`."""
+    """Drop columns as long as each removal lowers the log evidence by less than `LEAST_GAIN`."""
     while True:
         prior = _pruned(regression, posterior, candidates)
         if np.array_equal(prior.column_sd, posterior.prior.column_sd):
@@ -333,8 +333,8 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
 
 def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
     """
-    Return which column, shape (2, m), is the only lag of a model that has products or squares of
-    lags.
+    Return the columns, (2, m), that are the only lag in a part (bias or scale) with products or
+    squares of lags.
 
     A product t m of temperature and lag approximates the lag m at the rates of one program, but
     not at other rates, so a model with products keeps a lag (marginality, [3]_).
@@ -359,9 +359,9 @@ def downweigh(regression: Regression, posterior: Posterior) -> None:
 
 
 def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
-    """Return factors, up to 1, of the weights of windows, by their residuals of shape (n, 3)."""
+    """Return factors, up to 1, of the windows' weights, by residuals of shape (n, 3)."""
     size = residual * np.sqrt(weight)[:, None]
-    side = 3  # windows on each side whose median is the local level
+    side = 3  # number of windows on each side, whose median is the local level
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 2 * side:
             around = np.pad(part, ((side, side), (0, 0)), mode='reflect')

@@ -3,9 +3,9 @@
 """
 Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
 
-The means of the positions lie on an ellipsoid, which is fitted without temperature by least
-squares on ``|f| - g``. The initial values of the least-squares fit follow from the extremes of the
-means on each axis.
+The mean readings of the positions lie on an ellipsoid, which is fitted without temperature by
+least squares on ``|f| - g``. The initial values of bias and scale follow from the extremes of the
+mean readings on each axis.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .unknowns import BIAS_SD, SCALE_SD, Windows
 
 @dataclass(frozen=True)
 class ConstantCalibration:
-    """The triad at one temperature: bias [input units], scale [input units per m/s^2], M."""
+    """Constants at one temperature: bias [input units], scale [input units per m/s^2], M."""
 
     bias: Floats
     scale: Floats
@@ -44,7 +44,7 @@ def constant_calibration(
     means: Floats, gravity: float | Floats, misalignment_sd: float
 ) -> ConstantCalibration:
     """
-    Fit the triad to position means, shape (n, 3); raises FitError if they are on no ellipsoid.
+    Fit the triad to position means, shape (n, 3); raises FitError for means on no ellipsoid.
 
     `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2];
     `misalignment_sd`: prior sd of the elements of M [rad]; 0 for axes at right angles
@@ -77,8 +77,8 @@ def constant_calibration(
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, misalignment_sd))
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # The best ellipsoid of scattered points can be very large, with a remote centre: it is
-    # rejected.
+    # The best ellipsoid of scattered points can be very large, with a remote centre, which is no
+    # calibration.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(
@@ -165,7 +165,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     Return the error of the windows of each axis by the board's thermometer [m/s^2], shape (3,):
     the sd of the temperature times the slope of the samples over temperature within the positions.
 
-    `beyond_noise`: take the variance beyond that of a reading's noise, as by coarse steps or long
+    `beyond_noise`: use the variance less that of a reading's noise, as by coarse steps or long
     intervals
     """
     if windows.board is None:
@@ -175,7 +175,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     change = within_positions(windows.board[:, :1], windows.position)
     power = np.maximum(np.add.reduceat(change**2, first), 1e-12)
     along = np.add.reduceat(change * drift, first)
-    # White noise alone explains one squared noise of each position.
+    # White noise alone gives `along**2 / power` of each position a mean of one squared noise.
     square = along**2 / power - white_noise_of(windows, scale) ** 2
     slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
     variance = float(windows.board[:, 1].mean()) - beyond_noise * windows.board_noise**2
@@ -183,7 +183,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
 
 
 def within_positions(values: Floats, position: Ints) -> Floats:
-    """Subtract from the values of each window, shape (n, k), their mean in its position."""
+    """Subtract from values of windows, shape (n, k), the mean over the position of the window."""
     _, where, count = np.unique(position, return_inverse=True, return_counts=True)
     total = np.zeros((len(count), values.shape[1]))
     np.add.at(total, where, values)

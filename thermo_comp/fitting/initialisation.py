@@ -40,7 +40,7 @@ STEEPEST = np.array([5e-3, 2e-4])
 @dataclass(frozen=True)
 class Problem:
     """
-    The input of a regression, beside its windows.
+    The input of a regression other than the windows.
 
     start: initial calibration of the triad, without effects of temperature
     up: directions of the positions, shape (n_positions, 3)
@@ -90,7 +90,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = False) -> Fit:
-    """Fit the windows; `is_at_rest`: whether columns are constant in each position."""
+    """Fit the windows; `is_at_rest`: whether the columns are constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
     # A prior calibration separates the drifts of bias and scale factor, also in one attitude.
@@ -166,7 +166,7 @@ def _initial_prior(
     """Return the prior of the constants and of the noises, without columns."""
     data = windows.data
     drift = within_positions(data.mean / start.scale, data.position)
-    # Initial sd of mounting offsets, and smallest initial noise [m/s^2]: 1 ug.
+    # Initial sd of mounting offsets, and smallest initial white noise: 1 ug [m/s^2].
     least = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), least)
     noise = _noise_in_1_hz(windows, start.scale)
@@ -210,8 +210,8 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 
 def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:
     """
-    Return the prior of the constants during the selection of the columns: five times the largest
-    error of a norm, at least 5 % and at most 100 % of the prior's sd. In an incomplete model,
+    Return the prior of the constants during the selection of the columns: its sd is five times the
+    largest error of a norm, but 5 % to 100 % of the sd of `prior`. In an incomplete model,
     constants that few attitudes do not determine would change by large amounts.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
@@ -314,7 +314,7 @@ def _typical_slopes(steepness: float, steepest: Floats, options: FitOptions) -> 
 def _steepness(
     windows: ThermalWindows, start: ConstantCalibration, options: FitOptions, *, is_at_rest: bool
 ) -> float:
-    """Return the RMS change of the readings per kelvin, as if the bias alone changed [m/s^2]."""
+    """Return the RMS change of the readings, as if the bias alone changed [m/s^2 per K]."""
     data = windows.data
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())

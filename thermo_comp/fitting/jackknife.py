@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the uncertainty by effects that the model lacks: a jackknife over the sections of the program.
+Owns the covariance by effects that the model lacks: a jackknife over the sections of the program.
 
 The covariance of a fit contains the errors by noise alone. If the model lacks an effect, each
 section of the program requires other weights, and the error in another program is as large as the
@@ -31,7 +31,7 @@ def jackknife_covariance(regression: Regression, posterior: Posterior) -> Floats
     if not last:
         return np.zeros((n, n))
     products = regression.products(posterior.layout.used)
-    step, factor = regression.at(posterior.state, posterior.prior, products.whole).solution
+    step, factor = regression.at(posterior.state, posterior.prior, products.of_positions).solution
     changes, ratios = [], []
     for number in range(last + 1):
         grams = products.without(np.array([number]))

@@ -37,7 +37,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
             recordings.append([bag])
     number = {id(bag): k for k, bag in enumerate(bags)}
     recordings.sort(key=lambda recording: min(number[id(bag)] for bag in recording))
-    return [_whole(parts) if len(parts) > 1 else parts[0] for parts in recordings]
+    return [_one_recording(parts) if len(parts) > 1 else parts[0] for parts in recordings]
 
 
 def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
@@ -68,7 +68,7 @@ def _is_alike(before_s: float, after_s: float) -> bool:
     return abs(after_s - before_s) < 0.01 * before_s
 
 
-def _whole(parts: Sequence[ReducedBag]) -> ReducedBag:
+def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
     """Return the recording that consists of successive parts, as one bag."""
     first, last = parts[0], parts[-1]
     sources = [part.source for part in parts]
@@ -133,12 +133,12 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         for number, rest in enumerate(part.intervals):
             # Windows shorter than those of the first part, as in a short part, are not whole.
             n_whole = rest.n_whole if is_alike else 0
-            moved = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
+            shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0
-            if is_first and _is_one_rest(result[-1], moved, part.window_s):
-                result[-1] = _continued(result[-1], moved)
+            if is_first and _is_one_rest(result[-1], shifted, part.window_s):
+                result[-1] = _continued(result[-1], shifted)
             else:
-                result.append(moved)
+                result.append(shifted)
     return tuple(result)
 
 

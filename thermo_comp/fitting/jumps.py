@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the detection of jumps: steps in the reading of a sensor at rest.
+Owns the detection of jumps: steps in the reading of an accelerometer at rest.
 
 The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
@@ -28,12 +28,12 @@ from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest duration of the readings on either side of a gap that give the level: seconds, samples.
+# Shortest part on either side of a gap that gives the mean level: [s], and number of samples.
 _MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
 # Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8
-# Smallest significant step, in units of its sd; the search over the place of a step reaches about
-# 5 by chance.
+# Smallest significant ratio of a step to the sd of the step; the search over the place of a step
+# reaches a ratio of about 5 by chance.
 _STEP_SDS = 8.0
 
 
@@ -81,7 +81,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     if beside and not quiet_sd.all():
         # Samples that are equal at rest have at least the error of rounding.
         quiet_sd = np.maximum(quiet_sd, [_rounding_sd(axis) for axis in np.vstack(beside).T[1:4]])
-    # If the noise is correlated, the level beside a gap is the mean over a time above `margin_s`.
+    # If the noise is correlated, the level beside a gap is a mean over more than `margin_s`.
     margins = [max(_margin(part, quiet_sd), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)
@@ -112,7 +112,7 @@ def _beside_gaps(
 
 
 def _margin(samples: Floats, quiet_sd: Floats) -> float:
-    """Return the duration of readings beside a gap: 60 time constants of the noise, 10..100 s."""
+    """Return the time of readings beside a gap [s]: 60 time constants of the noise, 10..100."""
     time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -124,7 +124,7 @@ def _margin(samples: Floats, quiet_sd: Floats) -> float:
 def _examine(
     samples: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
 ) -> Jump | None:
-    """Return the jump in the readings beside a gap, or None if there is no jump."""
+    """Return the jump in the samples beside a gap between two rests, or None for no jump."""
     time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
@@ -140,7 +140,7 @@ def _examine(
     step_sd = sd * relative_sd * _correlation(residual, sd)
     if r:
         # At least half of the step must remain in the mean level, and the change of the mean level
-        # must exceed four of its standard deviations.
+        # must exceed four standard deviations of this change.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
@@ -201,8 +201,8 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
     Find the first sample after a step, and the lag-1 correlation of the noise.
 
     The place of the step and the correlation are estimated in turn, three times. Noise with a
-    lag-1 correlation below 0.4 counts as white. The correlation is at most 0.999; noise of a
-    larger correlation is a random walk.
+    lag-1 correlation of 0.4 or less counts as white. The correlation is limited to 0.999, because
+    noise of a larger correlation is a random walk.
     """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
     for _ in range(3):
@@ -262,7 +262,7 @@ def _trend(time: Floats, r: float = 0.0) -> Floats:
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the angle of rotation within 1 s of a step, by the rate about its medians [rad]."""
+    """Return the angle of rotation within 1 s of a step [rad], by the gyroscope about medians."""
     about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
-    turned = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
-    return float(np.linalg.norm(turned[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))
+    angles = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
+    return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

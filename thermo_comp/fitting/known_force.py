@@ -127,7 +127,7 @@ class ForceOptions:
             raise ValueError('`radius` and `radius_sd` are given without `rotation`')
 
 
-#: The options without any entry: the bags' metadata about |f| apply.
+#: Options without any entry: |f| follows from the metadata of the bags, or is gravity.
 USUAL_FORCE = ForceOptions()
 
 
@@ -230,7 +230,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
 
 
 def _rotating(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce:
-    """Read the rotation rate of a bag."""
+    """Read the rotation rate of a bag; return the known |f| by this rate and the radius."""
     wanted, field = split_field(asked.rotation or '')
     names = [name for name in info.topics if is_called(name, wanted)]
     if len(names) != 1:

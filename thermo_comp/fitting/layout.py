@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the places of the unknowns in the vector of parameters of the regression."""
+"""Owns the indices of the unknowns in the vector of parameters of the regression."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Layout:
     """
-    Places of the unknowns in the vector of parameters; the unknowns of the unit come first.
+    Places (indices) of the unknowns in the vector of parameters; those of the unit come first.
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
     weights, nonlinear: places of the weights, shape (2, 3, m), and of the nonlinear coefficients,
@@ -63,7 +63,7 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Places of radius, misalignment and poses, shared by all axes: the unit's last places."""
+        """Places of radius, misalignment and poses, which all axes share; the last of the unit."""
         return np.concatenate((self.radius, self.misalignment, self.pose.ravel()))
 
     @property

@@ -7,7 +7,7 @@ Each mounting (a position, or the rests into which knocks have cut a position) i
 and so is each section and each half of the program, in all positions at once. Left-out halves
 detect columns that interpolate between the sections of one program and fail in another. The
 left-out windows are corrected as the node would correct them: with the unit's parameters alone,
-initial lag states at their run-time mean, no mounting offsets and no tilts of the support.
+initial lag states at their prior mean, no mounting offsets and no tilts of the support.
 The errors are the drift (each axis less its mean over the position, which does not depend on the
 attitude) and ``|f| - g`` of the position, if the other positions determine it.
 
@@ -40,11 +40,11 @@ from .unknowns import State
 
 # Smallest number of windows of a position for a score of the position's drift.
 _FEWEST_WINDOWS = 8
-# Two logarithms of mean square errors count as equal below this difference: 5 % of an RMS.
-_EQUAL = 0.1
-# Errors of up to 1.7 times the noise count as noise: in a soak, changes of the temperature by
-# hundredths of a kelvin, whose lag is not known, add to the white noise.
-_AS_NOISE = 1.7
+# Largest log ratio of two mean square errors that count as equal: 5 % of an RMS.
+_NEGLIGIBLE_LOG_RATIO = 0.1
+# Largest ratio of an RMS error to the noise that counts as noise: in a soak, changes of the
+# temperature by hundredths of a kelvin, whose lag is not known, add to the white noise.
+_NOISE_RATIO = 1.7
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Folds:
 
     @classmethod
     def of(cls, square: Floats, windows: Floats, fold: Ints) -> Folds:
-        """Average mean squares, NaN if not scored, over the positions of each fold, shape (p,)."""
+        """Average the mean squares of positions, shape (p,), NaN if not scored, over each fold."""
         known = np.isfinite(square)
         count = np.bincount(fold, np.where(known, windows, 0.0))
         total = np.bincount(fold, np.where(known, square * windows, 0.0))
@@ -94,8 +94,8 @@ class Folds:
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
             # The standard error of a single fold is unknown: take the smallest difference that
-            # counts, `_EQUAL`.
-            return of_sums, _EQUAL
+            # counts, `_NEGLIGIBLE_LOG_RATIO`.
+            return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
         without = np.subtract(*map(np.log, others))
@@ -109,7 +109,7 @@ class Folds:
         """Whether white noise explains the errors in the folds that are scored for both models."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
-        return bool(square <= (_AS_NOISE * noise) ** 2)
+        return bool(square <= (_NOISE_RATIO * noise) ** 2)
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Score:
     @property
     def exceeds_noise(self) -> bool:
         """Whether neither noise nor errors of a coarse thermometer explain the left-out drift."""
-        return self.rms > _AS_NOISE * float(np.hypot(self.noise, self.by_thermometer))
+        return self.rms > _NOISE_RATIO * float(np.hypot(self.noise, self.by_thermometer))
 
     @property
     def excess(self) -> float:
@@ -165,7 +165,7 @@ class Score:
     @property
     def is_by_thermometer(self) -> bool:
         """Whether errors of a coarse thermometer explain the left-out drift."""
-        return self.rms <= _AS_NOISE * self.by_thermometer
+        return self.rms <= _NOISE_RATIO * self.by_thermometer
 
 
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
@@ -193,7 +193,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
         if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
     ]
-    # The RMS error of left-out halves of the program may rise by a quarter, about its scatter.
+    # The RMS error of left-out halves of the program may rise by a quarter, its usual scatter.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if is_worse_by_norms(before, after) or is_worse_by_halves:
         return 0.0
@@ -201,10 +201,10 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
         return 0.0
     total = sum(gain for gain, _ in drift)
     is_sure = bool(must_gain) and all(gain > error for gain, error in must_gain)
-    if is_sure and total > _EQUAL * len(drift):
+    if is_sure and total > _NEGLIGIBLE_LOG_RATIO * len(drift):
         return total
-    is_sure = norms is not None and norms[0] > max(2.0 * norms[1], _EQUAL)
-    if is_sure and norms and all(abs(gain) < _EQUAL for gain, _ in drift):
+    is_sure = norms is not None and norms[0] > max(2.0 * norms[1], _NEGLIGIBLE_LOG_RATIO)
+    if is_sure and norms and all(abs(gain) < _NEGLIGIBLE_LOG_RATIO for gain, _ in drift):
         return norms[0]
     return 0.0
 
@@ -222,7 +222,7 @@ def is_undecided(before: Score, after: Score) -> bool:
     smaller by one to two standard errors.
     """
     *drift, norms = _beyond_thermometer(before, after)
-    is_equal = all(abs(gain[0]) < _EQUAL for gain in drift if gain)
+    is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)
     return is_equal and (norms is None or norms[0] > norms[1])
 
 
@@ -234,11 +234,11 @@ def is_near(chosen: Score, other: Score) -> bool:
 
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
-    Return the gains, None for a drift or norms that errors of a coarse thermometer explain. These
-    errors repeat in all bags of one program: a model can explain them in left-out bags, and fails
-    in another program.
+    Return the log gains of `Score.kinds`, None for a drift or norms that errors of a coarse
+    thermometer explain. Errors of a coarse thermometer repeat in all bags of one program: a model
+    can explain these errors in left-out bags, and fails in another program.
     """
-    is_known = before.norms.rms > _AS_NOISE * before.by_thermometer
+    is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)
     return [gain if kept else None for gain, kept in zip(_gains(before, after), keep, strict=True)]
 
@@ -298,19 +298,19 @@ def _by_positions(
 
 
 def _mean(values: Floats, weights: Floats) -> Floats:
-    """Average windows like `np.average`, without its checks, which take longer than the sums."""
+    """Average windows as `np.average`, without checks, which would take longer than the sums."""
     share = weights.reshape(-1, *[1] * (values.ndim - 1))
     return np.asarray(np.sum(values * share, axis=0) / np.sum(share, axis=0))
 
 
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     """
-    Return the state of a fit after one Gauss-Newton step with changed equations, and the root of
-    its covariance, see `Posterior`; `matrix`: the changed equations of the unit's unknowns
+    Return the state after one Gauss-Newton step with other normal equations (`matrix`) of the
+    unit's unknowns, and the root of the unit's covariance, see `Posterior`.
     """
     step, factor = point.unit_step(matrix)
     step = np.pad(step, (0, point.layout.n - point.layout.n_unit))
-    return point.moved(step).state, inverse_root(factor)
+    return point.with_step(step).state, inverse_root(factor)
 
 
 def _is_determined(by_others: float, by_all: float) -> bool:
@@ -359,8 +359,8 @@ def _by_sections(
     is_within: bool = False,
 ) -> tuple[Folds, Floats]:
     """
-    Score the drift of left-out sections about the mean of the windows that stay in the fit, by
-    Gauss-Newton steps from the fit of all data.
+    Score the drift of left-out sections, about the mean of those windows of the position that stay
+    in the fit, by Gauss-Newton steps from the fit of all data.
 
     `folds`: the sections left out at once, in all positions; `is_within`: score only windows at
     temperatures that occur in the fit
@@ -372,15 +372,15 @@ def _by_sections(
     for k, fold in enumerate(folds):
         point = regression.at(posterior.state, posterior.prior, products.without(fold))
         for _ in range(n_steps):
-            point = point.moved(point.solution[0])
+            point = point.with_step(point.solution[0])
         force = regression.force(point.state)
-        judged = gone = np.isin(windows.section, fold)
+        judged = left_out = np.isin(windows.section, fold)
         if is_within:
             t = windows.columns[:, 0]
-            judged = gone & (t >= t[~gone].min()) & (t <= t[~gone].max())
+            judged = left_out & (t >= t[~left_out].min()) & (t <= t[~left_out].max())
         for p in range(windows.n_positions):
             rows = np.arange(*windows.edges[p : p + 2])
-            out, stayed = rows[judged[rows]], rows[~gone[rows]]
+            out, stayed = rows[judged[rows]], rows[~left_out[rows]]
             if len(out) and len(stayed) >= _FEWEST_WINDOWS:
                 level = _mean(force[stayed], share[stayed])
                 drift[out] = force[out] - level

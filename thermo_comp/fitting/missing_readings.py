@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .reduction import ReducedBag
 
 # Smallest lost share of the time at rest that is reported.
-_LEAST = 0.1
+_LEAST_LOST_SHARE = 0.1
 
 
 class _Missing(NamedTuple):
@@ -40,7 +40,7 @@ def judge_missing(windows: ThermalWindows) -> Iterator[Finding]:
     n_used = float(windows.data.weight.sum()) * windows.typical_count
     unsettled = n_unsettled / max(n_still, 1.0)
     missing = 1.0 - n_used / max(n_still, 1.0) - unsettled
-    if missing > _LEAST:
+    if missing > _LEAST_LOST_SHARE:
         why = 'do the thermometers and the accelerometer use the same clock?'
         if n_between > 0.5 * missing * n_still:
             why = f'does a thermometer stick, or drop out? {_longest_pause(used_bags)}'
@@ -49,7 +49,7 @@ def judge_missing(windows: ThermalWindows) -> Iterator[Finding]:
             f'{100.0 * missing:.0f} % of the time at rest has no temperatures and is left out: '
             f'{why}',
         )
-    if unsettled > _LEAST:
+    if unsettled > _LEAST_LOST_SHARE:
         quantum = windows.model.detector.board.quantum_c
         steps = f' (steps of {quantum:g} K)' if quantum else ''
         yield advice(
@@ -95,4 +95,4 @@ def _longest_pause(bags: Sequence[ReducedBag]) -> str:
     if not pauses:
         return ''
     pause_s, name, where = max(pauses)
-    return f'{where}: temperature/{name} reads nothing new for {pause_s:.0f} s'
+    return f'{where}: temperature/{name} has no new value for {pause_s:.0f} s'

@@ -31,9 +31,9 @@ from .selection import Selected
 from .unknowns import State
 from .windows import ThermalWindows
 
-# Smallest effective parameters per coefficient of a nonlinear term that the data determine: 0.99
+# Smallest effective parameters, per coefficient, of a nonlinear term that the data determine: 0.99
 # means that the posterior sd is a tenth of the prior sd.
-_DETERMINED = 0.99
+_DETERMINED_SHARE = 0.99
 
 _Active = frozenset[int]  # indices of the nonlinear coefficients in use
 
@@ -60,14 +60,14 @@ class Forces:
     radius_sd: float = 0.0
 
     def norms(self, radius: Floats, stretch: Floats) -> Floats:
-        """Return |f| of each position, given relative errors of the radius and of |f|."""
-        turned = self.spin * (1.0 + radius.sum())
-        return np.asarray(np.hypot(self.still, turned) * (1.0 + stretch.sum(axis=1)))
+        """Return |f| of each position, given the relative errors of the radius and of |f|."""
+        spin = self.spin * (1.0 + radius.sum())
+        return np.asarray(np.hypot(self.still, spin) * (1.0 + stretch.sum(axis=1)))
 
     def by_radius(self, radius: Floats) -> Floats:
         """Differentiate the logarithm of |f| by the relative error of the radius."""
-        turned = self.spin * (1.0 + radius.sum())
-        return np.asarray(self.spin * turned / (self.still**2 + turned**2))
+        spin = self.spin * (1.0 + radius.sum())
+        return np.asarray(self.spin * spin / (self.still**2 + spin**2))
 
     @property
     def sizes(self) -> Floats:
@@ -140,7 +140,7 @@ def with_forces(
 
 
 def is_beyond(windows: ThermalWindows) -> bool:
-    """Whether the stated |f| differs between the positions."""
+    """Whether the stated |f| differs between positions."""
     forces = windows.data.forces
     return forces is not None and float(np.ptp(forces.sizes)) > 0.0
 
@@ -161,7 +161,7 @@ def starting_sd(forces: Forces, options: FitOptions) -> Floats:
 
 
 class _TermFits:
-    """Fits with different nonlinear coefficients, and the gain by each coefficient."""
+    """Fits with different nonlinear coefficients, and what a fit gains by some coefficients."""
 
     def __init__(self, regression: Regression, selected: Selected, sd: Floats) -> None:
         """Set the prior sd of the nonlinear coefficients, shape (2 k,)."""
@@ -181,19 +181,19 @@ class _TermFits:
         """Return the indices of a term's coefficients: at the reference, and per kelvin."""
         return frozenset((kind, self._n_kinds + kind))
 
-    def loss(self, used: _Active, gone: _Active) -> float:
+    def loss(self, used: _Active, dropped: _Active) -> float:
         """Return the loss of log evidence without some nonlinear coefficients."""
-        return self.posterior(used).log_evidence - self.posterior(used - gone).log_evidence
+        return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
-    def left_out_gain(self, used: _Active, gone: _Active) -> tuple[float, float]:
+    def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
         """Return the log gain of left-out norms by some coefficients, and its standard error."""
-        return self.score(used - gone).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
+        return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
         """Whether the data determine a nonlinear coefficient."""
         posterior = self.posterior(used)
         share = posterior.determined[posterior.layout.nonlinear[:, at]]
-        return bool(share.mean() > _DETERMINED)
+        return bool(share.mean() > _DETERMINED_SHARE)
 
     def thinned(self, used: _Active) -> _Active:
         """Remove nonlinear terms that the data determine and that lower the log evidence."""
@@ -302,8 +302,8 @@ def without_terms(calibration: Calibration) -> Calibration:
     """Remove the nonlinear terms of a calibration, and their rows of its covariance."""
     layout, posterior = parameter_layout(calibration), calibration.posterior
     if posterior is not None:
-        gone = np.arange(layout.nonlinear, layout.misalignment)
-        kept = np.delete(posterior.matrix, gone, axis=0), np.delete(posterior.variances, gone)
+        rows = np.arange(layout.nonlinear, layout.misalignment)
+        kept = np.delete(posterior.matrix, rows, axis=0), np.delete(posterior.variances, rows)
         posterior = FilePosterior.of(*kept)
     return replace(calibration, nonlinearity=None, posterior=posterior)
 
@@ -314,7 +314,7 @@ def judge_terms(calibration: Calibration) -> Iterator[Finding]:
     undetermined = ', '.join(
         f'{term.kind} (effective parameters {term.effective_parameters:.1f} of 6)'
         for term in terms
-        if term.effective_parameters < 3.0 * _DETERMINED
+        if term.effective_parameters < 3.0 * _DETERMINED_SHARE
     )
     if undetermined:
         yield advice(

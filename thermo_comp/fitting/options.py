@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the options of a fit: their checks, local gravity, families of curves.
+Owns the options of a fit and their checks, normal gravity, and the choice of curve families.
 
 An error of the local gravity changes all three scale factors by the same ratio and is not visible
 in the residuals, so the user must state gravity.
@@ -159,7 +159,7 @@ class FitOptions:
 
     @property
     def saturated_at(self) -> float | None:
-        """Magnitude of a saturated sample, or None if it has to be chosen from the data."""
+        """Magnitude of a saturated sample [input units], or None to choose it from the data."""
         return self.full_scale or (COUNTS_FULL_SCALE if self.input == 'counts' else None)
 
 
@@ -196,7 +196,7 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
 
 def normal_gravity(latitude_deg: float, height_m: float) -> float:
     """
-    Return the gravity of the WGS 84 ellipsoid (Somigliana) at a height above it.
+    Return the normal gravity [m/s^2] at a height above the WGS 84 ellipsoid (Somigliana).
 
     Real gravity differs from the result by 30 mGal (30 ug) RMS, in mountains by some 50 mGal.
     Raises ValueError for a latitude outside -90..90 deg or a height outside -1000..10000 m.

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the curves over the temperatures of parts: a curve is a sum of columns with a common weight.
+Owns the powers of the temperature x of each axis's part, as sums of columns of t and of the lag m.
 
-The temperature of the part of an axis is ``x = t - m``, t being that of the board and m the lag of
-the part. By the binomial theorem x^p is a sum of the columns t^p, t^(p-1) m, ..., m^p, which the
-bank of columns has. If all bags repeat the same warm-up, the board temperature t and the lag m are
-functions of each other, and separate weights of the columns would not describe the part.
+The temperature of the part of an axis, such as a sensor's package, is ``x = t - m``, t that of the
+board and m the lag of the part. By the binomial theorem x^p is a sum of the columns t^p,
+t^(p-1) m, ..., m^p with known factors, so one weight per power describes a curve over x. If all
+bags repeat one warm-up, m is a function of t, and separate weights would not describe the part.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ ORDER = 3
 
 class PartCurves(NamedTuple):
     """
-    The curves over the temperatures of the parts of some axes.
+    The powers of the temperature x of the part of each axis; each power is a curve over x.
 
-    axis, power: axis and power of each curve, shape (p,)
-    sums: factors of the columns (of sets and response) in each curve, shape (p, m)
+    axis, power: axis and power of x of each curve, shape (p,)
+    sums: factors of the columns (of sets and response) whose sum is the curve, shape (p, m)
     """
 
     axis: Ints

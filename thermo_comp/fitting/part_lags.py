@@ -4,13 +4,13 @@
 Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
-temperature of one part of the unit less the reference temperature. The board temperature T less
-the reference temperature is t, and m = T - L(T + v G) is T less the temperature of the part, L
-being the lag operator, G the gradient and v its share. The part lags a temperature between board
-and case, the board's plus the share v of the gradient. The lag has one stage or, for a part that
-is heated through another part, two stages in series. Without a case thermometer, the temperature
-that the part lags may lead that of the board. The time constants, the share v of the gradient and
-the lead minimise the RMS residual of a spline of the bias and a cubic of the scale factor over x.
+temperature of one part of the unit less the reference temperature. t is the board temperature T
+less the reference temperature, and m = T - L(T + v G) is T less the temperature of the part, L
+being the lag operator and G the gradient. The part lags the temperature T + v G between board and
+case. The lag has one stage or, for a part that is heated through another part, two stages in
+series. Without a case thermometer, the temperature that the part lags may lead that of the board.
+The time constants, the share v of the gradient and the lead minimise the RMS residual of a spline
+of the bias and a cubic of the scale factor over x.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from .initial_triad import (
 from .windows import ThermalWindows
 
 # Ratio of a time constant of the columns to the next smaller time constant: half an octave.
-_STEP = 2.0**0.5
+_TAU_RATIO = 2.0**0.5
 
 
 class _Shape(NamedTuple):
@@ -45,7 +45,7 @@ class _Shape(NamedTuple):
     The shape of the curves over the temperatures of the parts.
 
     n_nodes: largest number of nodes of the spline of the bias
-    most_noise: ratio of the RMS residual to white noise up to which noise explains the residual
+    most_noise: largest ratio of the RMS residual to the noise at which noise explains the residual
     has_stress: whether bias and scale also depend on the lag m of the part, by a coefficient that
         is linear in the part's temperature x: the stress between a part and the board
     has_gradient: whether the bias also depends on the gradient of the case
@@ -59,8 +59,8 @@ class _Shape(NamedTuple):
 
 class _Steps(NamedTuple):
     """
-    First steps of a search: of the logarithms of both time constants of a part, of the share of
-    the gradient, and of the lead over the first time constant; 0 keeps a value.
+    First steps of a search in the logarithms of both time constants of a part, in the share of the
+    gradient, and in the ratio of lead to first time constant; 0 keeps a value constant.
     """
 
     tau: float
@@ -70,12 +70,12 @@ class _Steps(NamedTuple):
 
 
 # Ratio of the RMS residual to white noise below which no other shape of the curves is tried.
-_EXPLAINED = 1.1
-# Shapes tried in this order: a curve of few nodes determines a lag best but has no kinks, so noise
-# must explain its residual.
+_EXPLAINED_RATIO = 1.1
+# Shapes tried in this order: a spline of few nodes determines a lag best but has no kinks, so
+# noise must explain the residual of this spline.
 _SHAPES = (
-    _Shape(4, _EXPLAINED),
-    _Shape(4, _EXPLAINED, has_gradient=True),
+    _Shape(4, _EXPLAINED_RATIO),
+    _Shape(4, _EXPLAINED_RATIO, has_gradient=True),
     _Shape(60, 1.5),
     _Shape(60, 1.5, has_gradient=True, has_stress=True),
 )
@@ -127,12 +127,12 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
             continue
         if ratio < least:
             best, least = parts, ratio
-        if ratio <= _EXPLAINED:
+        if ratio <= _EXPLAINED_RATIO:
             break
     accepted = [] if best is None else [best]
     if least > _SHAPES[-1].most_noise:
         curves = _PartCurves(windows, start, _SHAPES[0], 500)
-        lags = [curves.single(axis) for axis in range(3)]
+        lags = [curves.one_stage(axis) for axis in range(3)]
         if min(map(curves.reduction, lags, range(3))) > 2.0:
             return [_parts_of(windows, start, _SHAPES[0], lags, noise)[0], *accepted]
     return accepted
@@ -154,7 +154,7 @@ def _parts_of(
     square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
     ratio = float(np.sqrt((square / noise**2).max()))
     x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-    # Curves alone extrapolate badly to left-out sections: drifts of 10 sd are allowed.
+    # Curves without stress terms extrapolate badly: left-out drifts of 10 sd of noise are allowed.
     is_curve = ratio <= shape.most_noise and not shape.has_stress
     return Parts((x, y, z), factors, (10.0 if is_curve else 2.0) * float(noise.mean())), ratio
 
@@ -163,7 +163,7 @@ class _PartCurves:
     """
     Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
 
-    Every k-th window is used, so that `n_windows` windows or more are left, if there are as many.
+    Every k-th window is used, with the largest k that leaves `n_windows` windows or more.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether a lag reduces the residual to near the limits of `find_parts`."""
+        """Whether the residual with a lag is small or reduced, nearly as `find_parts` requires."""
         typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -228,20 +228,20 @@ class _PartCurves:
         A second stage, or another share of the gradient, must reduce a residual above the white
         noise (`noise`) by 5 %.
         """
-        single = self.single(axis)
-        best = self._with_lead(single, axis)
+        one_stage = self.one_stage(axis)
+        best = self._with_lead(one_stage, axis)
         enough = 1.1**2 * noise**2 * len(self._t)
         if self._square(best, axis) > enough:
-            starts = [single]
+            starts = [one_stage]
             if self._has_case:
                 # The residual has several minima in a valley, in which the time constant grows
                 # with the time by which the temperature between board and case leads the board.
-                along = [self.single(axis, share) for share in (0.3, 0.6, 0.9)]
+                along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
                 # No second stage or other share of the gradient meets the limits of `find_parts`.
                 return best
-            lags = [self._searched(axis, _in_two_stages(single), _Steps(0.2, 0.4))]
+            lags = [self._searched(axis, _in_two_stages(one_stage), _Steps(0.2, 0.4))]
             if best.lead_s:
                 steps = _Steps(0.2, 0.4, lead=0.1)
                 lags.append(self._searched(axis, _in_two_stages(best), steps))
@@ -292,7 +292,7 @@ class _PartCurves:
         return self._searched(axis, lag, steps, accuracy=1e-3)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
-        """Return the second lag if its RMS residual is 5 % below that of the first lag."""
+        """Return `simple`, unless the RMS residual of `other` is more than 5 % smaller."""
         is_better = self._square(other, axis) < self._square(simple, axis) / 1.05**2
         return other if is_better else simple
 
@@ -300,7 +300,7 @@ class _PartCurves:
         """
         Return the lag of the smallest RMS residual by the simplex method, begun at `first`.
 
-        `accuracy`: half the tolerance in the searched values, which are logarithms and ratios
+        `accuracy`: half the tolerance of the simplex in logarithms of time constants and in ratios
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -324,8 +324,8 @@ class _PartCurves:
         minimum = minimize(log_square, simplex[0], method='Nelder-Mead', options=options)
         return lag_at(minimum.x)
 
-    def single(self, axis: int, sensor_share: float = 0.0) -> Part:
-        """Return the lag of one stage with the smallest RMS residual; 0 s if no lag is better."""
+    def one_stage(self, axis: int, sensor_share: float = 0.0) -> Part:
+        """Return the lag of one stage with the smallest RMS residual, which may be 0 s."""
 
         def square(tau_s: float) -> float:
             return self._square(Part(tau_s, 0.0, sensor_share if tau_s else 0.0), axis)
@@ -333,7 +333,7 @@ class _PartCurves:
         best = min(self._tried.tolist(), key=square)
         minimum = minimize_scalar(
             lambda log_tau: float(np.log(square(float(np.exp(log_tau))))),
-            bounds=(float(np.log(best / _STEP)), float(np.log(best * _STEP))),
+            bounds=(float(np.log(best / _TAU_RATIO)), float(np.log(best * _TAU_RATIO))),
             method='bounded',
             options={'xatol': 1e-3},
         )
@@ -342,18 +342,18 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether `_STEP` times longer or shorter time constants add 5 % to the RMS residual, and the
-        lag settles to 10 % within the longest bag.
+        Whether time constants longer or shorter by `_TAU_RATIO` add 5 % to the RMS residual, and
+        the lag settles to 10 % within the longest bag.
         """
         tau, second, share, lead = lag
         if tau > float(self._age.max()) / np.log(10.0):
             return False
         others = [
             Part(ratio * tau, ratio * second, share, ratio * lead)
-            for ratio in (1.0 / _STEP, _STEP)
+            for ratio in (1.0 / _TAU_RATIO, _TAU_RATIO)
         ]
         if not tau:
-            others = [Part(float(self._tried[0]) * _STEP)]
+            others = [Part(float(self._tried[0]) * _TAU_RATIO)]
         limit = 1.05**2 * self._square(lag, axis)
         return all(self._square(other, axis) > limit for other in others)
 
@@ -362,7 +362,7 @@ class _PartCurves:
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
     def n_parameters(self, lag: Part) -> int:
-        """Return the number of unknowns of one axis: coefficients and levels of positions."""
+        """Return the number of unknowns of an axis: coefficients, and a level of each position."""
         return int(self._series(lag, 0).shape[1]) + len(self._first)
 
     def residual(self, lag: Part, axis: int) -> Floats:

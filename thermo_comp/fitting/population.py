@@ -39,15 +39,15 @@ from .thermal_ranges import union
 #: Smallest number of units of a population: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
 #: Fields of a column whose lag has one stage, no share of the gradient and no lead.
-_ALONE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
+_ONE_STAGE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
 
 
 def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError for fewer calibrations than three, or if they differ in input, reference
-    temperature, sensors or curves.
+    Raises FitError for fewer than three calibrations, or for calibrations that differ in input,
+    reference temperature, sensors or curves.
     """
     # Nonlinear terms are left out: most units have none, because a centrifuge is needed to
     # determine them.
@@ -91,9 +91,7 @@ def _check_alike(calibrations: Sequence[Calibration]) -> None:
     first = calibrations[0]
     serials = [calibration.unit.serial for calibration in calibrations]
     if twice := sorted(serial for serial in set(serials) if serials.count(serial) > 1):
-        raise FitError(
-            f'two of the calibrations are of one unit, {twice[0]}: give one of each unit'
-        )
+        raise FitError(f'two calibrations are of unit {twice[0]}: give one calibration per unit')
     for calibration in calibrations:
         serial, unit = calibration.unit.serial, calibration.unit
         alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
@@ -115,8 +113,8 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     Return the covariance of n units from `deviations`, their distances to the mean / sqrt(n - 1),
     shape (n, p); `K`: scale factors of the axes.
 
-    The constants of a unit are taken as independent of each other and of the curves. With the
-    correlations by chance between few units, one position would determine all constants of a unit.
+    Bias, scale and misalignment are taken as independent of each other and of the curves: with
+    chance correlations between few units, one position would determine all constants of a unit.
     The correlations of the curves are reduced by a share estimated from their scatter [1]_. A
     dynamic curve counts as its difference from the static curve, because most units have one curve
     for both sets, and smaller correlations between equal curves would make the curves different.
@@ -171,26 +169,26 @@ def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats)
 
 
 def _without_range(column: Column) -> Column:
-    """Return a column without the fields that differ between units of a type: range and rest."""
+    """Return a column without the fields that differ between units of a type: range, rest_k."""
     return replace(column, range=(0.0, 1.0), rest_k=0.0)
 
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return columns of the bank whose sum is (about) a given column, each with its share.
+    Return columns of the bank, with factors, whose weighted sum is (about) the given column.
 
     The parts of two units of a type differ in their time constants. A lag is interpolated between
     the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
-    a lag behind a temperature between board and sensor, and a lag with a lead are sums of single
-    lags. The powers of a sum of lags are approximated by powers of one lag of the board, which is
-    the same time behind as the sum in a long ramp.
+    a lag behind a temperature between board and sensor, and a lag with a lead are sums of
+    first-order lags. The powers of a sum of lags are approximated by powers of one lag of the
+    board, with the same delay as the sum in a long ramp.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE
     if not is_line and any(column.part[1:]):
-        # A power of a sum of lags becomes that of one lag, whose time constant is 1 s or more.
+        # A power of a sum of lags becomes the power of one lag, of a time constant of 1 s or more.
         behind_s = max(tau + second - column.lead_s, 1.0)
-        return _on_common_lags(replace(column, tau_s=behind_s, **_ALONE))
+        return _on_common_lags(replace(column, tau_s=behind_s, **_ONE_STAGE))
     summands: list[tuple[Column, float]] = []
     if column.sensor_share:
         of_board = replace(column, sensor_share=0.0)
@@ -198,8 +196,8 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         summands = [(of_board, 1.0), (of_sensor, -column.sensor_share)]
     elif any(column.part[1:]) and isinstance(lag, Lag):
         summands = [
-            (replace(column, tau_s=tau_s, **_ALONE), share)
-            for (_, tau_s), share in lag.singles.items()
+            (replace(column, tau_s=tau_s, **_ONE_STAGE), share)
+            for (_, tau_s), share in lag.first_order_weights.items()
         ]
     if summands:
         return [

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the informative prior of a fit, which an earlier calibration of the unit gives, or the
+Owns the informative prior of a fit, from an earlier calibration of the unit or from the
 population of its type.
 
 Mean and covariance of all parameters of the calibration form the Gaussian prior of the regression,
@@ -70,13 +70,13 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def offset_sd_of(calibration: Calibration) -> float:
-    """Return the sd of the bias offset of a mounting or turn-on by a calibration [m/s^2]."""
+    """Return the sd of the bias offset of a mounting or turn-on in a calibration [m/s^2]."""
     axes = [axis for part in calibration.regime_sets() for axis in part.axes()]
     return min(axis.residual_sd_m_s2 for axis in axes)
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Set bias and weights of a state to those of a calibration with the nominal scale."""
+    """Set bias and weights of a state to those of a calibration whose K is the nominal scale."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
@@ -100,7 +100,7 @@ def informative_priors(
     """
     Return candidate priors from a calibration, which the fit compares by evidence.
 
-    The last candidate is the widest; the fit begins with it. Raises FitError if the calibration
+    The last candidate is the widest, with which the fit begins. Raises FitError if the calibration
     has no covariance.
     """
     if calibration.posterior is None:

@@ -21,7 +21,7 @@ from .reduction import ReducedBag
 
 
 def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
-    """Refuse a prior of another unit: its small uncertainties do not apply to this unit."""
+    """Refuse a prior of another unit, whose small uncertainties do not apply to this unit."""
     if prior is None or prior.provenance.model == POPULATION:
         return
     if 'unknown' not in (serial, prior.unit.serial) and serial != prior.unit.serial:
@@ -149,7 +149,7 @@ class _DeadAxis(NamedTuple):
 
 
 def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
-    """Explain constant readings: an axis is clipped at the largest reading, or dead."""
+    """Return why readings are constant: an axis is clipped at the largest reading, or dead."""
     largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
     # The magnitudes of the two limits of a two's complement code differ by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
@@ -179,7 +179,7 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
 
 
 def constant_axes(bags: Sequence[ReducedBag], usual: Bools) -> Iterator[_DeadAxis]:
-    """Find axes that are constant throughout a rest, of the axes that `usual`ly are not, (3,)."""
+    """Find axes constant throughout a rest, among those that should have noise (`usual`, (3,))."""
     for bag in bags:
         for rest in bag.intervals:
             is_dead = ~(rest.sample_sd > 0.0) & usual & (np.ptp(rest.mean, axis=0) == 0.0)
@@ -197,7 +197,7 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
     warmed = ''
     if np.isfinite(jump.temperature_change):
         warmed = (
-            f', while its temperature changed by {jump.temperature_change:+.2f} ± '
+            f', while the board temperature changed by {jump.temperature_change:+.2f} ± '
             f'{jump.temperature_change_sd:.2f} K'
         )
     return (

@@ -78,7 +78,7 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite or out of order
     n_cells, n_still_cells: number of cells in the bag, and in its rests
-    window_s: length of a window [s]; longer than the option if the samples are slow
+    window_s: length of a window [s]; above the requested length if the samples are slow
     cycle_s: typical interval between samples [s]
     middle: code at zero force of the samples if the codes are unsigned, else 0
     max_abs: largest magnitude of a reading without outliers, see `_max_abs` [input units]
@@ -134,8 +134,8 @@ class ReducedBag:
 
 class _Pass:
     """
-    One pass over the blocks of a source: cells of the samples, readings, causes that can explain
-    the lack of a rest; `has_rate`: whether all blocks have a finite angular rate.
+    One pass over the blocks of a source: cells of the samples, temperature readings, possible
+    causes of a lack of rests; `has_rate`: whether all blocks have a finite angular rate.
     """
 
     def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
@@ -201,13 +201,12 @@ def reduce_source(
         return usual
     share = usual.n_still_cells / usual.n_cells
     if share < 0.95 and source.force is None:
-        # If rests are interrupted, shorter cells are used if shorter cells add 5 % of the bag to
-        # the rests.
+        # Shorter cells are used if they increase the time at rest by more than 5 % of the bag.
         shorter, _ = reduced(10)
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
     if share < 0.5:
-        # If rests are short, shorter cells are used if shorter cells show six attitudes.
+        # Cells of 5 samples are used if they give rests in six attitudes or more.
         shorter, _ = reduced(5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
         means = means.reshape(-1, 3)
@@ -224,7 +223,7 @@ def _reduced(
     still_sd: float,
     fewest_windows: int,
 ) -> tuple[ReducedBag, float]:
-    """Reduce a source with one length of the cells; return also this length [s]."""
+    """Reduce a source, for one choice of cells; return also the length of a cell [s]."""
     reading = _Pass(source, accumulator)
     cells = reading.cells
     if source.force is None:
@@ -288,7 +287,7 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     """
     Keep plausible readings with rising stamps; average readings that are less than 0.2 s apart.
 
-    No thermometer is faster than 0.2 s, and the tracker's loop over readings, in Python, is slow.
+    No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
     """
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))

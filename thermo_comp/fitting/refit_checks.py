@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the checks of a chosen model for effects that no column has: a drift after power-on, and slow
-tilts of the supports. The fit is repeated if a check finds such an effect.
+Owns the checks of a chosen model for effects that no column describes: a drift after power-on, and
+slow tilts of the supports. The fit is repeated if a check finds such an effect.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from .windows import CURVE
 
 # Length of a piece of a rest in which a slow tilt of the support is constant [s].
 _PIECE_S = 3600.0
-# Slow tilts are tried if the drifts of left-out positions, averaged over the pieces, exceed six
-# times their white noise and a tenth of the error of the left-out norms: other drifts are small.
-_SLOW_DRIFT, _PART_OF_NORMS = 6.0, 0.1
-# Smallest number of positions whose norms the others determine: with fewer, the gain by slow tilts
-# has no reliable standard error.
+# Slow tilts are tried if the drift of left-out positions, averaged over each piece, exceeds these
+# multiples of the white noise of the average, and of the error of the left-out norms.
+_DRIFT_TO_NOISE, _DRIFT_TO_NORMS = 6.0, 0.1
+# Smallest number of positions with left-out norms: the norms of fewer positions give no reliable
+# standard error of the gain by slow tilts.
 _FEWEST_NORMS = 6
-# Smallest gain of the left-out norms by slow tilts, a log ratio of mean squares: 14 % of an RMS.
+# Smallest log gain of the mean square left-out norm by slow tilts: 14 % of the RMS.
 _TILT_GAIN = 0.3
 SLOW_TILTS = advice(
     'tilt',
@@ -41,8 +41,8 @@ SLOW_TILTS = advice(
 
 def extrapolates(fit: Fit) -> bool:
     """
-    Whether the chosen model leaves more than noise, and its settled bias has a larger expected
-    error than that of a smaller model, see `settled_bias`.
+    Whether the left-out drift of the chosen model exceeds noise, and the expected error of the
+    settled bias is larger than that of a smaller model, see `settled_bias`.
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next((trial for trial in trials if trial.is_chosen), None)
@@ -60,14 +60,14 @@ def extrapolates(fit: Fit) -> bool:
 
 def may_have_slow_tilts(fit: Fit) -> bool:
     """
-    Whether the drifts of left-out positions are not only noise, and are a part of the error of
-    their norms. Slow tilts of a support change the axes across gravity, and hardly the norms.
+    Whether the drifts of left-out positions exceed noise and a tenth of the error of left-out
+    norms. Slow tilts of a support change the axes across gravity, and hardly the norms.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
         return False
     drift, n_windows = _slow_drift(data, score.drift)
-    least = max(_SLOW_DRIFT * score.noise / n_windows**0.5, _PART_OF_NORMS * score.norms.rms)
+    least = max(_DRIFT_TO_NOISE * score.noise / n_windows**0.5, _DRIFT_TO_NORMS * score.norms.rms)
     return bool(drift > least)
 
 
@@ -129,7 +129,7 @@ def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
 def of_whole_rests(
     pieces: Sequence[PositionReport], bags: Sequence[ReducedBag]
 ) -> tuple[PositionReport, ...]:
-    """Join the reports of the pieces of each rest: the mean attitude, and RMS of all pieces."""
+    """Join the reports of the pieces of each rest: mean attitude, and RMS over the pieces."""
     result, left = [], iter(pieces)
     for bag in bags:
         for rest in bag.intervals:

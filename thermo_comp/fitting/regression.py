@@ -4,9 +4,8 @@
 Owns the regression: the posterior of all unknowns under a given prior, by Gauss-Newton.
 
 All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode; the
-inverse of the Hessian is the covariance. The unknowns of each bag are eliminated first, so the
-information of a bag about the unit is one matrix and one vector; their subtraction leaves the bag
-out.
+inverse of the Hessian is the covariance. The unknowns of positions and bags are eliminated first.
+The subtraction of a position's share from the remaining normal equations leaves the position out.
 
 References
 ----------
@@ -25,7 +24,7 @@ from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats, Ints
 from .elimination import Reduced, eliminate, factored_with_prior, inverse_root, solved
-from .equations import Equations, last_result_kept, moved_by, without_inactive
+from .equations import Equations, last_result_kept, with_step, without_inactive
 from .gains import Inactive
 from .layout import Layout
 from .tangent import Normal, Tangent
@@ -68,7 +67,7 @@ class Posterior:
 @dataclass(frozen=True)
 class Point:
     """
-    The equations linearised about a state, and Gauss-Newton's step from it under a prior.
+    The equations linearised about a state, and Gauss-Newton's step from this state under a prior.
 
     grams: products of the base series in each position, shape (n_positions, n_base, n_base)
     """
@@ -81,17 +80,17 @@ class Point:
 
     @property
     def tangent(self) -> Tangent:
-        """The linearised equations."""
+        """The measurement equations, linearised about the state."""
         return self.regression.linearised(self.state, self.layout, self.grams)[0]
 
     @property
     def normal(self) -> Normal:
-        """The normal equations."""
+        """The normal equations of the linearised measurement equations."""
         return self.regression.linearised(self.state, self.layout, self.grams)[1]
 
     @property
     def precision(self) -> Floats:
-        """Inverse prior variances of the unknowns, see `Equations.precision`."""
+        """Inverse prior variances of all unknowns, see `Equations.precision`, shape (n,)."""
         return self.regression.precision(self.prior, self.layout)
 
     @cached_property
@@ -135,9 +134,9 @@ class Point:
     @property
     def _common_variance(self) -> float:
         """Prior variance of the sum over the bags of an initial lag state."""
-        # The prior sd of an initial lag state's mean over the bags is 0.1 of its sd in one bag: a
-        # mean that differs from 0 is an effect of the unit.
-        return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_share
+        # The prior sd of an initial lag state's mean over the bags is 0.1 of the sd in one bag,
+        # because a mean that differs from 0 is an effect of the unit.
+        return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
 
     @cached_property
     def reduced(self) -> Reduced:
@@ -190,7 +189,7 @@ class Point:
         """
         deviation = self.deviation.copy()
         deviation[self.layout.offset[:, axis]] -= 1.0
-        step, _ = self.unit_step(self._reduced(self.normal, deviation).whole)
+        step, _ = self.unit_step(self._reduced(self.normal, deviation).full_matrix)
         return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
@@ -208,9 +207,9 @@ class Point:
             return solved(factor, gradient - precision * deviation), factor
         # In units of the prior's standard deviations the normal equations are well conditioned.
         root = self.prior.informative.root
-        turned = solve_triangular(root, information, trans='T')
-        turned = solve_triangular(root, turned.T, trans='T')
-        factor = factored_with_prior((turned + turned.T) / 2.0, np.ones(n))
+        scaled = solve_triangular(root, information, trans='T')
+        scaled = solve_triangular(root, scaled.T, trans='T')
+        factor = factored_with_prior((scaled + scaled.T) / 2.0, np.ones(n))
         right = solve_triangular(root, gradient, trans='T') - root @ deviation
         return solve_triangular(root, solved(factor, right)), root.T @ factor
 
@@ -220,7 +219,7 @@ class Point:
         return self._solution(self.reduced)
 
     def _solution(self, reduced: Reduced) -> tuple[Floats, Floats]:
-        unit, factor = self.unit_step(reduced.whole)
+        unit, factor = self.unit_step(reduced.full_matrix)
         step = np.empty(self.layout.n)
         step[: self.layout.n_unit] = unit
         step[self.layout.own], step[self.layout.of_bag] = reduced.follow(unit)
@@ -231,9 +230,9 @@ class Point:
         reduced = self._reduced(_damped(self.normal, self.layout), self.deviation)
         return self._solution(reduced)[0]
 
-    def moved(self, step: Floats) -> Point:
-        """Add a step to the state of the regression."""
-        return replace(self, state=moved_by(self.state, step, self.layout))
+    def with_step(self, step: Floats) -> Point:
+        """Return the point at the state plus a step."""
+        return replace(self, state=with_step(self.state, step, self.layout))
 
     def stepped(self) -> Point:
         """
@@ -246,7 +245,7 @@ class Point:
         # The energy before the step is computed first, because the regression keeps only the last
         # linearisation.
         energy, (step, _) = self.energy, self.solution
-        result = self.moved(step)
+        result = self.with_step(step)
         if result.energy <= energy:
             return result
         layout = self.layout
@@ -254,8 +253,8 @@ class Point:
         for places in (layout.kappa, layout.shared, layout.up, layout.stretch, layout.start):
             is_nonlinear[places] = True
         for share in (1.0, 0.25, 0.06, 0.015, 0.004, 0.001):
-            turned = self.moved(np.where(is_nonlinear, share * step, 0.0))
-            result = turned.moved(np.where(is_nonlinear, 0.0, turned.linear_step()))
+            partial = self.with_step(np.where(is_nonlinear, share * step, 0.0))
+            result = partial.with_step(np.where(is_nonlinear, 0.0, partial.linear_step()))
             if result.energy <= energy:
                 break
         return result
@@ -277,7 +276,7 @@ class Point:
             determined[:n] = 1.0 - np.sum(root * (root @ unit_root @ unit_root.T), axis=0)
             of_prior += 2.0 * float(np.log(np.diag(root)).sum())
         if reduced.common is not None:
-            of_prior += layout.start.shape[1] * float(np.log(prior.start_share))
+            of_prior += layout.start.shape[1] * float(np.log(prior.start_variance_ratio))
         log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
         evidence = -0.5 * (end.misfit + end.prior_misfit + log_hessian - of_prior)
         return Posterior(
@@ -291,7 +290,7 @@ class Regression(Equations):
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
         """Return the equations at a state, inactive weights 0, by default with all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
-        grams = self.products(layout.used).whole if grams is None else grams
+        grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)
 
     @last_result_kept
@@ -333,19 +332,19 @@ class Regression(Equations):
             return Inactive(part, column, np.zeros((0, 0)), np.zeros(0))
         base = self.products(layout.used).base
         columns, at = np.unique(column, return_inverse=True)
-        among, beside = self.products_of(columns, base, state)
+        of_columns, with_base = self.products_of(columns, base, state)
         # Derivatives of the reading by a column's contribution to the bias, and to the scale.
         acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
         acts /= sigma
-        rows = point.tangent.of(self.at_starts(beside, state, base))[:, :, at]
+        rows = point.tangent.of(self.at_starts(with_base, state, base))[:, :, at]
         rows *= (acts[part] / sigma).transpose(1, 2, 0)[..., None]
-        gone, cross = point.reduced.beside(rows)
-        sums = np.tensordot(np.einsum('api,bpi->iabp', acts, acts), among, 1)
-        S = -gone.reshape(len(part), 3, len(part), 3)
+        reduction, cross = point.reduced.eliminate_from(rows)
+        sums = np.tensordot(np.einsum('api,bpi->iabp', acts, acts), of_columns, 1)
+        S = -reduction.reshape(len(part), 3, len(part), 3)
         for axis in range(3):
             S[:, axis, :, axis] += sums[axis, part[:, None], part, at[:, None], at]
-        step, factor = point.unit_step(point.reduced.whole)
-        S = S.reshape(gone.shape) - cross[:n].T @ solved(factor, cross[:n])
+        step, factor = point.unit_step(point.reduced.full_matrix)
+        S = S.reshape(reduction.shape) - cross[:n].T @ solved(factor, cross[:n])
         Q = cross[n] - cross[:n].T @ step
         if self.windows.acts_on is not None:
             absent = ~self.windows.acts_on[column].ravel()

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the properties of the rests of a test: whether temperatures and readings change in a rest,
-which attitudes were heated, and to which attitudes the unit was returned.
+Owns the tests of what the rests of a recording show: whether temperatures and readings change in a
+rest, which attitudes were heated, and to which attitudes the unit was returned.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from .windows import LAGS, ThermalWindows
 
 def is_constant(windows: ThermalWindows, part: Ints) -> bool:
     """
-    Whether temperatures change less in the parts, positions or bags, than from part to part;
-    `part`: number of the part of each window, (n,).
+    Whether temperatures change less (RMS) within the parts of the data than from part to part;
+    `part`: number of the part of each window, which is its position or its bag, (n,).
     """
     t = windows.temperature
     within = within_positions(t[:, None], part)[:, 0]
@@ -39,8 +39,8 @@ def _is_heated(windows: ThermalWindows) -> Bools:
     """
     Return the positions that show an effect of temperature, shape (n_positions,): a position whose
     temperature changes by more than a tenth of the span of all temperatures, or whose mean is as
-    far from the median; all positions if there is no such position. Beside a ramp the short rests
-    of a tumble in a room do not count, as their drifts hardly separate bias and scale factor.
+    far from the median; all positions if there is no such position. The short rests of a tumble in
+    a room, recorded with a ramp, do not count: their drifts hardly separate bias and scale factor.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]
@@ -79,9 +79,9 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
-    Return the windows with columns that are constant in steady positions, (n_positions,), and with
-    lags that begin settled in settled positions, (n_positions,). Initial lag states would fit the
-    noise of a rest, as if an attitude that was not heated showed a drift per kelvin.
+    Return the windows with constant columns in the positions `steady`, (n_positions,), and with
+    initial lag states of 0 in the positions `settled`, (n_positions,). Initial lag states would
+    fit the noise of a rest, as if an attitude that was not heated showed a drift per kelvin.
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]

@@ -30,8 +30,8 @@ from .regression import Posterior, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalWindows
 
-#: Large sd of mounting offsets relative to the prior's scale: turn-ons of tactical triads repeat
-#: within 0.3 to 1 mg by data sheets, which is 10 to 20 times the scale of the prior.
+#: Large initial sd of mounting offsets / `Prior.offset_scale`: by data sheets, turn-ons of
+#: tactical triads repeat within 0.3 to 1 mg, which is 10 to 20 times `Prior.offset_scale`.
 LARGE_OFFSETS = 10.0
 
 
@@ -40,12 +40,12 @@ class Trial:
     """
     A model that the selection has fitted.
 
-    groups: its groups of columns, () for a model of constants alone
-    score: its left-out errors
-    posterior: its fit
-    typical: typical prior sd of its columns, shape (2, m)
-    is_chosen: whether it is the chosen model
-    is_near: whether its score is within one standard error of that of the chosen model
+    groups: groups of the model's columns, () for a model of constants alone
+    score: left-out errors of the model
+    posterior: fit of the model
+    typical: typical prior sd of the model's columns, shape (2, m)
+    is_chosen: whether the model is the chosen model
+    is_near: whether the score is within one standard error of that of the chosen model
     """
 
     groups: tuple[str, ...]
@@ -105,7 +105,7 @@ class Fit(NamedTuple):
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
-    """Compare the chosen model with each trial in turn, keep the better, return the last kept."""
+    """Return the model that is left after a comparison with each trial in turn."""
     for trial in trials:
         if is_better(chosen.score, trial.score):
             chosen = trial
@@ -132,8 +132,8 @@ class Growth:
         is_wanted = np.isin(self._names, groups)
         prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
         if self.regression.windows.n_poses:
-            # Large prior sd of the rests would absorb the effect of new columns: begin with
-            # small sd of attitudes and (unless stated) mounting offsets, which the data increase.
+            # Attitudes and offsets of large prior sd would absorb the effect of new columns: begin
+            # with a small sd of attitudes and (unless stated) of mounting offsets.
             prior = replace(prior, pose_sd=0.1 * POSE_SD)
             if prior.offset_scale > 0.0:
                 least = float(min(prior.offset_sd, prior.sigma.mean()))
@@ -170,7 +170,7 @@ class Growth:
             chosen = simplest_of_the_best(chosen, better)
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit a model with further groups, and then the same model with bends."""
+        """Fit a model with further groups, then the same model with bends; return all trials."""
         added = tuple(group for group in groups if group in self.free)
         smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
@@ -235,9 +235,9 @@ class Growth:
         state = posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
-            # Attitudes and offsets of rests in a pose absorb errors of the model: add both.
-            turned = regression.gravity * state.from_pose
-            square += float(np.mean(state.offset**2) + np.mean(turned**2))
+            # Attitudes and offsets of rests in a pose absorb errors of the model: add their power.
+            by_attitude = regression.gravity * state.from_pose
+            square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
         slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
         units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
         new = np.minimum(slope * units * kelvins, most)
@@ -286,7 +286,7 @@ def select(
     constants = first = better_start(fits)
     trials = [constants]
     if CURVE in growth.free:
-        # The curve is added without a test: it may improve the score only with other groups.
+        # The curve is added without a test, as it may improve the score only with other groups.
         if regression.windows.has_drifts:
             curve = better_start([growth.extended(fit, (CURVE,)) for fit in fits])
             downweigh(regression, curve.posterior)
@@ -340,7 +340,7 @@ def _grown(
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, with its final score, and models within one standard error of it."""
+    """Mark the chosen model, with the final score, and models within one standard error."""
     marked = []
     for trial in trials:
         is_chosen = trial.groups == chosen.groups
@@ -381,8 +381,8 @@ def finish(
     regression: Regression, chosen: Trial, candidates: Candidates
 ) -> tuple[Posterior, Score]:
     """
-    Complete the chosen model: weights of outliers, columns with too little gain, mounting offsets,
-    slow noise.
+    Complete the chosen model: reduce the weights of outliers, drop columns of little gain, try
+    large mounting offsets, and slow noise.
 
     Slow noise also absorbs thermal effects that the model lacks, so it is kept only if it does not
     worsen the correction of left-out data.

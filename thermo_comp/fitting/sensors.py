@@ -3,8 +3,8 @@
 """
 Owns the estimation of thermometer and detector settings from bags, and the bags' thermal states.
 
-Rates are central differences over two minutes, which are not causal and need a recording. The
-settings of causal thermometers and detector are the noise, lag and ramps of the recorded test.
+Rates are central differences over two minutes, which are not causal and need a recording. Noise,
+lag and ramps of the recorded test become settings of the causal thermometers and the detector.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 @dataclass(frozen=True)
 class RateHistory:
-    """One thermometer's rate over one bag, on a grid of ten seconds, and its noise [K/s]."""
+    """Rate of one thermometer over one bag, on a grid of ten seconds, and the rate's sd [K/s]."""
 
     rate: Floats
     rate_sd: float
 
     @property
     def is_resting(self) -> Bools:
-        """Grid points that have no ramp within five minutes before and after."""
+        """Whether each grid point has no ramp within five minutes before and after."""
         moving = np.abs(self.rate) > max(0.2 * self.fastest, self.least_ramp)
         return np.asarray(np.convolve(moving, np.ones(61))[30:-30] < 0.5)
 
@@ -105,7 +105,7 @@ def learn_thermometer(
 
 
 def quantum_of(values: Floats) -> float:
-    """Find the quantum of a sensor's readings, shape (n,) [K]; 0 if they are not rounded."""
+    """Return the quantum [K] of a sensor's readings, shape (n,); 0 for readings not rounded."""
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -166,7 +166,7 @@ def _rate_histories(
         n_bins = int(time[-1] / _BIN_S)
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a bin is the difference of the integral at its edges / its length.
+        # The mean over a minute is the change of the integral / the length of the minute.
         integral = cumulative_trapezoid(readings.value, time, initial=0)
         edges = np.interp(np.arange(n_bins + 1) * _BIN_S, time, integral)
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side
@@ -234,7 +234,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 
 
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
-    """Remove thermometers that repeat the board's readings in every bag; return their names."""
+    """Return the bags without copies of the board's thermometer, and the names of the copies."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
     is_read = any(len(bag.board.value) for bag in bags)
     copies = [

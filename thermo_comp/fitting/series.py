@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the base series of the windows, and their products whitened for a noise model.
+Owns the base series of the windows (1, columns, their derivatives, readings), the filter that
+whitens them for slow noise, and the sums of their products.
 
-All terms of the measurement equation (`equations`) are linear combinations of a few base series,
-so the products of the whitened base series of each position and section are sufficient statistics.
+All terms of the measurement equation (`equations`) are linear combinations of the base series, so
+the sums of the products of whitened base series in each position are sufficient statistics.
 
 The noise is white plus exponentially correlated (first-order Gauss-Markov). Within a position the
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
@@ -62,8 +63,8 @@ class Whitener:
             time_s *= 10.0**0.5
         #: The correlation time after the longest candidate, up to which a search may go [s].
         self._longest_s = time_s
-        #: Number of processes of flicker noise, so many that the longest correlation time exceeds
-        #: the length of a position.
+        #: Number of processes of flicker noise: the longest correlation time, from 3 windows on in
+        #: factors of ten, is at least the length of a position.
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
     def shows(self, time_s: float) -> bool:
@@ -79,8 +80,8 @@ class Whitener:
         """
         Run the Kalman filter over series, shape (n, m), for k noises of equally many processes.
 
-        Yields for each step: window of each position, whether the position has one, innovations,
-        shape (k, n_positions, m), and their variances [sigma^2], shape (k, n_positions).
+        Yields for each step: window of each position, whether the position has such a window,
+        innovations, (k, n_positions, m), and their variances [sigma^2], (k, n_positions).
         """
         times_s = np.array([[noise.times_s] for noise in noises])
         # Stationary covariance of the processes, which are independent of each other.
@@ -151,7 +152,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the place of the minimum of the parabola through three values at -1, 0 and 1."""
+    """Return where the parabola through `values[at - 1 : at + 2]` is smallest, from -1 to 1."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -166,14 +167,14 @@ class Base:
     derivative by the lag's initial state; t of the nonlinear terms; the temperatures of a support
     (`Windows.tilt`); the measured values of the three axes less their mean in the position.
 
-    columns: the active columns; moved: places in `columns` of the columns with a lag
-    lag: number of the lag of each column in `moved`
+    columns: the active columns; lagged: indices in `columns` of the columns with a lag
+    lag: number of the lag of each column in `lagged`
     at_start, t, tilts, measured: places of the derivatives by the initial lag states, of t for the
         nonlinear terms, shape (1,) or (0,), of a support's temperatures, of the measured values
     """
 
     columns: Ints
-    moved: Ints
+    lagged: Ints
     lag: Ints
     at_start: Ints
     t: Ints
@@ -183,10 +184,10 @@ class Base:
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
         """Assign places to the series, given the number of the lag of each column, -1 for none."""
-        moved = np.flatnonzero(lags[columns] >= 0)
-        counts = 1 + len(columns), len(moved), n_t, n_tilts, 3
+        lagged = np.flatnonzero(lags[columns] >= 0)
+        counts = 1 + len(columns), len(lagged), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-        return cls(columns, moved, lags[columns[moved]], *places)
+        return cls(columns, lagged, lags[columns[lagged]], *places)
 
     @property
     def size(self) -> int:
@@ -212,16 +213,16 @@ class Products:
     section: Ints
 
     @cached_property
-    def whole(self) -> Floats:
+    def of_positions(self) -> Floats:
         """Products of each position, shape (n_positions, n_base, n_base)."""
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
         """Products of each position without some sections, (n_positions, n_base, n_base)."""
-        result: Floats = self.whole.copy()
-        gone = np.flatnonzero(np.isin(self.section, sections))
-        position = np.searchsorted(self.first, gone, side='right') - 1
-        np.subtract.at(result, position, self.cells[gone])
+        result: Floats = self.of_positions.copy()
+        left_out = np.flatnonzero(np.isin(self.section, sections))
+        position = np.searchsorted(self.first, left_out, side='right') - 1
+        np.subtract.at(result, position, self.cells[left_out])
         return result
 
 
@@ -311,7 +312,7 @@ class Series:
 
     def of(self, base: Base) -> Floats:
         """Return the base series in the order of `base`, shape (n, n_base)."""
-        at_start = self._starts[:, base.columns[base.moved]]
+        at_start = self._starts[:, base.columns[base.lagged]]
         return np.hstack((self._ones, self.columns[:, base.columns], at_start, self._others))
 
     def starts(self, state: State, base: Base) -> Floats:
@@ -320,13 +321,15 @@ class Series:
 
     def at_starts(self, rows: Floats, state: State, base: Base) -> Floats:
         """
-        Convert linear functions of the base series, shape (n_positions, k, n_base), from columns
-        at the prior mean of the initial lag states to columns at the lag states of `state`.
+        Convert linear functions of the base series, (n_positions, k, n_base), from columns at the
+        prior mean of the initial lag states to columns at the initial lag states of `state`.
         """
-        if not len(base.moved):
+        if not len(base.lagged):
             return rows
         result: Floats = rows.copy()
-        result[..., 1 + base.moved] += self.starts(state, base)[:, None] * rows[..., base.at_start]
+        result[..., 1 + base.lagged] += (
+            self.starts(state, base)[:, None] * rows[..., base.at_start]
+        )
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:

@@ -14,35 +14,34 @@ import numpy as np
 from ..typing import Floats
 from .regression import Posterior, Regression
 
-# Number of windows that are sufficient for the mean sd of the bias.
-_N_SEEN = 500
+# Number of windows that are sufficient for the mean sd of the bias in the windows.
+_N_WINDOWS = 500
 
 
 def settled_error(
     regression: Regression, posterior: Posterior, excess: float, settled: Floats
 ) -> float:
     """
-    Return the expected error of the settled bias [m/s^2]; it is infinite for a model without a
-    curve.
+    Return the expected error of the settled bias [m/s^2]; infinite for a model without a curve.
 
-    The error is the sd of the settled bias, and the left-out drift beyond the noise, `excess`
-    [m/s^2], enlarged as the sd of the settled bias exceeds that in the windows. `settled`: columns
-    at settled temperatures, shape (k, m).
+    The error is the root sum of squares of the sd of the settled bias, and of the left-out drift
+    beyond the noise, `excess` [m/s^2], times the ratio of that sd to the sd in the windows, at
+    least 1. `settled`: columns at settled temperatures, shape (k, m).
     """
     if not posterior.layout.used[0].any():
         return np.inf
-    seen = regression.columns[:: max(len(regression.columns) // _N_SEEN, 1)]
+    seen = regression.columns[:: max(len(regression.columns) // _N_WINDOWS, 1)]
     sd, seen_sd = (
         _sd_of_changes(posterior, columns - columns.mean(axis=0))
         for columns in (settled / regression.rms, seen)
     )
-    # The columns are constant in the windows if the temperature hardly changes.
+    # `seen_sd` is 0 if the temperature, and with it every column, is constant in the windows.
     growth = max(sd / seen_sd, 1.0) if seen_sd else 1.0
     return float(np.hypot(sd, excess * growth))
 
 
 def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
-    """RMS sd of the bias of three axes for columns, shape (k, m) [m/s^2]."""
+    """Return the RMS sd of the bias [m/s^2] of three axes by columns, shape (k, m)."""
     parts = posterior.layout.by_weights(columns, np.zeros(3))
     square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
     return float(np.sqrt(square / (3 * len(columns))))

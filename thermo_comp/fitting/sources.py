@@ -3,7 +3,7 @@
 """
 Owns the input of a fit: sources of blocks of accelerometer samples and temperature readings.
 
-Bags, tables and simulated runs provide the same blocks to the fit and to the compensator.
+Bags, tables and simulated runs all give blocks of the same type, for the fit and the compensator.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .known_force import USUAL_FORCE, ForceOptions, KnownForce, known_force
 
 
 def angular_velocity(block: object) -> Floats | None:
-    """Return the angular rate of a block of Imu messages, or None for other blocks."""
+    """Return the angular rate [rad/s] of a block of Imu messages; None for none, or zeros only."""
     imu = getattr(block, 'imu', None)
     if imu is None or (imu.angular_velocity_covariance[:, 0] == -1.0).any():
         return None

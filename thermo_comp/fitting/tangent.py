@@ -70,7 +70,7 @@ class Tangent:
         Return the normal equations, given the products of the base series at the state, shape
         (n_positions, n_base, n_base).
         """
-        first, turned = self.n_local, products[:, None] @ self.combined
+        first, with_combined = self.n_local, products[:, None] @ self.combined
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)
         scale = slice(bias.stop, bias.stop + self.n_scale)
@@ -84,22 +84,22 @@ class Tangent:
             unit[:, rows, columns] = block
             unit[:, columns, rows] = np.swapaxes(block, 1, 2)
         others = np.array([0, *range(scale.stop, n)])
-        rows_of = self._rows(np.append(np.arange(first), first + others), products, turned)
+        rows_of = self._rows(np.append(np.arange(first), first + others), products, with_combined)
         of_others = rows_of[:, :, first:, first:].sum(axis=0)
         unit[:, others] = of_others
         unit[:, :, others] = np.swapaxes(of_others, 1, 2)
         return Normal(rows_of[:, :, :first], unit)
 
-    def _rows(self, unknowns: Ints, products: Floats, turned: Floats) -> Floats:
+    def _rows(self, unknowns: Ints, products: Floats, with_combined: Floats) -> Floats:
         """Return the normal equations of some unknowns, (n_positions, 3, m, k + 1)."""
         n, series = products.shape[-1], self.place[unknowns]
         base, combined = np.flatnonzero(series < n), np.flatnonzero(series >= n)
-        by_series = np.empty((*turned.shape[:2], len(series), n + turned.shape[-1]))
+        by_series = np.empty((*with_combined.shape[:2], len(series), n + with_combined.shape[-1]))
         of_combined = self.combined[..., series[combined] - n]
         by_series[:, :, base, :n] = products[:, None, series[base]]
-        by_series[:, :, base, n:] = turned[:, :, series[base]]
-        by_series[:, :, combined, :n] = np.swapaxes(turned[..., series[combined] - n], 2, 3)
-        by_series[:, :, combined, n:] = np.swapaxes(of_combined, 2, 3) @ turned
+        by_series[:, :, base, n:] = with_combined[:, :, series[base]]
+        by_series[:, :, combined, :n] = np.swapaxes(with_combined[..., series[combined] - n], 2, 3)
+        by_series[:, :, combined, n:] = np.swapaxes(of_combined, 2, 3) @ with_combined
         result = by_series.take(self.place, axis=3)
         result *= self.factor[:, :, unknowns, None]
         result *= self.factor[:, :, None]

@@ -41,7 +41,7 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 
 def temperature_range(windows: ThermalWindows) -> Range:
-    """Return the valid range of board temperatures."""
+    """Return the valid range of board temperatures [degC]."""
     # The calibration of a test at one temperature is valid within 0.5 K, or within 50 K without a
     # thermometer, because then the covariance of the slope covers the unknown curve.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
@@ -49,8 +49,8 @@ def temperature_range(windows: ThermalWindows) -> Range:
 
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
-    Return the first sensor's gradient in soaks and its robust scatter [K], from a prior
-    calibration if it has them, or None without the sensor or a soak.
+    Return the first sensor's gradient in soaks and the gradient's robust scatter [K], from a prior
+    calibration that states both, or None without the sensor or a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
@@ -87,7 +87,7 @@ def rest_gradient_range(
 
 def measured_board_lag(windows: ThermalWindows) -> float:
     """
-    Return the lag of the board behind the case [s], negative if the board leads, NaN without ramps
+    Return the lag of the board behind the case [s], negative if the board leads; NaN without ramps
     or without a case temperature.
     """
     return _slope_of_gradient(windows) if _has_gradients(windows) else np.nan
@@ -100,7 +100,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s], or the usual lag if it was not measured."""
+    """Return the lag of the board behind the case [s], or `USUAL_BOARD_LAG_S` if implausible."""
     lag = _slope_of_gradient(windows)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 

@@ -41,7 +41,7 @@ class Windows:
     The data of a fit: windows sorted by position and time, with every column of the table.
 
     position, bag: position and bag of each window, from 0; a position lies in one bag, shape (n,)
-    section: number of the program section, from 0, rising with time in each bag, shape (n,)
+    section: number of the program section, from 0, rising with time in a position, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: number of samples divided by that of a typical window, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
@@ -61,7 +61,7 @@ class Windows:
     acts_on: axes that each column acts on, shape (m, 3); None for all
     pose: number of the pose to which the unit was returned in each position, -1 for none, shape
         (n_positions,), or None if the unit was not returned
-    has_prior: whether a prior calibration states the unit's parameters
+    has_prior: whether the prior is a calibration
     board: temperature of the board [degC] and the variance of its estimate [K^2], shape (n, 2), or
         None if unknown
     board_noise: sd of the noise of a reading of the board's thermometer [K]
@@ -111,7 +111,7 @@ class Windows:
 
     @property
     def parts(self) -> Bools:
-        """Masks of the columns that may act on the bias and on the scale, shape (2, m)."""
+        """Whether each column may act on the bias and on the scale, shape (2, m)."""
         return np.stack((np.ones_like(self.in_scale), self.in_scale))
 
     @cached_property
@@ -145,15 +145,15 @@ class Windows:
 
     @property
     def n_turn_ons(self) -> int:
-        """Number of turn-ons."""
+        """Number of turn-ons, one for each bag."""
         return len(np.unique(self.bag))
 
     @cached_property
     def has_turn_ons(self) -> bool:
         """
-        Whether there are several turn-ons, or a prior calibration, and at least two mountings in
-        each turn-on on average. Fewer mountings do not show which part of their offsets a turn-on
-        shares; the offset of a single turn-on is part of the bias, unless a prior states the bias.
+        Whether turn-on offsets are unknowns: several turn-ons, or a prior calibration, and at
+        least two mountings per turn-on on average. Fewer mountings do not separate both kinds of
+        offsets; without a prior the offset of a single turn-on is part of the bias.
         """
         least = 1 if self.has_prior else 2
         return least <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
@@ -221,11 +221,11 @@ class Prior:
     """
     Standard deviations of the prior of the unknowns, and the noises of the windows.
 
-    bias_sd: sd of the bias [m/s^2], shape (3,); its mean is 0
+    bias_sd: sd of the bias [m/s^2], about a mean of 0, shape (3,)
     scale_mean, scale_sd: mean of the scale ratio kappa of each axis, shape (3,), and its sd
     misalignment_sd: sd of the elements of M [rad]
-    column_sd: sd of the weights of each column in units of its RMS, in the bias [m/s^2] and in the
-        scale (relative); 0 for an inactive column, shape (2, m)
+    column_sd: sd of the weights of the columns, each divided by its RMS, in the bias [m/s^2] and
+        in the scale (relative); 0 for an inactive column, shape (2, m)
     offset_sd: sd of the bias offset of each position and axis by mounting and turn-on [m/s^2]
     turn_on_sd: sd of the bias offset that all positions of a bag share, by its turn-on [m/s^2]
     sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
@@ -239,7 +239,7 @@ class Prior:
     tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
     pose_sd: sd of the attitude of a position about its pose [rad]; the prior of other attitudes is
         flat
-    start_share: variance of the initial lag states / their variance in the node's prior
+    start_variance_ratio: variance of the initial lag states / their variance in the node's prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive coefficient, shape (2 k,)
     informative: prior that replaces all sd of the unit's parameters; with an informative prior
@@ -261,7 +261,7 @@ class Prior:
     tilt_sd: float = 1e-7
     least_sigma: float = 1e-7
     pose_sd: float = POSE_SD
-    start_share: float = 1.0
+    start_variance_ratio: float = 1.0
     nonlinear_sd: Floats = field(default_factory=lambda: np.zeros(0))
     informative: InformativePrior | None = None
 
@@ -272,8 +272,9 @@ class State:
     The unknowns of the regression.
 
     kappa, bias: scale ratio and bias [m/s^2], shape (3,)
-    weights: weights of the columns in bias and scale, in units of their RMS, shape (2, 3, m)
-    misalignment: elements of the inverse of M, shape (3,)
+    weights: weights of the columns, each divided by its RMS, in the bias [m/s^2] and in the scale
+        (relative), shape (2, 3, m)
+    misalignment: elements of the inverse of M below the diagonal, shape (3,)
     up: attitude of each position, shape (n_positions, 3)
     offset: bias offset of each position [m/s^2], shape (n_positions, 3)
     tilt: tilts of the support along the attitude's tangents, shape (n_positions, k, 2)
@@ -303,14 +304,14 @@ class State:
 
     @cached_property
     def inverse(self) -> Floats:
-        """The inverse of M."""
+        """The inverse of the misalignment matrix M, shape (3, 3)."""
         return inverse_misalignment(self.misalignment)
 
     @cached_property
     def tangents(self) -> Floats:
         """
-        Two vectors perpendicular to each attitude, shape (n, 3, 2). The vectors of an attitude in
-        a pose are the pose's tangents, projected: equal steps turn pose and attitudes alike.
+        Two vectors perpendicular to each attitude, shape (n, 3, 2). The tangents of an attitude in
+        a pose are those of the pose, projected perpendicular to the attitude.
         """
         result = tangent_basis(self.up)
         if self.pose.size:
@@ -348,7 +349,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def inverse_misalignment(misalignment: Floats) -> Floats:
-    """Return A = M^-1: from the frame to the sensitivity axes, lower triangular, unit diagonal."""
+    """Return A = M^-1, from output frame to sensitivity axes: lower triangular, diagonal of 1."""
     matrix = np.eye(3)
     matrix[1, 0], matrix[2, 0], matrix[2, 1] = misalignment
     return matrix

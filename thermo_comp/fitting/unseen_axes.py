@@ -22,12 +22,12 @@ from .selection import Fit
 from .thermal_ranges import Range, union
 from .windows import CURVE, PART
 
-#: Least share of gravity along an axis in a position that determines the axis' scale factor. At a
-#: half, the error of |f| is a quarter of the scale factor's error.
-LEAST_SHARE = 0.5
+#: Smallest share of gravity along an axis in a position that determines the axis' scale factor. At
+#: a half, the error of |f| is a quarter of the scale factor's error.
+LEAST_GRAVITY_SHARE = 0.5
 #: Share of the temperature range of an axis by which its scale curve continues without error. The
 #: ranges of the positions of one test differ by about this share.
-FREE_SHARE = 0.1
+FREE_RANGE_SHARE = 0.1
 #: Extrapolation of a scale factor above which a position is advised [K].
 LEAST_KELVINS = 2.0
 
@@ -45,7 +45,7 @@ def with_unseen_axes(
     (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, known)
-    # The variance is linear between the temperatures, and five of them follow the square.
+    # The variance is interpolated linearly; five temperatures approximate the square.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)
@@ -97,7 +97,7 @@ def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
     temperature, as its covariance is that of the fit's prior.
     """
     lower, upper = _seen(fit, known)
-    reach = FREE_SHARE * (upper - lower)
+    reach = FREE_RANGE_SHARE * (upper - lower)
     is_seen = lower <= upper
     return np.where(is_seen, (lower - reach, upper + reach), [[-np.inf], [np.inf]])
 
@@ -108,7 +108,7 @@ def _seen(fit: Fit, known: Calibration | None) -> Floats:
     axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) for none.
     """
     temperature = fit.windows.temperature[:, np.newaxis]
-    is_along = np.abs(fit.posterior.state.up) >= LEAST_SHARE
+    is_along = np.abs(fit.posterior.state.up) >= LEAST_GRAVITY_SHARE
     is_seen = is_along[fit.windows.data.position]
     lower = np.where(is_seen, temperature, np.inf).min(axis=0)
     upper = np.where(is_seen, temperature, -np.inf).max(axis=0)

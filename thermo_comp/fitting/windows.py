@@ -39,7 +39,7 @@ PART_SUMS = ('board', 'product', 'square')
 #: Groups of columns linear in a difference of temperatures; groups of the products of such a
 #: difference with temperature, and of its squares.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
-#: Smallest number of windows of a short rest: fewer windows do not determine the rest's noise.
+#: Smallest number of windows of a rest: fewer windows do not determine the rest's noise.
 FEWEST_WINDOWS = 20
 # Number of temperatures at which the settled columns are evaluated.
 _N_SETTLED = 9
@@ -74,13 +74,13 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of both sets' curves; the sum of two curves has the family of higher order."""
+        """Families of static and dynamic curve; the family of a sum is that of higher order."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """Group of each column of the model."""
+        """Group of each column of the static and the dynamic set."""
         return (CURVE,) * self.static.n_free + (SET,) * (1 + self.dynamic.n_free)
 
     @property
@@ -188,7 +188,7 @@ class ThermalWindows:
 
 class _Rows(NamedTuple):
     """
-    The windows of a rest, or of all rests.
+    The windows of one rest or of all rests, as columns of a table.
 
     thermal: board temperature [degC], its rate [K/s], weight of the dynamic set, gradient [K], and
         the columns of the response without powers of t, as in `ThermalWindows`, shape (n, 4 + k)
@@ -282,7 +282,7 @@ def _rows(
     slopes = table.slopes(states)[0] * factors
     for k, column in enumerate(table.columns):
         if isinstance(lag := column.source, Lag):
-            by_start[k] = slopes[k] * lag.start_share(time - begin_s, np.exp)
+            by_start[k] = slopes[k] * lag.remaining_share(time - begin_s, np.exp)
     rate = interval.angular_rate if has_rate else None
     mean = partial(block_means, weight=count, first=first)
     return _Rows(
@@ -299,7 +299,7 @@ def _rows(
 def _windows(
     model: Model, spec: MemorySpec, rows: _Rows, position: Ints, bag: Ints, table: ColumnTable
 ) -> Windows:
-    """Make the data of the regression from windows of all rests."""
+    """Make the data of the regression from the windows of all rests."""
     curves = model.part_curves
     groups, columns, acts_on = model.sets.groups, model.columns, model.acts_on
     if acts_on is not None:
@@ -384,7 +384,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The level of the dynamic set is an effect of ramps: it corresponds to the RMS gradient [K].
+    # The level of the dynamic set is an effect of ramps, equivalent to the RMS gradient [K].
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)

@@ -30,7 +30,7 @@ from .judgement import Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 
 # Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
-_NOISES = 4.0
+_LARGEST_NOISE_RATIO = 4.0
 # Smallest sd of the noise of a sample whose axis is never constant in a rest [counts].
 _DEAD_NOISE = 0.5
 # Smallest significant change of a constant between calibrations, in standard deviations.
@@ -56,8 +56,7 @@ def open_bags(
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
-    Read bags for windows of `window_s`, with the topics and limits of the first calibration, if
-    any.
+    Read bags for windows of `window_s`, with topics and limits of the first calibration, if any.
 
     Raises RecordingError if a bag cannot be read, or lacks a board temperature that is needed.
     """
@@ -67,7 +66,7 @@ def open_bags(
         unit, require = calibrations[0].unit, needed_roles(*calibrations)
         topics = topics_for(calibrations[0], topics)
         density = max(calibrations[0].noise_density_m_s2_sqrt_hz) / STANDARD_GRAVITY
-        noise = _NOISES / np.sqrt(unit.cycle_time_s) * density
+        noise = _LARGEST_NOISE_RATIO / np.sqrt(unit.cycle_time_s) * density
         known = {'full_scale': unit.full_scale, 'still_sd': max(STILL_SD, noise)}
     bags: list[ReducedBag] = []
     for path in paths:
@@ -136,8 +135,8 @@ def evaluate(
     """
     Judge calibrations of a unit, given with their names, on recordings of the unit.
 
-    Local gravity and topics default to those of the first calibration; `tolerance` is the largest
-    accepted RMS of ``|f| - g`` [m/s^2]; for `serial` see `replay.check_unit`; `force`: the user's
+    Gravity [m/s^2] and topics default to those of the first calibration; `tolerance`: largest
+    accepted RMS of ``|f| - g`` [m/s^2]; `serial`: see `replay.check_unit`; `force`: the user's
     options about rests at which |f| is not g.
 
     Raises RecordingError if a recording cannot be read, or none has a window at rest, and
@@ -200,9 +199,7 @@ class Drift:
 
     @property
     def is_sure(self) -> bool:
-        """
-        Whether the change of a constant is significant given the uncertainty of both calibrations.
-        """
+        """Whether the change exceeds three standard deviations (`sd`)."""
         return abs(self.change) > _SIGNIFICANT_SDS * self.sd
 
 

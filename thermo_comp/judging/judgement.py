@@ -26,8 +26,8 @@ _WIDE_CLAIM = 1e3 * MICRO_G
 _SIGNIFICANT_SDS = 3.0
 # Smallest sd assumed for a misalignment [rad]; smallest relative sd of a position's mean |f|, and
 # smallest claimed sd of a window [m/s^2].
-_SMALLEST_MISALIGNMENT_SD, _SMALLEST_MISS = 1e-5, 1e-8
-# Number of consecutive windows that count as one, since thermal residuals are correlated.
+_SMALLEST_MISALIGNMENT_SD, _SMALLEST_NORM_SD = 1e-5, 1e-8
+# Number of consecutive windows that count as one observation: thermal residuals are correlated.
 _CORRELATED_WINDOWS = 6.0
 
 
@@ -47,9 +47,9 @@ class Judgement:
     The judgement of a calibration on recordings: the verdict, and a sentence with its numbers.
 
     `left_out_rms` is the fit's RMS on positions left out, NaN if the bags are not those of the
-    fit; `tolerance` is the user's limit [m/s^2]. `shifts` are those of bias and scale per axis,
-    empty with fewer than six distinct positions; `moved` lists the significant shifts. For
-    `axis_rms` see `rms_by_axis`. A gyroscope is judged separately.
+    fit; `tolerance` is the user's limit on the RMS [m/s^2]. `shifts`: shift of bias and scale of
+    each axis, empty with fewer than six distinct positions; `moved`: text of each significant
+    shift; `axis_rms`: see `rms_by_axis`; `rate`: judgement of the gyroscope.
     """
 
     kind: Verdict
@@ -78,9 +78,7 @@ class Judgement:
 
     @property
     def headline_rms(self) -> float:
-        """
-        RMS error expected in a new attitude: of positions left out, or of bags outside the fit.
-        """
+        """RMS error: of positions left out if the fit has them, else of windows in the ranges."""
         in_sample = self.sections['all'].rms
         return self.left_out_rms if np.isfinite(self.left_out_rms) else in_sample
 
@@ -200,7 +198,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
         )
     else:
         parts.append(
-            'the calibration states no uncertainty: give the largest RMS with --tolerance'
+            'the calibration states no uncertainty: give the largest accepted RMS with --tolerance'
         )
     if kind is Verdict.SWAPPED:
         parts.insert(0, SWAPPED)
@@ -237,15 +235,17 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
         return ()
     gravity = windows.gravity
     # Windows with a large claimed sd, as while the lags are unknown, have a small weight.
-    weight = 1.0 / np.maximum(windows.claimed_sd, _SMALLEST_MISS) ** 2
-    known = means_by(windows.position, weight)
-    force = means_by(windows.position, windows.force * weight[:, None]) / known[:, None] / gravity
+    weight = 1.0 / np.maximum(windows.claimed_sd, _SMALLEST_NORM_SD) ** 2
+    precision = means_by(windows.position, weight)
+    force = (
+        means_by(windows.position, windows.force * weight[:, None]) / precision[:, None] / gravity
+    )
     residual = windows.residual
     scatter = means_by(windows.position, residual**2) - means_by(windows.position, residual) ** 2
     count = np.unique(windows.position, return_counts=True)[1]
-    variance = 1.0 / known + scatter / np.maximum(count / _CORRELATED_WINDOWS, 1.0)
-    sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_MISS)
-    # The equations of the norms, and of the misalignment's prior, are linear in the small shifts.
+    variance = 1.0 / precision + scatter / np.maximum(count / _CORRELATED_WINDOWS, 1.0)
+    sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)) / gravity, _SMALLEST_NORM_SD)
+    # The norms and the prior of the misalignment give linear equations of the small shifts.
     sizes = np.linalg.norm(force, axis=1)
     rows = norm_columns(force / sizes[:, None]) / sd[:, None]
     rows = np.vstack(
@@ -277,7 +277,7 @@ def change_texts(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
 
 
 def rms_by_axis(windows: Windows) -> Floats:
-    """Return the RMS of each axis about its position's mean, static and dynamic, shape (2, 3)."""
+    """Return the RMS force of each axis about position means, static and dynamic, (2, 3)."""
     about = within_positions(windows.force, windows.position)
     return np.array(
         [

@@ -22,9 +22,9 @@ LARGEST_RATIO = 2.0
 #: Ratio of claimed RMS to raw RMS above which a valid calibration is called wide.
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
-_FEWEST = 6
-# Largest ratio of successive values of |f|, in rising order, that belong to one level of |f|.
-_NEXT_LEVEL = 1.02
+_FEWEST_WINDOWS = 6
+# Largest ratio of a |f| to the next smaller |f| of the windows, for both to be one level of |f|.
+_LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
 
@@ -52,9 +52,8 @@ class Section:
     Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or changes of the angular rate
     [rad/s].
 
-    `raw` values use the constants at the reference temperature, other values the whole
-    calibration; `claimed_rms` is the RMS of the claimed sd of the same windows, NaN without a
-    claim.
+    `raw` values are corrected with the constants at the reference temperature alone, other values
+    with the whole calibration; `claimed_rms`: RMS of the claimed sd of the windows, or NaN.
     """
 
     n: int
@@ -78,8 +77,8 @@ class Sections(dict[str, Section]):
 
     @property
     def regimes(self) -> list[Section]:
-        """Sections of the regimes that have at least `_FEWEST` windows."""
-        return [part for part in (self['static'], self['dynamic']) if part.n >= _FEWEST]
+        """Sections of the regimes that have at least `_FEWEST_WINDOWS` windows."""
+        return [part for part in (self['static'], self['dynamic']) if part.n >= _FEWEST_WINDOWS]
 
     @property
     def worst_ratio(self) -> float:
@@ -106,7 +105,7 @@ def by_force(windows: Windows, claimed: Floats) -> dict[float, Section]:
     if windows.is_usual.all():
         return {}
     order = np.argsort(windows.size, kind='stable')
-    steps = np.flatnonzero(windows.size[order][1:] > _NEXT_LEVEL * windows.size[order][:-1]) + 1
+    steps = np.flatnonzero(windows.size[order][1:] > _LEVEL_RATIO * windows.size[order][:-1]) + 1
     values = windows.raw_residual, windows.residual, claimed
     levels = np.split(order, steps)
     return {float(windows.size[rows].mean()): _section(*values, rows) for rows in levels}
@@ -144,17 +143,17 @@ class RateJudgement:
 
 def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | None:
     """
-    Judge a gyroscope by the windows of bags, or return None without gyroscope or angular rate.
+    Judge a gyroscope by windows at rest; return None without a gyroscope or angular rates.
 
-    At rest a gyroscope reads the Earth's rate and its turn-on bias, both unknown, so the changes
-    from the mean of each rest are judged, against the sd claimed for the changes.
+    At rest a gyroscope reads the unknown sum of Earth's rate and turn-on bias, so the changes from
+    the mean of each rest are judged, against the sd claimed for the changes.
     """
     windows = windows.select(np.asarray(np.isfinite(windows.gyro[:, :6]).all(axis=1)))
     if not windows.gyro.size:
         return None
     raw, corrected, variance = (windows.gyro[:, k : k + 3] for k in (0, 3, 6))
-    # The rate in windows outside the calibrated ranges is compared with the mean of the windows
-    # inside, if there are any.
+    # The rate of a window is compared with the mean over the rest's windows that are inside the
+    # calibrated ranges, or over all windows of the rest if none is inside.
     _, place = np.unique(windows.position, return_inverse=True)
     has_inside = np.bincount(place, windows.is_inside) > 0.0
     weight = np.where(has_inside[place], windows.is_inside, 1.0)
@@ -192,7 +191,7 @@ def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict
     total, outside = sections['all'], sections['outside']
     if not total.n:
         return Verdict.OUTSIDE, f'{counted(outside.n, "window")} of {window_s:g} s, all outside'
-    text = f'{_mdeg(total.rms)} RMS of its changes at rest, {_mdeg(total.raw_rms)} raw'
+    text = f'{_mdeg(total.rms)} RMS of changes at rest, {_mdeg(total.raw_rms)} raw'
     over = f'over {counted(total.n, "window")} of {window_s:g} s'
     if not claims:
         kind = Verdict.NO_BETTER if total.rms > total.raw_rms else Verdict.NO_CLAIM

@@ -32,8 +32,8 @@ from ..unit.nonlinearity import AT_REST
 WINDOW_S = 60.0
 # Distance outside a calibrated range that noise can explain, so that a window counts as inside
 # [half ranges].
-_EDGE = 0.02
-# Fewest samples in a partial sum that is used, relative to the median over all partial sums.
+_RANGE_TOLERANCE = 0.02
+# Smallest number of samples of a used partial sum / median over all partial sums.
 _LEAST_FILLED = 0.9
 
 
@@ -84,12 +84,12 @@ class Windows:
 
     @cached_property
     def raw_residual(self) -> Floats:
-        """|f| by the constants at reference temperature, less the known |f| or g, shape (n,)."""
+        """|f| by the constants at the reference temperature, less `size`, (n,) [m/s^2]."""
         return norm_residual(self.raw, self.size)
 
     @cached_property
     def residual(self) -> Floats:
-        """|f| by the calibration, less gravity or the known |f|, shape (n,)."""
+        """|f| by the calibration, less `size`, shape (n,) [m/s^2]."""
         return norm_residual(self.force, self.size)
 
     @property
@@ -99,7 +99,7 @@ class Windows:
 
 
 def sum_length(window_s: float) -> float:
-    """Choose the duration of partial sums [s], in which the thermal state changes little."""
+    """Choose the duration of a window's partial sums [s], 10 s or less: a share of `window_s`."""
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
@@ -127,7 +127,7 @@ def corrected_windows(
     gravity = np.nan if gravity is None else gravity
     table = _table(bags, calibration, window_s, gravity)
     raw, claimed_sd, noise_sd = table['mean'], *np.full((2, len(table)), np.nan)
-    is_inside = table['excess'] <= _EDGE
+    is_inside = table['excess'] <= _RANGE_TOLERANCE
     if calibration is not None:
         constants, force = constants_of(calibration), table['force']
         raw = constants.force(raw)
@@ -182,8 +182,8 @@ def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[A
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields of a window; all other fields except `excess` are averaged over the partial sums
-# of a window.
+# Integer fields of a window, of which `count` is a sum; all other fields except `excess` are
+# averages over the partial sums of a window.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')

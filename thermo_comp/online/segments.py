@@ -262,6 +262,6 @@ class ThermalSide:
                 # the reference temperature.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             memory = self.tracker.memory
-            shares = memory.start_shares(start_ns + SEGMENT_NS)
+            shares = memory.remaining_shares(start_ns + SEGMENT_NS)
             self._slow = SlowState(end_state, shares, memory.start_rate)
         return self._slow

@@ -205,7 +205,7 @@ class RestKeeper:
         if thermal.is_unmeasured:
             width = Layout(thermal.correction.memory).width
             return (*thermal.sample(now_ns), *[0.0] * width)[:width], ()
-        return thermal.sample(now_ns), thermal.tracker.memory.start_shares(now_ns)
+        return thermal.sample(now_ns), thermal.tracker.memory.remaining_shares(now_ns)
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:

@@ -27,11 +27,11 @@ from .thermometer import Thermometer
 
 BEND_SHARES = (1.0, 10.0)  # tuned acceleration of a filter / smallest acceleration at an onset
 TUNING: Final = 1.45  # best memory of a filter / (noise sd / acceleration)^0.4, at 1 Hz
-# Noise variance / filter variance for a sensor whose noise is mostly quantization.
+# Noise variance of the rate / the filter's variance, for a sensor with mostly quantization noise.
 CELL_NOISE_SHARE: Final = 0.4
-SETTLING: Final = 5.0  # age of a filter at which its noise is stationary, in filter memories
+SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
-LARGEST_BASELINE: Final = 0.25  # largest rate of the soak's baseline / rate of the smallest ramp
+LARGEST_BASELINE_SHARE: Final = 0.25  # largest baseline rate of a soak / smallest ramp's rate
 SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
 SWING_SIGMAS: Final = 3.0  # noise subtracted from an observed swing of the rate, in sd
 # Time constant with which the swing of the rate decays, in sensor lags.
@@ -50,7 +50,7 @@ class ChangeDetector:
         self, sensor: ThermometerSettings, smallest_rate: float, ripple: float, false_alarms: float
     ) -> None:
         self._largest_swing = 0.5 * smallest_rate
-        self._largest_baseline = LARGEST_BASELINE * smallest_rate
+        self._largest_baseline = LARGEST_BASELINE_SHARE * smallest_rate
         self._ripple_rate = min(ripple / sensor.lag_s, self._largest_swing)
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
@@ -95,13 +95,13 @@ class ChangeDetector:
         self._reading = nan
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
-        """Begin a soak with the rate as its baseline, with an error of at least `least_error`."""
+        """Begin a soak: the rate is its baseline, of an error of at least `least_error` [K/s]."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # a cell edge crossed before the soak would give the ramp's rate
 
     def is_following(self, stamp_ns: int) -> bool:
-        """Whether `rate` includes the reading with a given stamp."""
+        """Whether the filter of `rate` has used the reading of a stamp."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
@@ -110,9 +110,9 @@ class ChangeDetector:
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:
         """
-        Use the sensor's last accepted reading. The baseline follows the rate at a relative speed
-        `pace`, 1 in a soak and 0 in a ramp. Returns the sign of the rate's departure from the
-        baseline, 0 = none.
+        Use the sensor's last accepted reading; return the sign of the rate's departure from the
+        baseline, 0 = none. `pace`: relative speed at which the baseline follows the rate, 1 in a
+        soak, 0.25 at the onset of a ramp, 0 in a ramp.
         """
         stamp = self._stamp_ns
         dt = 0.0 if stamp is None else (stamp_ns - stamp) * 1e-9
@@ -172,7 +172,7 @@ class ChangeDetector:
             self._thresholds.insert(0, squared * share)
             self._noise_share = share
         self._edge_margin = sqrt(squared) * self._edge_noise
-        self._settled_s = SETTLING * math.pow(self._noise * dt / self._powers[0], 0.25)
+        self._settled_s = SETTLING_MEMORIES * math.pow(self._noise * dt / self._powers[0], 0.25)
 
     def _watch_filters(
         self, dt: float, measured: float, variance: float, low: float, high: float
@@ -209,8 +209,8 @@ class ChangeDetector:
         reading, before = sensor.reading, self._reading
         apart = (stamp_ns - self._edge_ns) * 1e-9
         if reading == before:
-            # Since no edge of a cell has been crossed, the rate is at most one quantum per time
-            # since the last edge.
+            # As no edge of a cell was crossed, the rate is at most a quantum divided by the time
+            # since the last crossing.
             bound = self._quantum / apart
             if bound < self._baseline_error + abs(self._baseline):
                 self._baseline_error = max(min(self._baseline_error, bound), self.swing)

@@ -8,17 +8,17 @@ less the lag.
 
 A part may exchange heat with another part that lags the board: the lag then has two stages in
 series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of
-two single lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
+two first-order lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
 The temperature that a part lags may lead the board thermometer by a time theta: the thermometer
 itself lags the board, or the part also exchanges heat with a case that has no thermometer. With
-a lead theta the part responds to the readings by ``(1 + theta s) / (1 + tau s)``, so that
+a lead theta the transfer function of the part is ``(1 + theta s) / (1 + tau s)``, so that
 ``m = (1 - theta / tau) m_tau``, and for two stages
 ``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``.
 
 A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v G`` between them, with ``G = T_s - T``. The lag behind ``T + v G`` is the lag
-of the board less v times the lag of the gradient.
+temperature ``T + v G`` between them, with ``G = T_s - T``. The state is
+then ``m = T - L(T + v G)``: that of the board, ``T - L(T)``, less v times ``L(G)``.
 """
 
 import math
@@ -54,16 +54,16 @@ class _Lag(NamedTuple):
 
 class Lag(_Lag, Quantity):
     """
-    The board temperature less that of a part which lags the board, or the lag of the gradient of a
-    sensor (`input`) [K]. The time constants are those of two stages [s]; the second is shorter, or
-    0 for a lag of one stage. A part may lag a temperature between board and sensor: that of the
-    board plus `sensor_share` of the gradient of `sensor`. `lead_s`: time by which the temperature
-    that the part lags leads the board thermometer [s].
+    The board temperature less that of a part which lags the board, or the lagged gradient of a
+    sensor (`input`) [K]. `tau_s` and `second_tau_s` are the time constants of two stages [s]; the
+    second is shorter, or 0 for a lag of one stage. A part may lag a temperature between board and
+    sensor: that of the board plus `sensor_share` of the gradient of `sensor`. `lead_s`: time by
+    which the temperature that the part lags leads the board thermometer [s].
     """
 
     @property
     def by_board(self) -> float:
-        """Derivative by the board temperature, while the single lags L are constant."""
+        """Derivative by the board temperature, at constant first-order lags L."""
         if self.input != BOARD_INPUT:
             return 0.0
         return 1.0 if self.second_tau_s else self.shares[0]
@@ -74,8 +74,8 @@ class Lag(_Lag, Quantity):
         return (self.input, self.sensor) if self.sensor else (self.input,)
 
     @property
-    def singles(self) -> dict[tuple[str, float], float]:
-        """Share of each single lag in this lag, by input and time constant."""
+    def first_order_weights(self) -> dict[tuple[str, float], float]:
+        """Weight of each first-order lag in the sum, by input and tau [s]."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -86,16 +86,16 @@ class Lag(_Lag, Quantity):
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Shares of the single lags of both time constants in this lag."""
+        """Weights of the first-order lags of `tau_s` and `second_tau_s` in the sum."""
         tau, second, lead = self.tau_s, self.second_tau_s, self.lead_s
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
-    def start_share(self, age_s: Any, exp: Any = math.exp) -> Any:
-        """Return the RMS share of the initial value that remains at an age [s], from 1 to 0."""
+    def remaining_share(self, age_s: Any, exp: Any = math.exp) -> Any:
+        """Return the share of the initial state (RMS) that remains after a time [s], 1 to 0."""
         first = exp(-age_s / self.tau_s)
         if not self.second_tau_s:
             return first
-        # The variance of the sum of both single lags follows from `start_covariance`.
+        # The variance of the sum of two first-order lags follows from `start_covariance`.
         second = exp(-age_s / self.second_tau_s)
         a, b = self.shares
         tau, tau_2 = self.tau_s, self.second_tau_s
@@ -116,9 +116,9 @@ class _Play(NamedTuple):
 
 class Play(_Play, Quantity):
     """
-    A play of half-width `width_k` less its input, a lag of the board (0 s: the board itself) [K].
-    A play less its input has no variance: an error of the input shifts the play by the same
-    amount.
+    A play of half-width `width_k` less its input [K], which is the lagged board temperature, or
+    the board temperature if `tau_s` is 0.
+    A play less its input has no variance: an error of the input shifts the play equally.
     """
 
     input = BOARD_INPUT
@@ -137,8 +137,8 @@ class Play(_Play, Quantity):
 @dataclass(frozen=True)
 class MemorySpec:
     """
-    Contents of the thermal state of a tracker. `sensors`: names of the thermometers beside the
-    board; the regime detector uses the first as the leading sensor.
+    Contents of the thermal state of a tracker. `sensors`: names of the thermometers other than the
+    board's; the regime detector uses the first as the leading sensor.
     `lags`: in the order of `inputs`. `rates`: sensors whose rate of change is in the state.
     """
 
@@ -157,13 +157,13 @@ class MemorySpec:
         return (BOARD_INPUT, *self.sensors)
 
 
-def singles_of(lags: Iterable[Lag]) -> tuple[tuple[str, float], ...]:
-    """Return the input and the time constant of each single lag that the lags contain."""
-    return tuple(dict.fromkeys(single for lag in lags for single in lag.singles))
+def first_order_lags(lags: Iterable[Lag]) -> tuple[tuple[str, float], ...]:
+    """Return input and time constant [s] of each first-order lag that the lags contain."""
+    return tuple(dict.fromkeys(term for lag in lags for term in lag.first_order_weights))
 
 
 def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
-    """Return the covariance of lags at their start, before any input was seen, (n, n) [K^2]."""
+    """Return the covariance of the lags at the first reading of their input, (n, n) [K^2]."""
     root = start_root(lags)
     return np.asarray(root @ root.T)
 
@@ -171,23 +171,23 @@ def start_covariance(lags: Sequence[tuple[Any, ...]]) -> Floats:
 def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     """
     Return a factor of the covariance of `start_covariance`, which is the factor times its
-    transpose, shape (n, number of single lags) [K].
+    transpose, shape (n, number of first-order lags) [K].
 
-    The covariance itself is singular if two sums of single lags are equal but for rounding. The
-    unseen input is modelled as a random walk that ends at the first reading, so that ``P_kl =
-    D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different
-    inputs. After the first reading the covariance decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
+    The covariance is singular if two sums of first-order lags are equal except for rounding. The
+    input before the start is modelled as a random walk up to the first reading, so that ``P_kl = D
+    tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different inputs.
+    After the first reading the covariance decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
-    singles = singles_of(all_lags)
-    tau = np.array([tau for _, tau in singles])
-    names = np.array([name for name, _ in singles])
+    terms = first_order_lags(all_lags)
+    tau = np.array([tau for _, tau in terms])
+    names = np.array([name for name, _ in terms])
     sd = np.where(names == BOARD_INPUT, BOARD_START_SD, GRADIENT_START_SD)
     with np.errstate(invalid='ignore'):
         shape = tau[:, np.newaxis] * tau / (tau[:, np.newaxis] + tau)
     is_same = names[:, np.newaxis] == names
     shape[np.diag_indices_from(shape)] *= 1.0 + START_JITTER
     covariance = np.where(is_same, 2.0 / START_TAU_S * sd * sd * shape, 0.0)
-    shares = np.array([[lag.singles.get(single, 0.0) for single in singles] for lag in all_lags])
-    shares = shares.reshape(len(all_lags), len(singles))
-    return np.asarray(shares @ np.linalg.cholesky(covariance))
+    weights = [[lag.first_order_weights.get(term, 0.0) for term in terms] for lag in all_lags]
+    matrix = np.array(weights).reshape(len(all_lags), len(terms))
+    return np.asarray(matrix @ np.linalg.cholesky(covariance))

@@ -16,20 +16,20 @@ from typing import Final
 import numpy as np
 
 from ..typing import Floats
-from .lags import BOARD_INPUT, MemorySpec, singles_of
+from .lags import BOARD_INPUT, MemorySpec, first_order_lags
 
-#: Interval between readings / time constant of a lag, beyond which the time at which the input
-#: changed between the readings adds variance.
+#: Interval between readings / time constant of a lag, beyond which the unknown time at which
+#: the input changed between the readings adds variance.
 SPARSE_SHARE: Final = 0.1
 #: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
-_FADED: Final = 1e-18
+_LEAST_WEIGHT: Final = 1e-18
 
 
 class LagBank:
     """
-    Single lags of one input; `start_ns` is the first stamp since the last `forget`.
+    First-order lags of one input; `start_ns` is the first stamp since the last `forget`.
 
-    taus: time constants of the single lags [s]
+    taus: time constants of the lags [s]
     """
 
     def __init__(self, taus: tuple[float, ...]) -> None:
@@ -50,9 +50,7 @@ class LagBank:
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """
-        Take the input's next value [K], with an error `sd` [K]; linear in time between values.
-        """
+        """Update with the next input value [K], error `sd` [K]; input linear between values."""
         seen_ns = self.stamp_ns
         if seen_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
@@ -114,7 +112,7 @@ class LagBank:
 
 @lru_cache(maxsize=1024)
 def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], list[float]]:
-    """Return each lag's decay over a step, and the gain from the input's change to the lag."""
+    """Return each lag's decay over a step [ns], and the factor of the input's change in it."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
     return [1.0 - part for part in lost], [
@@ -132,26 +130,25 @@ class ThermalMemory:
 
     def __init__(self, spec: MemorySpec) -> None:
         self.spec = spec
-        singles = sorted(singles_of(spec.lags), key=lambda single: spec.inputs.index(single[0]))
-        #: The single lags of each input, by the input's name.
+        terms = sorted(first_order_lags(spec.lags), key=lambda term: spec.inputs.index(term[0]))
+        #: The first-order lags of each input, by the input's name.
         self.banks = {
-            name: LagBank(tuple(tau for of, tau in singles if of == name)) for name in spec.inputs
+            name: LagBank(tuple(tau for of, tau in terms if of == name)) for name in spec.inputs
         }
         self.board = self.banks[BOARD_INPUT]
         self.is_empty = not spec.lags and not spec.plays
-        #: For each lag the indices of its single lags, each with its share; empty if all lags are
-        #: single lags.
+        #: Index and weight of the first-order terms of each lag; empty if all lags have order 1.
         self._sums = [
-            [(singles.index(single), share) for single, share in lag.singles.items()]
+            [(terms.index(term), share) for term, share in lag.first_order_weights.items()]
             for lag in spec.lags
         ]
-        if [lag.singles for lag in spec.lags] == [{single: 1.0} for single in singles]:
+        if [lag.first_order_weights for lag in spec.lags] == [{term: 1.0} for term in terms]:
             self._sums = []
         #: For each play: index of the lag that it follows, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
-        #: The single lags of each play's lag, by index and share; none for a play of the board.
+        #: Index and weight of the first-order terms of each play's lag; none for the board.
         self._followed = [
-            [(singles.index(single), share) for single, share in play.lag.singles.items()]
+            [(terms.index(term), share) for term, share in play.lag.first_order_weights.items()]
             if play.lag
             else []
             for play in spec.plays
@@ -170,7 +167,7 @@ class ThermalMemory:
         self.start_rate = 0.0
 
     def forget_input(self, name: str) -> None:
-        """Forget the gradient of a sensor, or all inputs if it is the board."""
+        """Forget the gradient of a sensor or, for the board, all inputs."""
         if name == BOARD_INPUT:
             self.forget()
         else:
@@ -178,13 +175,13 @@ class ThermalMemory:
             self._held = [] if self._needs_sensors else self._held
 
     def board_step(self, stamp_ns: int, board: float, sd: float = 0.0) -> None:
-        """Take the next estimate of the board temperature [degC], with an error `sd`."""
+        """Update with the next board temperature [degC], error `sd` [K]."""
         self.board.step(stamp_ns, board, sd)
         values = self.board.lagging
         if self._needs_sensors:
             # Other sensors have no reading at the board's stamp, so their last gradients are used.
             gradients = [self.banks[name].input for name in self.spec.sensors]
-            values, _ = self._single_lags(stamp_ns, board, gradients)
+            values, _ = self._first_order(stamp_ns, board, gradients)
         inputs = [
             board - sum([share * values[k] for k, share in lag]) if lag else board
             for lag in self._followed
@@ -207,12 +204,12 @@ class ThermalMemory:
         still: Sequence[tuple[float, float]] = (),
     ) -> list[float]:
         """
-        Return each lag [K] and its extra variance [K^2], then each play less its input [K].
+        Return each lag [K] and its `extra` variance [K^2], then each play less its input [K].
 
         still: for each input the possible error of constant readings [K], and the time since their
             last change [s]; empty without constant readings
         """
-        behind, extra = self._single_lags(stamp_ns, board, gradients)
+        behind, extra = self._first_order(stamp_ns, board, gradients)
         if still:
             # An error of the board temperature is also an error of each gradient.
             causes = [still[:1], *((still[0], cause) for cause in still[1:])]
@@ -225,7 +222,7 @@ class ThermalMemory:
         if self._sums:
             values, variances = behind, extra
             behind = [sum([share * values[k] for k, share in lag]) for lag in self._sums]
-            # The errors of the single lags have common causes, so their standard deviations add.
+            # The errors of first-order lags have common causes, so their standard deviations add.
             extra = [
                 sum([abs(share) * math.sqrt(variances[k]) for k, share in lag]) ** 2
                 for lag in self._sums
@@ -236,14 +233,14 @@ class ThermalMemory:
         if not self._held:
             return result + [0.0] * len(self._widths)
         for place, p, r in zip(self._inputs, self._held, self._widths, strict=True):
-            beside = p - (board if place < 0 else board - behind[place])
-            result.append(-r if beside < -r else r if beside > r else beside)
+            apart = p - (board if place < 0 else board - behind[place])
+            result.append(-r if apart < -r else r if apart > r else apart)
         return result
 
-    def _single_lags(
+    def _first_order(
         self, stamp_ns: int, board: float, gradients: Sequence[float]
     ) -> tuple[list[float], list[float]]:
-        """Return each single lag [K], and its extra variance [K^2]."""
+        """Return each first-order lag [K], and its extra variance [K^2]."""
         values, extra = self.board.at(stamp_ns, board)
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
             if (bank := self.banks[name]).taus:
@@ -252,30 +249,32 @@ class ThermalMemory:
                 extra = extra + bank_extra
         return values, extra
 
-    def start_shares(self, stamp_ns: int) -> list[float]:
-        """Return each lag's remaining share of its initial value, in the order of `spec.lags`."""
+    def remaining_shares(self, stamp_ns: int) -> list[float]:
+        """Return the share of each lag's initial state that remains at a stamp, 1 to 0."""
         ages = {name: bank.age_s(stamp_ns) for name, bank in self.banks.items()}
-        return [lag.start_share(min(map(ages.__getitem__, lag.inputs))) for lag in self.spec.lags]
+        return [
+            lag.remaining_share(min(map(ages.__getitem__, lag.inputs))) for lag in self.spec.lags
+        ]
 
 
 def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Compute the results of `ThermalMemory` for series on a uniform grid, equal except for rounding.
+    Compute `ThermalMemory.at` for series on a uniform grid; the results differ by rounding only.
 
     Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
     """
     inputs = dict(zip(spec.inputs, (board, *gradients), strict=True))
-    single: dict[tuple[str, float], Floats] = {}
-    for name, tau in singles_of(spec.lags):
+    first_order: dict[tuple[str, float], Floats] = {}
+    for name, tau in first_order_lags(spec.lags):
         u = inputs[name]
         lost = -math.expm1(-step_s / tau)
         driven = np.diff(u, prepend=u[:1]) * (lost * tau / step_s)
         m = _recursion(1.0 - lost, driven)
-        single[name, tau] = m if name == BOARD_INPUT else u - m
+        first_order[name, tau] = m if name == BOARD_INPUT else u - m
     behind = {
-        lag: np.asarray(sum(share * single[of] for of, share in lag.singles.items()))
+        lag: np.asarray(sum(w * first_order[of] for of, w in lag.first_order_weights.items()))
         for lag in spec.lags
     }
     columns = [part for lag in behind.values() for part in (lag, np.zeros_like(lag))]
@@ -289,7 +288,7 @@ def _recursion(decay: float, driven: Floats) -> Floats:
     """Compute ``m[k] = decay m[k - 1] + driven[k]`` in log2(n) passes: pass j spans 2^j steps."""
     result: Floats = driven.copy()
     shift, factor = 1, decay
-    while shift < len(result) and factor > _FADED:
+    while shift < len(result) and factor > _LEAST_WEIGHT:
         result[shift:] += factor * result[:-shift]
         shift, factor = 2 * shift, factor * factor
     return result

@@ -52,7 +52,7 @@ LEAD_SHARE: Final = 0.15
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
-_SIGMAS: Final = 6.0
+_NOISE_SDS: Final = 6.0  # largest deviation of a temperature by noise, in sd
 #: Time [ns] for which the rates of both sensors must be low before the temperatures count as
 #: constant: estimates of rates start at 0, also in a unit that heats itself after switch-on.
 _CALM_NS: Final = 120 * 10**9
@@ -62,21 +62,21 @@ class Fault(Enum):
     """The faults of a sensor; values are the words of the diagnostics."""
 
     NONE = 'none'
-    #: Readings that have been equal for too long: they are used, with a growing variance.
+    #: Readings that have been equal for longer than noise explains: used with a growing variance.
     STILL = 'stands still'
     #: Readings that stay equal while the other sensor's temperature changes: they are not used.
     FROZEN = 'frozen'
     #: A reading that changed faster than any part of a unit can: it is not used.
     STEP = 'jumped'
-    #: A difference from the case that neither a ramp nor the unit's heat explains, as of a loose
-    #: thermometer; the readings are used, with a larger variance.
+    #: A board temperature that differs from the case's by more than ramp and self-heating explain,
+    #: as by a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
 
 
 class SensorCheck:
     """
-    Judges one sensor's readings by its past and by the other sensor, which it follows with a lag
-    of `lag_s` (0 for the leading sensor). `is_revived`: the reading just accepted ends a fault.
+    Judges a sensor's readings by its earlier readings and by the other sensor, which the sensor
+    lags by `lag_s` [s] (0 for the leading sensor). `is_revived`: the last reading ends a fault.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
@@ -89,7 +89,7 @@ class SensorCheck:
         self._n_still = still_readings(settings)
         self._rate = settings.fastest_ramp_k_min / 60.0
         self._decay = 1e-9 / max(settings.lag_s, other.settings.lag_s)
-        self._largest_noise = self._quantum + _SIGMAS * settings.noise_sd_c
+        self._largest_noise = self._quantum + _NOISE_SDS * settings.noise_sd_c
         self._n_doubtful = min(DOUBTFUL_READINGS, self._n_still)
         self.reset()
 
@@ -132,7 +132,7 @@ class SensorCheck:
         possible = LARGEST_RATE * (second_ns - first_ns) * 1e-9 + 2.0 * self._quantum
         # Change from the second to the third reading in a ramp of constant rate [K].
         continued = abs(step) * (stamp_ns - second_ns) / (second_ns - first_ns)
-        is_step = abs(step) > possible + _SIGMAS * self.sensor.settings.noise_sd_c
+        is_step = abs(step) > possible + _NOISE_SDS * self.sensor.settings.noise_sd_c
         return is_step and abs(after) < CONTINUED_SHARE * min(abs(step), continued)
 
     def admits(self, stamp_ns: int, celsius: float) -> bool:
@@ -168,20 +168,20 @@ class SensorCheck:
             expected, _, variance = sensor.at(stamp_ns)
             step = celsius - expected
             possible = LARGEST_STEP + 2.0 * self._quantum + LARGEST_RATE * age
-            if abs(step) > possible + _SIGMAS * sqrt(variance):
+            if abs(step) > possible + _NOISE_SDS * sqrt(variance):
                 self.fault = Fault.STEP
                 self.step = step
                 return False
             if fault is Fault.STEP:
                 # After a rejected step the estimate starts again if an accepted reading differs
                 # from the expected temperature by more than noise.
-                self.is_revived = abs(step) > self._largest_noise + _SIGMAS * sqrt(variance)
+                self.is_revived = abs(step) > self._largest_noise + _NOISE_SDS * sqrt(variance)
         self.fault = Fault.NONE
         self._n_used += 1
         return True
 
     def watch_other(self) -> None:
-        """Note the change of the other sensor since the last change of this sensor's reading."""
+        """Note the other sensor's change [K] since the last change of this sensor's reading."""
         other = self._other
         now_ns = other.stamp_ns
         moved = other.temperature - self._other_then
@@ -196,7 +196,7 @@ class SensorCheck:
                 # Expect the judged sensor to change as the other sensor, with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The sensor that follows may reach the leading sensor's temperature, but not pass it.
+            # The board may reach the temperature of the leading sensor, but not pass it.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns
@@ -206,7 +206,7 @@ class SensorCheck:
         sensor, other = self.sensor, self._other
         if sensor.changed_ns is None:
             return Fault.NONE
-        margin = _SIGMAS * sqrt(other.var_temperature) + 2.0 * other.settings.quantum_c
+        margin = _NOISE_SDS * sqrt(other.var_temperature) + 2.0 * other.settings.quantum_c
         if self._has_cells:
             hidden = 2.0 * self._quantum + OTHER_MOVED_BEYOND_CELL + margin
             is_frozen = self.fault == Fault.FROZEN or abs(self._expected) > hidden
@@ -227,7 +227,7 @@ class SensorCheck:
         return self._jumped * exp(-max(stamp_ns - self._jumped_ns, 0) * self._decay)
 
     def extra_variance(self, stamp_ns: int) -> float:
-        """Return the variance that standstills and jumps add to the temperature's [K^2]."""
+        """Return the variance of a temperature by constant readings and jumps [K^2]."""
         return self._jump_at(stamp_ns) + self.still(stamp_ns)[0] ** 2
 
     def still(self, stamp_ns: int) -> tuple[float, float]:
@@ -254,7 +254,7 @@ def still_readings(settings: ThermometerSettings) -> int:
 
 class LeadCheck:
     """
-    Finds out which of two sensors leads in a ramp.
+    Finds out whether case or board leads in a ramp.
 
     The temperature changes since the last constant temperature are compared while both sensors
     change in the same direction. Heat from outside changes the case temperature first. If the
@@ -296,7 +296,7 @@ class LeadCheck:
         slow, fast = direction * case.rate, direction * board.rate
         if slow > fast:
             slow, fast = fast, slow
-        noise = _SIGMAS * sqrt(case.var_temperature + board.var_temperature)
+        noise = _NOISE_SDS * sqrt(case.var_temperature + board.var_temperature)
         lead = direction * (by_case - by_board)
         if lead > -noise - self._quanta:
             self.extra_variance = 0.0

@@ -25,7 +25,5 @@ class Quantity:
 
     @property
     def by_board(self) -> float:
-        """
-        Derivative by the board temperature; lags and other thermometers' readings are constant.
-        """
+        """Derivative by the board temperature, at constant lags and other temperatures."""
         return float(self.input == 'board')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the readings that wait for the sample at which they take effect, by their stamps."""
+"""Owns the readings that wait for the sample at which they take effect, in order of stamps."""
 
 import heapq
 from collections.abc import Callable, Iterator

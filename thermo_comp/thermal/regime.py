@@ -30,7 +30,7 @@ HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state, in lags of th
 # most of the rate's variance is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
 OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
-FIRST_READINGS: Final = 20  # number of readings that correct a declared noise that is too small
+FIRST_READINGS: Final = 20  # readings after which the noise estimate corrects a declared noise
 
 
 class Regime(IntEnum):
@@ -45,8 +45,7 @@ class RegimeDetector:
     """
     State machine over the temperature estimates of the case and the board.
 
-    `direction` is -1 while cooling and +1 while heating; it is 0 in the dynamic state before the
-    direction is known, and in all other states.
+    `direction`: in the dynamic regime -1 while cooling, +1 while heating; 0 in other regimes.
     """
 
     def __init__(self, settings: DetectorSettings) -> None:
@@ -66,7 +65,7 @@ class RegimeDetector:
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
         """
-        Decide after a used reading of the leading sensor: the case, or the board without a case.
+        Decide the regime after a reading of the leading sensor: the case, or the board without it.
         """
         if case is not None:
             lead, change = case, self._case.change
@@ -128,7 +127,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Use a direction that lasts half a dwell time: a coarse quantum makes the rate step."""
+        """Set the direction if it lasts half a dwell time: coarse quanta make the rate step."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -175,7 +174,7 @@ class _Watch:
 
     def is_calm(self, stamp_ns: int, sensor: Thermometer | None, lead_swing: float) -> bool:
         """
-        Follow the sensor's rate; return whether the rate is low; without a fresh reading, True.
+        Update a sensor's mean rate; return whether its rate is low, True without a fresh reading.
         """
         seen_ns = None if sensor is None else sensor.stamp_ns
         if sensor is None or seen_ns is None or stamp_ns - seen_ns > self._stale_ns:

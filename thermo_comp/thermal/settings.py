@@ -3,7 +3,7 @@
 """
 Owns the settings of thermometers, detector and tracker.
 
-Calibrations hold settings of thermometers and detector; workers of a fleet receive all settings.
+A calibration file states the settings of thermometers and detector, the user those of the tracker.
 """
 
 from dataclasses import dataclass, field
@@ -11,9 +11,7 @@ from typing import Annotated, Final, Literal, get_args
 
 from ..quantities import QUANTITIES, NotNegative, Positive, refuse_impossible
 
-CELL_SIGMAS: Final = (
-    2.5  # quantum / noise sd above which a reading is treated as an interval, its cell
-)
+CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading counts as an interval (cell)
 # Quantum / noise sd above which noise never moves a reading: 6 sd of the difference of two
 # readings.
 WIDE_CELL_SIGMAS: Final = 8.5
@@ -67,7 +65,7 @@ Closes = Literal['board', 'case']
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """Smallest ramp, ripple, false alarms of the detector; keys of the `detector` section."""
+    """Settings of the regime detector; keys of the section `detector` of a calibration file."""
 
     smallest_ramp_k_min: Annotated[
         float, QUANTITIES['ramp'], 'The slowest ramp that must never be missed, K/min.'
@@ -118,7 +116,7 @@ class DetectorSettings:
 
 @dataclass(frozen=True)
 class ThermalConfig:
-    """Time limits that the user sets; ValueError if a value is out of its range."""
+    """Times of the tracker that the user sets; ValueError if a value is out of its range."""
 
     #: Time over which the two sets of coefficients are blended after a change of regime [s],
     #: longer if they differ much (`Correction.gentle_transition`); 0 = the paper's hard switch.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the quantities of a unit's thermal state at a stamp, and their places in a flat tuple."""
+"""Owns the quantities of a unit's thermal state at a stamp, and their indices in a flat tuple."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -9,7 +9,7 @@ from ..quantities import QUANTITIES
 from .lags import BOARD_INPUT, MemorySpec
 from .quantity import Quantity
 
-#: Sd of every lag below which the thermal memory counts as settled [K].
+#: The thermal memory counts as settled if the sd of every lag is below this [K].
 MEMORY_SETTLED_SD: Final = 0.05
 #: Lag of a board behind its case if the bags do not determine it [s]: 15 min, typical of a housing
 #: of a few hundred grams in a chamber.
@@ -50,13 +50,13 @@ class Gradient(Quantity):
 
 class Layout:
     """
-    The numbers of a thermal state from BOARD to UNKNOWN, then (value, variance) pairs, then plays.
+    Order of the numbers of a thermal state: BOARD to UNKNOWN, (value, variance) pairs, plays.
 
-    pairs: number of each quantity's (value, variance) pair; `lag_pairs` is the slice of the lags
-    lags: number of each lag among the lags
-    variances: places of the quantities' variances in the state
+    pairs: index of each quantity's (value, variance) pair; `lag_pairs` is the slice of the lags
+    lags: index of each lag in `MemorySpec.lags`
+    variances: indices of the quantities' variances in the state
     numbers: name of each number of the state
-    places: place of each quantity in the state
+    places: index of each quantity in the state
     """
 
     def __init__(self, spec: MemorySpec) -> None:

@@ -6,9 +6,9 @@ Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stampe
 Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, in which the
 acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
 acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
-the mixture of the quiet and the bending filter; its variance includes their difference. If a
-sensor's quantum exceeds its noise, a changed reading is a precise measurement of the edge between
-two cells, and an unchanged reading only bounds the temperature by its cell.
+the mixture of the quiet and the bending filter, with the variance of a mixture. If a sensor's
+quantum exceeds the noise, a changed reading is a precise measurement of the edge between two
+cells, and an unchanged reading only bounds the temperature by the cell [3]_.
 
 References
 ----------
@@ -27,11 +27,11 @@ from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
 OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a reading is rejected
-RESTART_READINGS: Final = 4  # number of outliers in a row on one side that count as a real change
+RESTART_READINGS: Final = 4  # consecutive outliers of equal sign that restart the estimate
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
-QUIET_SHARE: Final = 5e-3  # quiet / bending change of acceleration, without wide cells
-CELL_SHARE: Final = 0.2  # quiet / bending change of acceleration, with wide cells
+QUIET_SHARE: Final = 5e-3  # sd of the noise of acceleration, quiet / bending; no wide cells
+CELL_SHARE: Final = 0.2  # sd of the noise of acceleration, quiet / bending, with wide cells
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
 #: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
@@ -39,7 +39,7 @@ COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
 # Horizon of linear extrapolation [reading intervals]; beyond it the temperature is held.
 HORIZON_INTERVALS: Final = 5.0
-LONGEST_STEP: Final = 0.125  # longest step of a prediction / lag of the sensor
+LONGEST_STEP_SHARE: Final = 0.125  # longest step of a prediction / lag of the sensor
 NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
 # The filters of the two modes are written out in floats: a matrix library costs more per call.
@@ -128,7 +128,7 @@ class Thermometer:
         bent = mix(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
         # The transition of `predict` holds for times much shorter than the lag: a long interval is
         # predicted in steps.
-        n_steps = 1 + int(dt / (LONGEST_STEP * lag))
+        n_steps = 1 + int(dt / (LONGEST_STEP_SHARE * lag))
         for _ in range(n_steps):
             quiet = predict(quiet, dt / n_steps, lag, self._quiet_power)
             bent = predict(bent, dt / n_steps, lag, self._bending_power)
@@ -143,8 +143,8 @@ class Thermometer:
         is_turning = surprise * self._surprise < 0.0
         self._surprise = surprise
         if is_turning and not self._has_cells:
-            # Only innovations that change sign are noise; a change of the rate makes a run of
-            # equal signs.
+            # Only innovations that change sign count as noise, because a change of the rate gives
+            # innovations of equal sign.
             excess = min(surprise * surprise / spread - 1.0, 8.0)
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
@@ -303,7 +303,7 @@ class Thermometer:
 
 
 def mix(state: State, other: State, share: float) -> State:
-    """Mix a state with a share of another state; the covariance contains their difference."""
+    """Mix a state with a share of another; the covariance includes their squared difference."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a

@@ -32,7 +32,7 @@ ANY_RANGE: Final = (-inf, inf)
 
 
 class ThermalTracker:
-    """Thermal state from stamped readings of the board and the thermometers beside it."""
+    """Thermal state from stamped readings of the board and of other thermometers."""
 
     def __init__(
         self,
@@ -46,13 +46,13 @@ class ThermalTracker:
         self.spec = memory or MemorySpec()
         self._configure(config or ThermalConfig(), board_lag_s, rest_gradient_range_k)
         self.board = Thermometer(detector.board)
-        beside = {name: Thermometer(detector.case) for name in self.spec.sensors}
-        self.thermometers = {BOARD_INPUT: self.board, **beside}
+        others = {name: Thermometer(detector.case) for name in self.spec.sensors}
+        self.thermometers = {BOARD_INPUT: self.board, **others}
         #: The leading sensor: the first thermometer other than the board's.
-        self.case = beside[self.spec.sensors[0]]
+        self.case = others[self.spec.sensors[0]]
         self.checks = {
             BOARD_INPUT: SensorCheck(self.board, self.case, board_lag_s),
-            **{name: SensorCheck(sensor, self.board, 0.0) for name, sensor in beside.items()},
+            **{name: SensorCheck(sensor, self.board, 0.0) for name, sensor in others.items()},
         }
         self.memory = ThermalMemory(self.spec)
         #: Stamp of the newest reading that was used, or None before the first reading.
@@ -106,7 +106,7 @@ class ThermalTracker:
         return seen_ns is not None and (stamp_ns - seen_ns) * 1e-9 <= self._case_timeout_s
 
     def read(self, name: str, stamp_ns: int, celsius: float) -> bool:
-        """Take a reading [degC]; return False if it is not newer, an outlier or not plausible."""
+        """Take a reading [degC]; return False if it is old, an outlier or implausible."""
         sensor, check = self.thermometers[name], self.checks[name]
         if not self._use(name, sensor, check, stamp_ns, celsius):
             return False
@@ -195,7 +195,7 @@ class ThermalTracker:
         return True
 
     def _begin_again(self, name: str, sensor: Thermometer) -> None:
-        """Forget the wrong readings of a sensor, and the lags, gradients and regime from them."""
+        """Forget wrong readings of a sensor, and lags, gradients and regime computed from them."""
         sensor.reset()
         self.memory.forget_input(name)
         self._rest_gradients.clear()
@@ -274,7 +274,7 @@ class ThermalTracker:
     def loose_k(self, gradient: float) -> float:
         """
         Return the part of a gradient of the leading sensor [K] that neither a ramp nor the unit's
-        own heat explains; else 0.
+        self-heating explains, 0 for none.
         """
         of_ramp = self._board_lag_s * self.board.rate
         lower, upper = self._rest_gradient_range
@@ -315,15 +315,13 @@ class ThermalTracker:
         return gradient, variance
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """
-        Whether the effect of the unknown temperatures before the start on the memory has decayed.
-        """
+        """Whether the effect of temperatures before the start on the memory has decayed."""
         state = self.sample(stamp_ns)
         gradients = list(state[GRADIENT : GRADIENT + 2 * len(self.spec.sensors) : 2])
         lags = self.memory.at(stamp_ns, state[BOARD], gradients)[: 2 * len(self.spec.lags)]
         extra = lags[1::2]
         start = start_covariance(self.spec.lags).diagonal().tolist()
-        shares = self.memory.start_shares(stamp_ns)
+        shares = self.memory.remaining_shares(stamp_ns)
         return all(
             variance * share * share + more < MEMORY_SETTLED_SD**2
             for variance, share, more in zip(start, shares, extra, strict=True)

@@ -40,7 +40,7 @@ class SlowUncertainty:
         self._span = max(edges) - min(edges)
         #: Delay of each lag's part behind the board in a long ramp [s].
         self._behind_s = np.array([
-            sum(share * tau for (name, tau), share in lag.singles.items() if name == BOARD_INPUT)
+            sum(w * tau for (of, tau), w in lag.first_order_weights.items() if of == BOARD_INPUT)
             for lag in lags
         ])  # fmt: skip
         #: By axis the rows of the posterior's factor, and the added variances: of bias, scale and
@@ -245,7 +245,7 @@ def ramp_states(
         if isinstance(quantity, Rate | Gradient):
             states[:, place] = rate if isinstance(quantity, Rate) else gradient
         elif isinstance(quantity, Lag):
-            for (name, tau), share in quantity.singles.items():
+            for (name, tau), share in quantity.first_order_weights.items():
                 end = tau * rate if name == BOARD_INPUT else gradient
                 states[:, place] += share * end * (1.0 - np.exp(-np.asarray(lasted_s) / tau))
         elif isinstance(quantity, Play):
@@ -263,6 +263,6 @@ def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> 
         elif isinstance(quantity, Lag):
             states[:, place] += change_k * sum(
                 share
-                for (name, _), share in quantity.singles.items()
+                for (name, _), share in quantity.first_order_weights.items()
                 if name == calibration.sensors[0]
             )
