@@ -38,7 +38,7 @@ AHEAD_DAYS = 1.0
 
 
 @dataclass(frozen=True)
-class Moved:
+class AxisChange:
     """
     Changes of an axis' constants, each with posterior sd; if the rests do not determine the axis,
     the changes are 0 and the sds are prior sds.
@@ -103,7 +103,7 @@ class Update:
     """An updated calibration with the results of the ageing model."""
 
     calibration: Calibration
-    moved: tuple[Moved, ...]
+    axis_changes: tuple[AxisChange, ...]
     ageing: Ageing
     changes: tuple[Change, ...]
     judged: Judged
@@ -143,13 +143,13 @@ def update(
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     to_file, bend = _levels(calibration), _slopes(calibration)
     solution = solve(model, ageing, to_file, bend, ahead)
-    determined, moved = _axis_changes(used, calibration, model, solution, ageing)
+    determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
     # For parameters that are not updated, the shift that is not applied is an additional error.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
-    axis_determined = [change.is_determined for change in moved]
+    axis_determined = [change.is_determined for change in by_axis]
     new = _shifted(calibration, shift, covariance)
     before = calibration.provenance
     new = replace(
@@ -164,7 +164,7 @@ def update(
         ),
     )
     n_outliers = len(series) - len(used)
-    return Update(new, moved, ageing, model.changes, judged, used, n_outliers, model, solution)
+    return Update(new, by_axis, ageing, model.changes, judged, used, n_outliers, model, solution)
 
 
 def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
@@ -212,7 +212,7 @@ def _slopes(calibration: Calibration) -> Floats:
 
 def _axis_changes(
     series: Series, calibration: Calibration, model: Model, solution: Solution, ageing: Ageing
-) -> tuple[Bools, tuple[Moved, ...]]:
+) -> tuple[Bools, tuple[AxisChange, ...]]:
     """Find the parameters that the rests determine, and list the changes of each axis."""
     layout, correction = parameter_layout(calibration), Correction(calibration)
     coolest, warmest = np.argsort(series.temperature)[[len(series) // 10, -1 - len(series) // 10]]
@@ -245,7 +245,7 @@ def _axis_changes(
         of_scale = change[1] / gravity, sd[1] / gravity
         values = [change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3]]
         values += [claimed, present]
-        shifts.append(Moved(name, is_determined, *map(float, values)))
+        shifts.append(AxisChange(name, is_determined, *map(float, values)))
     determined[layout.misalignment :] = all(shift.is_determined for shift in shifts)
     return determined, tuple(shifts)
 
@@ -371,7 +371,7 @@ def change_texts(result: Update) -> list[str]:
                 )
             lines.append(text)
     lines += _gravity_texts(result)
-    undetermined = [change.axis for change in result.moved if not change.is_determined]
+    undetermined = [change.axis for change in result.axis_changes if not change.is_determined]
     if undetermined:
         lines.append(
             f'the rests do not determine {", ".join(undetermined)}: these axes keep their values, '

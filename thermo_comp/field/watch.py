@@ -61,8 +61,8 @@ class Watch:
     days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
     week: rows of the days with rests in the last week
     recent: RMS over the last week divided by the limit, robust against one disturbed day
-    left: first day from which the unit stays outside its claim, None for a unit within its claim
-    back: first day after an earlier time outside the claim, for a unit within its claim
+    outside_since: first day from which the unit stays outside its claim, None if it is within
+    inside_since: first day after a time outside the claim; None if still, or never, outside
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years
     interval: the quantiles of `forecast` for a unit that has just been updated
@@ -74,8 +74,8 @@ class Watch:
     last: str
     week: tuple[Row, ...]
     recent: float
-    left: str | None
-    back: str | None
+    outside_since: str | None
+    inside_since: str | None
     forecast: tuple[float, ...]
     interval: tuple[float, ...]
     ageing: Ageing | None
@@ -83,7 +83,7 @@ class Watch:
     @property
     def exit_code(self) -> int:
         """Exit code of the command: 1 if the error of the unit exceeds its claim, else 0."""
-        return 1 if self.left else 0
+        return 1 if self.outside_since else 0
 
     def __str__(self) -> str:
         n_out = sum(not row.is_within for row in self.week)
@@ -91,15 +91,16 @@ class Watch:
             f'RMS of |f| - g {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} days'
         )
         week += f', {n_out} of {counted(len(self.week), "day")} outside'
-        if self.left and self.recent <= 1.0:
+        if self.outside_since and self.recent <= 1.0:
             week += ', above the limit at the last rest by the ageing model'
-        if self.left:
+        if self.outside_since:
             text = (
-                f'the unit is outside its claim since {self.left} ({week}): update its '
+                f'the unit is outside its claim since {self.outside_since} ({week}): update its '
                 'calibration by rests, or recalibrate the unit'
             )
         else:
-            how = f'again within its claim since {self.back}' if self.back else 'within its claim'
+            since = self.inside_since
+            how = f'again within its claim since {since}' if since else 'within its claim'
             text = f'the unit is {how} up to {self.last} ({week}); '
             if self.forecast:
                 when = 'on any day' if self.forecast[1] < 1.0 else f'about {self._date(1)}'
@@ -148,23 +149,23 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
-    left = back = None
+    outside_since = inside_since = None
     if is_out[-1]:
         is_early = ~is_out if recent[-1] > 1.0 else ~is_row_out
         begin = min(int(np.append(-1, np.flatnonzero(is_early))[-1]) + 1, len(days) - 1)
         window = days[first[begin] if recent[-1] > 1.0 else begin : begin + 1]
-        left = next((row.name for row in window if not row.is_within), window[-1].name)
+        outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
         # If the last week of a unit within its claim is above the limit, the last two days are
         # within the limit, so a day follows the last day outside.
         until = int(np.flatnonzero(recent > 1.0)[-1])
-        back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
+        inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
     temperatures = _rows(series, np.array(classes), warmer, tolerance)
     return Watch(
         *(days, periods, temperatures, last, days[first[-1] :], float(recent[-1])),
-        *(left, back, forecast, interval, ageing),
+        *(outside_since, inside_since, forecast, interval, ageing),
     )
 
 

@@ -15,7 +15,7 @@ from ..unit.prediction import bias_and_scale, in_a_soak, nonlinear_coefficients,
 from .evidence import Evidence
 from .html import minus, number, rounded
 from .statements import CertificateInfo
-from .states import curves, evaluate, programs, slopes, table_temperatures
+from .temperature_curves import curves, evaluate, programs, slopes, table_temperatures
 
 #: Coverage factor of an expanded uncertainty: 95 % of a normal distribution.
 COVERAGE = 2.0

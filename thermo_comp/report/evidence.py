@@ -196,7 +196,7 @@ class Evidence:
         return {name: force - true for name, force in self.forces.items()}
 
 
-def given(value: _T | None) -> _T:
+def required(value: _T | None) -> _T:
     """Return a value that a figure needs; ValueError if the value is None."""
     if value is None:
         raise ValueError('`evidence` lacks the data of this figure')

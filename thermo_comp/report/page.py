@@ -32,8 +32,8 @@ from .certificate import (
 from .evidence import LEFT_OUT, Evidence
 from .html import label_text, render, utc
 from .statements import CertificateInfo
-from .states import programs
 from .style import drawing, png, svg
+from .temperature_curves import programs
 from .trace import span_of
 
 # Mean radius of the Earth [m]: GRS 80.

@@ -54,7 +54,7 @@ parameters:
 NOT_GIVEN = 'not_given.'
 
 #: Errors that are no bug of the node: of files, values, environment, middleware (RuntimeError).
-_NOT_OURS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
+_USER_ERRORS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
 class CompensationNode:
@@ -169,7 +169,7 @@ class CompensationNode:
         self, loaded: LoadedCalibration, config: parameters.NodeConfig, inputs: tuple[str, ...]
     ) -> None:
         """Refuse a calibration of another unit, input or set of thermometers."""
-        unit, heard = loaded.calibration.unit, inputs[1:]
+        unit, listened_sensors = loaded.calibration.unit, inputs[1:]
         message = key = ''
         taken = {'counts': 'counts', 'imu': 'm/s^2'}[config.input]
         if config.serial and unit.serial != config.serial:
@@ -180,10 +180,10 @@ class CompensationNode:
                 f'must be {taken!r} (parameter `input` is {config.input}), got {unit.input!r}'
             )
             key = 'unit.input'
-        elif loaded.calibration.sensors != heard:
+        elif loaded.calibration.sensors != listened_sensors:
             named, key = ', '.join(loaded.calibration.sensors), 'sensors'
-            message = f'must be {", ".join(heard)}, which this node listens to, got {named}: '
-            message += 'restart the node with this file'
+            message = f'must be {", ".join(listened_sensors)}, which this node listens to, '
+            message += f'got {named}: restart the node with this file'
         if message:
             raise CalibrationError(message, loaded.path, key)
 
@@ -230,7 +230,7 @@ def main(args: list[str] | None = None) -> int:
                 node.close()
         except ExternalShutdownException:
             pass
-        except _NOT_OURS as error:
+        except _USER_ERRORS as error:
             return _fail(error, 1)
         finally:
             rclpy.try_shutdown()

@@ -288,7 +288,7 @@ class ParameterRequests:
         """Apply one group of parameters; an unexpected error refuses the group and is logged."""
         try:
             changes, preparation = prepared.result()
-            news = [change for change in changes if not self._is_in_force(change)]
+            news = [change for change in changes if not self._repeats_fixed_value(change)]
             result = (
                 self._apply(news, preparation) if news else SetParametersResult(successful=True)
             )
@@ -301,7 +301,7 @@ class ParameterRequests:
             )
             raise
 
-    def _is_in_force(self, change: Parameter) -> bool:
+    def _repeats_fixed_value(self, change: Parameter) -> bool:
         """Whether a change keeps a fixed parameter's value, as `param load` of a dump does."""
         node = self._loop.node
         return bool(

@@ -91,8 +91,8 @@ class Relay:
     def _check_topics(self, output: str) -> None:
         """Refuse a topic shared by two thermometers, and an output equal to the input."""
         roles: dict[tuple[str, str], str] = {}
-        for name, heard in self.thermometers.items():
-            topic = heard.subscription.topic_name
+        for name, raw in self.thermometers.items():
+            topic = raw.subscription.topic_name
             twin = roles.setdefault((topic, split_field(self._topic(name))[1]), name)
             if twin != name:
                 raise ThermoCompError(TWINS.format(twin, name), key=topic)
@@ -102,8 +102,8 @@ class Relay:
 
     def follow_types(self) -> None:
         """Subscribe again to thermometers whose messages have another type."""
-        for name, heard in list(self.thermometers.items()):
-            if self._fields[name].kind is not Temperature or heard.count_publishers():
+        for name, raw in list(self.thermometers.items()):
+            if self._fields[name].kind is not Temperature or raw.count_publishers():
                 continue
             try:
                 field = live_field(self._loop.node, self._topic(name))
@@ -113,7 +113,7 @@ class Relay:
                     self._loop.node.get_logger().error(str(error))
                 continue
             if field is not None:
-                topic = heard.subscription.topic_name
+                topic = raw.subscription.topic_name
                 self._loop.unsubscribe(self.thermometers.pop(name))
                 # The middleware allows one type per topic: the loop must release the old
                 # subscription first.
@@ -121,8 +121,8 @@ class Relay:
 
     def _subscribe(self, name: str, topic: str, field: LiveField) -> None:
         self._fields[name] = field
-        heard = self._loop.subscribe(field.kind, topic, qos_of(BOARD), wakes=False)
-        self.thermometers[name] = heard
+        raw = self._loop.subscribe(field.kind, topic, qos_of(BOARD), wakes=False)
+        self.thermometers[name] = raw
 
     @property
     def samples(self) -> RawSubscription:
