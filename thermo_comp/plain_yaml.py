@@ -22,7 +22,7 @@ from .files import read_bounded
 
 DEPTH_LIMIT = 12
 #: Largest number of keys, values, lists and mappings of a file: three times that of a calibration
-#: with the columns of two thermometers except bends.
+#: with all columns of `unit.columns.bank` for two thermometers, except the kind `bend`.
 NODE_LIMIT = 20_000
 # Size limit of YAML files written by hand [bytes]; usual files have a few kB.
 _FILE_LIMIT = 1 << 16

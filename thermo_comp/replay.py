@@ -50,7 +50,7 @@ class ReplayResult:
     output: Path
     counters: Counters
     n_flags: int
-    #: The first regime flag, and each flag that differs from the previous one.
+    #: Stamp [ns] and value of the first regime flag, and of each flag unlike the flag before it.
     switches: list[tuple[int, bool]]
     #: Warnings that the node would give: exchanged thermometers, temperatures outside the
     #: calibrated range.
@@ -165,7 +165,7 @@ def _beyond(calibration: Calibration, block: Block) -> float:
 
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
-    """Keep the first regime flag (stamp, regime) and each flag unlike the flag before it."""
+    """Return the first regime flag (stamp, is dynamic) and each flag unlike the flag before it."""
     return [next(run) for _, run in groupby(flags, key=itemgetter(1))]
 
 

@@ -67,7 +67,7 @@ class Correction:
     """
     Static and dynamic set of a calibration, blended by the dynamic weight, and thermal response.
 
-    memory: contents of the thermal memory; by default those that `memory_of_unit` returns
+    memory: lags, plays and rates of the states; by default those of `memory_of_unit`
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: elements yx, zx, zy of the misalignment matrix M
@@ -264,7 +264,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Without lags, a rate beyond its range adds variance; lags add variance at any rate.
+            # Without lags the excess of a rate adds variance; with lags, the excess of the lags.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])

@@ -105,8 +105,8 @@ class SlowUncertainty:
         of_misalignment, var_misalignment = self._misalignment
         n_start, (n, rank) = len(of_start), (states.shape[1], of_misalignment.shape[1])
         errors = np.zeros((9, n_start + rank, n))
-        # A larger element of the misalignment increases the force, a larger bias or scale factor
-        # decreases it.
+        # A larger element of the misalignment increases the force; a larger bias or scale factor
+        # decreases the force.
         errors[6:, n_start:] = -of_misalignment[:, :, np.newaxis]
         added = np.zeros((3, 3, n))
         beyond: list[Floats] = []
