@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the plausibility checks of samples: a stuck converter, samples faster than conversions can be,
-and |f| at rest, which must be gravity.
+Owns the plausibility checks of samples: a stuck converter, samples faster than the converter, and
+|f| at rest, which must be gravity.
 
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
-calibration, or that of another unit, |f| at rest differs from gravity by more than the claimed
-uncertainty. |f| is averaged over still windows of a second or longer: their scatter is the
-sensor's noise, and their mean agrees with that of the window before. A step of |f| from one rest
-to another is not a motion, and is judged within a second.
+calibration, or the calibration of another unit, |f| at rest differs from gravity by more than the
+claimed uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
+scatter is the sensor's noise and its mean agrees with the mean of the previous window. A step of
+|f| from a rest to another rest is not a motion, and is judged within a second.
 """
 
 import math
@@ -64,11 +64,11 @@ Run: TypeAlias = tuple[tuple[float, float, float, int], int, float]
 
 class StuckCheck:
     """
-    Counts equal readings in a row of each axis; after the time-out [s] (0 = never) they are stuck.
+    Counts equal readings in a row of each axis, which are stuck after the time-out [s], 0 = never.
 
-    Samples are stuck if all three axes repeat their readings, or if one axis does while both
-    others change by `motion` [input unit]: no motion leaves one axis at exactly one number. At
-    rest an axis whose noise is less than the converter's step may repeat its reading for long.
+    Samples are stuck if all three axes repeat their readings, or if an axis repeats its reading
+    while both other axes change by `motion` [input unit]: no motion leaves an axis at exactly the
+    same number. At rest an axis with noise below the converter's step may repeat its reading.
     """
 
     def __init__(self, timeout_s: float, motion: float) -> None:

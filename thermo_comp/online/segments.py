@@ -5,8 +5,8 @@ Owns the segments: time intervals between temperature readings, with a correctio
 
 A segment ends at a temperature reading, or after one second. The correction is evaluated in full
 at both ends of a segment, so a sample costs a few operations, the output has no steps between two
-readings, and a batch needs one evaluation per segment. The slow part of the variance is evaluated
-at the first segment in each ten seconds.
+readings, and a batch needs one evaluation per segment. The part of the variance by parameters and
+initial lag states, which changes slowly, is evaluated at the first segment in each ten seconds.
 """
 
 from collections.abc import Sequence
@@ -92,7 +92,7 @@ class Model:
 
 
 class ThermalSide:
-    """The code that streaming and batch share: queued readings, thermal state, segments."""
+    """Queued readings, thermal state and segments, which streaming and batch share."""
 
     def __init__(self, model: Model, config: CompensatorConfig, counters: Counters) -> None:
         self.counters = counters
@@ -138,7 +138,7 @@ class ThermalSide:
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # A change of other settings does not end a stop by the rate of samples.
+            # A stop because of the samples' rate persists while the unit is the same.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
@@ -158,7 +158,7 @@ class ThermalSide:
         self._forget_samples()
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Queue a reading, if the calibration knows its thermometer."""
+        """Queue a reading, if the calibration has a thermometer of this name."""
         if name in self.inputs:
             self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
 

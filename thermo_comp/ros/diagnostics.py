@@ -3,8 +3,8 @@
 """
 Owns the node's diagnostics: the compensator's status as a `DiagnosticStatus`.
 
-ERROR: no valid output, or samples are saturated. WARN: the output is worse than the calibration
-states. The message names every reason, the worst first; the values hold the figures.
+The level is ERROR if there is no valid output, or if samples are saturated; WARN if the output is
+worse than the calibration states. The message names every reason, the most severe first.
 """
 
 import math
@@ -171,7 +171,7 @@ class Reporter:
                 yield level, f'no messages of a publisher on {topic}: {mismatch}'
 
     def _lost_rests(self) -> Iterator[Finding]:
-        """Name the reason if rests could not be kept."""
+        """Yield a warning with the reason if rests could not be written to the rest log."""
         rests = self._relay.rests
         if rests is not None and rests.log.reason:
             lost = counted(rests.log.n_lost, 'rest')
@@ -270,7 +270,7 @@ def _of_axes(key: str, values: Iterable[float]) -> dict[str, str]:
 
 
 def _mismatch(node: Node, subscription: Subscription) -> str:
-    """Return why no publisher on a topic is heard: type or QoS; empty if there is none."""
+    """Return why a publisher's messages are not received (type or QoS), or an empty text."""
     topic, expected = subscription.topic_name, type_name(subscription.msg_type)
     for publisher in node.get_publishers_info_by_topic(topic):
         if publisher.topic_type != expected:

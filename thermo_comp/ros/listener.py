@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a node that only listens: the inputs of the live topics as blocks, for `record`."""
+"""Owns the node of `record`, which subscribes to live inputs and yields blocks of messages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _AS_OFFERED = QoSProfile(
 
 
 class LiveTopics:
-    """Listens to the node's inputs; it subscribes to a topic once the topic has a publisher."""
+    """Receives the inputs of the compensating node, each topic once it has a publisher."""
 
     def __init__(self, topics: Topics, ros_args: Sequence[str] = ()) -> None:
         self._topics, self._ros_args = topics, ros_args

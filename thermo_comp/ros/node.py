@@ -50,10 +50,10 @@ example: thermo_comp_node --ros-args -p calibration_file:=unit42.yaml -r accel/c
 parameters:
 """
 
-#: Prefix that the launch file gives to a parameter whose argument was not given.
+#: Prefix that the launch file puts before the name of a parameter whose argument is missing.
 NOT_GIVEN = 'not_given.'
 
-#: Errors that are no bug of the node: of files, values, environment, middleware (RuntimeError).
+#: Errors by the user's files, values or environment, or by the middleware (RuntimeError).
 _USER_ERRORS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
@@ -122,7 +122,7 @@ class CompensationNode:
         return self._relay.running.compensator
 
     def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
-        """Read, try and build the calibration of a parameter change, parallel to the samples."""
+        """Read, test and prepare a changed calibration, in parallel to the samples."""
         names = [change.value for change in changes if change.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
@@ -149,7 +149,7 @@ class CompensationNode:
             if new:
                 self._print_calibration(before.loaded.calibration.unit.serial)
             self._loop.call_soon(partial(self._relay.release, before.samples))
-            # `return` is inside `try`: any failure restores the previous calibration.
+            # Any failure up to this `return` restores the previous calibration and parameters.
             return result  # noqa: TRY300
         except BaseException:
             self._run_with(before)

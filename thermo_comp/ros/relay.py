@@ -4,7 +4,7 @@
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
 Messages do not identify their publisher. A topic with more than one publisher is ignored, as is
-the first batch after a publisher has left, which may hold its messages (`waitloop.Sources`).
+the first batch after a publisher has left, which may hold messages of this publisher.
 """
 
 from bisect import bisect_left, bisect_right

@@ -175,7 +175,7 @@ class WaitLoop:
         self, message_type: Any, topic: str, qos: QoSProfile, *, wakes: bool = True
     ) -> RawSubscription:
         """
-        Subscribe in serialized form.
+        Subscribe to a topic; its messages stay serialized.
 
         While samples flow, only messages of the first subscription with `wakes` end a wait.
         """
@@ -197,7 +197,7 @@ class WaitLoop:
         self.node.destroy_subscription(raw.subscription)
 
     def call_soon(self, callback: Callable[[], None]) -> None:
-        """Call back in the loop's thread, one callback per wake-up; callable from any thread."""
+        """Queue a call in the loop's thread, one per wake-up; callable from any thread."""
         self._soon.append(callback)
         with suppress(InvalidHandle):
             self._guard.trigger()
@@ -292,7 +292,7 @@ class WaitLoop:
         callback: Callable[[], bool | None],
         fatal: tuple[type[Exception], ...] = (ExternalShutdownException,),
     ) -> bool | None:
-        """Call back; log a failure (at most every `_LOG_PERIOD_NS`) and go on with the samples."""
+        """Call a function; log an exception, at most every `_LOG_PERIOD_NS`, and continue."""
         try:
             return callback()
         except fatal:
