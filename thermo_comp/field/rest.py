@@ -60,7 +60,7 @@ class Rest:
 
 
 def encode(record: Start | Rest) -> bytes:
-    """Write a start or a rest as a line."""
+    """Return a start or a rest as a line of a rest log."""
     if isinstance(record, Start):
         # Earlier releases cannot read angular rates and the newer fields of lags and plays: such
         # fields are written only if they differ from their defaults.
@@ -86,7 +86,7 @@ def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
 
 
 def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
-    """Read the rests of a file, each with its start of the node; count the damaged lines."""
+    """Return a file's rests, each with its start of the node, and the number of damaged lines."""
     rests: list[tuple[Start, Rest]] = []
     start: Start | None = None
     n_damaged = 0

@@ -36,8 +36,8 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-#: Parts of the name of an update's source: before the time of the last rest, and before the number
-#: of days by which the covariance was aged.
+#: Parts of the name of an update's source: texts before the time of the last rest, and before the
+#: number of days by which the covariance was aged.
 _UNTIL, _AGED = 'rests until ', ', claim aged '
 
 
@@ -291,8 +291,8 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     Assign windows to groups of consecutive windows that are averaged, at most 60.
 
     All windows of a group belong to the same start of the node. Direction and temperature of a
-    group's windows differ by less than 1e-3 rad and 1 K from those of the first window. Different
-    directions reduce the norm of a mean of vectors by a share of half the squared angle.
+    group's windows differ by less than 1e-3 rad and 1 K from those of the first window. An angle
+    between vectors reduces the norm of their mean by a share of at most half the squared angle.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)

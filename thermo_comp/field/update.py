@@ -30,8 +30,8 @@ from .series import Series, last_rest, valid_since
 #: Names of the conclusions that a user can override: another gravity than stated at the rests, and
 #: samples of another unit.
 OVERRIDES = ('gravity', 'unit')
-#: Limits of the RMS of |f| - g of a start, relative to gravity (a shock of 1 mg) and in claimed sd
-#: (some milli-g for a poor sensor); rests of another unit exceed both limits.
+#: Largest RMS of |f| - g of a start, relative to gravity (a shock of 1 mg) and in claimed sd (some
+#: milli-g for a poor sensor); the RMS of rests of another unit exceeds both limits.
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
 #: Default time after the last rest for which the covariance is aged [days].
 AHEAD_DAYS = 1.0
@@ -40,8 +40,8 @@ AHEAD_DAYS = 1.0
 @dataclass(frozen=True)
 class AxisChange:
     """
-    Changes of an axis' constants, each with posterior sd; if the rests do not determine the axis,
-    the changes are 0 and the sds are prior sds.
+    Changes of an axis' constants by an update, each with its posterior sd; for an axis that the
+    rests do not determine, the changes are 0 and the sds are prior sds.
 
     bias: change of the bias at the temperature of the rests [m/s^2]
     scale: relative change of the scale
@@ -73,8 +73,8 @@ class Judged:
     over, n: kind of the folds, days or starts, and their number
     before, after: RMS of ``|f| - g`` over all folds with the calibration, and with an update from
         the folds before each fold [m/s^2]
-    gain, gain_sd: mean over the folds of the difference of the mean squares, and its standard
-        error [m^2/s^4]
+    gain, gain_sd: mean over the folds of the decrease of the mean square, and the standard error
+        of this mean [m^2/s^4]
     """
 
     over: str
@@ -127,7 +127,7 @@ def update(
 
     `source`, `created`: source and date for the new file's provenance; `ahead`: time after the
     last rest for which the covariance is aged [days]; `is_gravity_certain`: never explain the
-    rests by another gravity than stated. Raises FitError if the rests belong to fewer than three
+    rests by a gravity other than stated. Raises FitError if the rests belong to fewer than three
     starts of the node.
     """
     n_starts = int(series.start.max()) + 1
@@ -251,7 +251,7 @@ def _axis_changes(
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score the update by earlier rests on each day or, with less than five days, each start."""
+    """Score updates by earlier rests on each day or, if there are less than five, each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -345,7 +345,7 @@ def _gravity_texts(result: Update) -> Iterator[str]:
 
 
 def change_texts(result: Update) -> list[str]:
-    """Describe the ageing, the changes, and the axes that the rests do not determine."""
+    """Return sentences on the ageing, the changes, and axes that the rests do not determine."""
     ageing = result.ageing
     lines = [
         f'random walk of the bias {ug_text(ageing.bias)}, of the scale '

@@ -25,13 +25,13 @@ from .update import Update, update
 #: Largest error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
 #: Length of the window whose RMS decides the verdict [days]: long enough to average the scatter of
-#: single starts, and short against the time in which a unit drifts to its limit.
+#: single starts, and short against the time in which a unit drifts to the limit.
 _WINDOW_DAYS = 7
-#: Smallest number of starts whose attitudes the forecast uses, if the last window has fewer.
+#: Smallest number of starts of the node whose attitudes the forecast uses.
 _LEAST_STARTS = 10
 #: Probabilities of the forecast, its horizon [days], and number of simulated random walks.
 _QUANTILES, _HORIZON, _WALKS = (0.1, 0.5, 0.9), 3650.0, 2000
-#: Width of a temperature class [K], and largest number of periods, in the tables of a watch.
+#: Width of a temperature class [K], and largest number of periods, in the tables of `Watch`.
 _CLASS_K, _PERIODS = 10.0, 30
 
 
@@ -192,7 +192,7 @@ def _forecasts(
     """
     Forecast when the unit leaves its claim, with the present calibration and just after an update.
 
-    The attitudes of use are those of the rests in the last window, and of ten starts at least.
+    The attitudes of use are those of the rests in the last week, and of ten starts at least.
     """
     used, ageing, solution = updated.series, updated.ageing, updated.solution
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS
@@ -267,7 +267,7 @@ def passage(
     for step in np.diff(times):
         if stays[-1] <= 1.0 - _QUANTILES[-1]:
             break
-        # Remove the walks beyond the bound once they are more than a fifth of all walks.
+        # Remove the walks beyond the bound once more than a fifth of the walks are beyond it.
         is_in = inside > 0.0
         if is_in.mean() < 0.8:
             error, speed, left, inside = error[is_in], speed[is_in], left[is_in], inside[is_in]

@@ -24,7 +24,7 @@ _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
 _RING = 22.0
-# Largest number of positions in `draw_every_position`, a row each.
+# Largest number of positions, and so of rows, in `draw_every_position`.
 _MOST = 24
 
 
@@ -44,7 +44,7 @@ def draw_temperatures(evidence: Evidence) -> Figure:
 
 
 def draw_dynamics(evidence: Evidence) -> Figure:
-    """Draw the readings' drift, the temperatures' derivatives and the flag (Fig. 4 a, b, c)."""
+    """Draw drift, derivatives of the temperatures and regime flag (the paper's Fig. 4 a, b, c)."""
     drift, name = _drift(evidence)
     heights = [1.725] * bool(len(drift)) + [1.495, 1.15, 0.8625]
     figure, panels, shown, unit = _panels(evidence, heights, is_flagged=True)
@@ -119,7 +119,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """Make panels over time for the shown bag, grey where dynamic; return also the time unit."""
+    """Return figure, panels over time (dynamic regime in grey), shown bag and time unit [s]."""
     shown = required(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
@@ -144,7 +144,7 @@ def _rows(evidence: Evidence) -> Bools:
 
 
 def _plot(axes: Axes, evidence: Evidence, value: Floats, unit: float, **line: Any) -> None:
-    """Draw a value of the windows over time, with a gap between positions."""
+    """Draw a value of the shown bag's windows over time, with gaps between positions."""
     windows, rows = required(evidence.windows), _rows(evidence)
     time, value = style.broken(windows.time[rows], value[rows], windows.position[rows])
     axes.plot(time / unit, value, **line)

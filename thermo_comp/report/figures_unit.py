@@ -93,9 +93,9 @@ def _draw_less_line(
 
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
-    Average the residual in each soak of each position: temperatures (n,), bias [micro-g] and scale
-    [ppm] (n, 6), attributed to bias or to scale alone; scale is NaN if the axis senses less
-    than half of gravity.
+    Average the residual in each soak of each position; return temperatures (n,), and the residual
+    as a bias [micro-g] and as a scale error [ppm], (n, 6). The scale error is NaN if the axis
+    senses less than half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:

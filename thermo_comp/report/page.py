@@ -78,7 +78,7 @@ def render_report(
     *,
     figures: Sequence[tuple[ReportFigure, str]] | None = None,
 ) -> str:
-    """Render the page with the given figures; by default all that the evidence allows."""
+    """Return the page with the given figures, by default all that the evidence allows."""
     if figures is None:
         figures = drawn_figures(figures_of(evidence))
     info = info or CertificateInfo()
@@ -127,7 +127,7 @@ def schuler_peak(bias: float) -> float:
 
 
 def remarks_of(bag: ReducedBag) -> list[str]:
-    """List losses and peculiarities of a bag."""
+    """Return remarks on a bag: lost samples, no rest, several rests, no case temperature."""
     n = len(bag.intervals)
     return [
         text
@@ -145,7 +145,7 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _judged_bags(evidence: Evidence) -> list[str]:
-    """Describe the bags of the verdict; add a sentence if the shown bag has no known regime."""
+    """Return sentences on the judged bags and, if so, on a shown bag without known regime."""
     collected = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
@@ -196,7 +196,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if shown is None:
         return
     bag = f'Bag {label_text(shown.bag.source.name, 60)}.'
-    read = f'Grey: the time in which the flag says dynamic. {bag} After Fig.'
+    read = f'Grey: dynamic regime. {bag} After Fig.'
     yield (
         'How did the unit follow the chamber?',
         of_bags.draw_temperatures,

@@ -27,7 +27,7 @@ class Program(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The name of the program; for a ramp also the rate."""
+        """The name of the program and, for a ramp, the rate."""
         return f'{self.name} at {abs(self.rate_k_min):g} K/min' if self.rate_k_min else self.name
 
 
@@ -88,7 +88,7 @@ def table_temperatures(lowest: float, highest: float) -> Floats:
     span = highest - lowest
     step = next((k for k in _STEPS_K if span <= k * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
     within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)
-    # Skip round temperatures within a quarter of a step from an end of the range: their rows would
+    # Skip round temperatures within a quarter of a step from an end of the range: these rows would
     # repeat the row of the end.
     kept = within[(within - lowest > 0.25 * step) & (highest - within > 0.25 * step)]
     return np.array([lowest, *kept, highest])
