@@ -68,10 +68,10 @@ static:                              # the set of the static regime
 response:                            # columns of both sets
   - kind: gradient                   # T_case - T_board
     group: gradient
-    range: [-9.0, 9.0]               # held at its edges
+    range: [-9.0, 9.0]               # the value is limited to it
     bias: [0.0021, 0.0014, -0.0006]  # x, y, z: counts per K
     scale: [1.1e-06, 9.0e-07, 1.3e-06]  # relative, per K
-  - kind: board                      # T_board minus its lag
+  - kind: board                      # T_board - lagged T_board
     group: board
     tau_s: 960.0
     range: [-20.0, 20.0]
@@ -191,7 +191,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 
 
 def json_schema(cls: type) -> dict[str, Any]:
-    """Return the JSON Schema of a dataclass including nested ones."""
+    """Return the JSON Schema of a dataclass including nested dataclasses."""
     definitions: dict[str, Any] = {}
     top = _schema(cls, definitions)['$ref'].rpartition('/')[2]
     result = definitions.pop(top)
@@ -316,7 +316,7 @@ def _section(
     for key, value in part.get('properties', {}).items():
         default = 'required' if key in required else f'`{json.dumps(value.get("default"))}`'
         if len(default) > 40:
-            default = 'see there'
+            default = 'in the schema'
         meaning = value.get('description', '') or _described(value, definitions)
         # Escape brackets: an element of a matrix is not a link.
         meaning = re.sub(r'\w+(\[\d\]){2}', r'`\g<0>`', meaning)

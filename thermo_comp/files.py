@@ -67,7 +67,7 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """Choose the kind of an output bag by its suffix; the error message also lists `others`."""
+    """Return the kind of an output bag by its suffix; the error message also lists `others`."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP

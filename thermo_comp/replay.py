@@ -76,14 +76,14 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
     if info.input == 'imu' and calibration.unit.input != 'm/s^2':
         raise CalibrationError(
             f'this calibration takes samples in {calibration.unit.input}, but those read from '
-            f'{info.path} are sensor_msgs/Imu in m/s^2: if it has counts, too, choose them with '
+            f'{info.path} are sensor_msgs/Imu in m/s^2: if the recording has counts, too, choose '
             '--input counts',
             key='unit.input',
         )
 
 
 def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
-    """Choose the input topics: ``auto`` reads counts for a calibration in counts, else Imu."""
+    """Return the input topics: ``auto`` reads counts for a calibration in counts, else Imu."""
     topics = topics or Topics()
     if topics.input != 'auto':
         return topics

@@ -93,8 +93,8 @@ IMU_OUT = NodeTopic('imu/data_raw', IMU, 'specific force in m/s^2', 2000)
 REGIME = NodeTopic(
     'regime/dynamic',
     BOOL,
-    'whether the regime is dynamic (S = 1); sent at each reading that decides it, of the case or, '
-    'while there is none of the case, of the board; not published while S is unknown',
+    'whether the regime is dynamic (S = 1); sent at each case reading or, without case, at each '
+    'board reading; not sent while S is unknown',
     1,
     is_latched=True,
 )

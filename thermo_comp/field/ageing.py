@@ -30,9 +30,9 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import Series
 
-#: Centres of the priors of sd, relative to that of the turn-on offset: random walk per root day of
-#: bias and of scale times g; scatter of a rest. Prior sd of the logarithm of each sd in `Ageing`:
-#: a factor of 5.
+#: Centres of priors of sds, relative to the centre for the turn-on offset: random walk of bias and
+#: of scale times g per root day, and scatter of a rest. Prior sd of the logarithm of each sd in
+#: `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
 #: Centre of the prior of the sd of the lag states at a start, relative to the sd that the
 #: calibration assumes; a unit in thermal equilibrium before its start has smaller lags.
@@ -146,7 +146,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
         # rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
-        # Another gravity changes |f| alike in all attitudes.
+        # A change of gravity changes |f| equally in all attitudes.
         ones = np.ones(len(series))
         levels = (series.by_parameter, series.by_level, ones)
         summed = (series.residual, *levels, series.by_start, series.lack)
@@ -262,7 +262,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centre of the priors, from the fit's residual sd or else the noise in 1 Hz."""
+    """Return the centres of the priors, from the fit's residual sd or else the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on

@@ -142,7 +142,7 @@ def read_rests(
     if others:
         notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
     if not rests:
-        found = ': no rest at all, is it a rest log?'
+        found = ': the files hold no rest'
         if others:
             found = f': the rests are of {", ".join(sorted(others))}'
         raise RecordingError(f'no rest of unit {wanted}{found}', ', '.join(map(str, paths)))
@@ -281,7 +281,7 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 
 def _numbered(start: Ints) -> Ints:
-    """Return the number of each start of the node, from 0 in order of appearance."""
+    """Return the number of each rest's start of the node, from 0 in order of appearance."""
     _, first, start = np.unique(start, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
 

@@ -354,11 +354,11 @@ def change_texts(result: Update) -> list[str]:
         f'{ug_text(ageing.rest)}'
     ]
     if result.series.by_start.any():
-        lines[0] += f'; sd of the lags at a start {ageing.lags:.2g} times that of the calibration'
+        lines[0] += f'; sd of the lags at a start {ageing.lags:.2g} times the calibrated sd'
     for change in result.changes:
         if change.time is None:
             lines.append(
-                'the curves of the bias over temperature have changed, not only its level'
+                'the curves of the bias over temperature have changed, not only the level'
             )
         elif change.kind == 'levels':
             day = np.datetime64(int(change.time * 86400.0), 's')

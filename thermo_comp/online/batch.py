@@ -56,7 +56,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct the samples of a block, and angular rates (n, 3), to the bits of single samples."""
+    """Correct a block's samples, and angular rates (n, 3), with the bits of single samples."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)

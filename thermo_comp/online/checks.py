@@ -76,11 +76,11 @@ class StuckCheck:
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
         self.motion = motion
         self.last = (math.nan, math.nan, math.nan, 0)  # the last sample and its stamp
-        #: Present run of each axis, or empty if the last sample changed all three.
+        #: Present run of equal readings of each axis; empty if the last sample changed all axes.
         self.runs: tuple[Run, ...] = ()
 
     def again(self, stamp_ns: int, x: float, y: float, z: float) -> bool:
-        """Take a sample that repeats at least one axis; return whether it is stuck."""
+        """Take a sample with the last reading of any axis; return whether the sample is stuck."""
         last = self.last
         self.last = sample = (x, y, z, stamp_ns)
         runs = self.runs or ((last, 0, 0.0),) * 3
@@ -155,8 +155,8 @@ class RateCheck:
     @property
     def noise_excess(self) -> float:
         """
-        Excess of the noise variance of a sample over its calibrated value, as a share of the
-        calibrated value; it follows from the rate of samples.
+        Excess of the noise variance of a sample over the calibrated variance, relative to the
+        calibrated variance, because of the rate of samples.
         """
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
@@ -198,7 +198,7 @@ class GravityCheck:
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        # Whether |f| of the last windows differed from gravity by more than the tolerance.
+        # Whether |f| of the last windows refutes the calibration.
         self.is_refuted = False
         self._n_agreeing = 0
         self._is_against = False

@@ -302,7 +302,7 @@ class Compensator:
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Use another model or settings; the original of a copied `self` stays as it is."""
+        """Use another model or settings; if `self` is a copy, the original does not change."""
         gravity, before = copy(self.gravity), self._gravity_settings
         stuck = self.stuck
         self.config, self.thermal = config, copy(self.thermal)
@@ -367,7 +367,7 @@ class Compensator:
 
     @property
     def scale_sd(self) -> tuple[float, ...]:
-        """Sd of the relative scale of each axis in the present segment; empty at first."""
+        """Sd of the relative scale of each axis in the present segment, () before the first."""
         line = self._segment[1]
         return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
 

@@ -90,7 +90,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         slope = f'{drift_k:g} K times the slope of the correction'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
     beyond = 'residual in excess of noise, attitude and model'
-    # The gravity uncertainty that was given to the fit is a part of the claimed sd already.
+    # The claimed sd already contains the uncertainty of gravity that was given to the fit.
     gravity = unclaimed_gravity_sd(evidence, info)
     in_fit = 'given to the fit, included in the model' if evidence.gravity_sd else ''
     return (
@@ -232,7 +232,7 @@ def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
     if unclaimed_gravity_sd(evidence, info) is None:
         return (
             'U of the scale factors and of |f| − g is withheld: the uncertainty of local gravity, '
-            'which is a part of it, is not stated.'
+            'a part of U, is not stated.'
         )
     return ''
 

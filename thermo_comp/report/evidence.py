@@ -34,7 +34,7 @@ RAW = 'raw'
 CHOSEN = 'calibration'
 #: The correction of each position of a fit by a calibration fitted to the other positions.
 LEFT_OUT = 'left out'
-# Rate of heating (or cooling) from which bags count as holding a heating (cooling) ramp [K/min].
+# Rate from which the heating (cooling) in bags counts as a heating (cooling) ramp [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
 #: Key of a bag's metadata in which the simulator stores the truth.
 _SIMULATED = 'truth'
@@ -105,7 +105,7 @@ class Evidence:
         if self.calibration is not None:
             if self.bags:
                 return 'not judged: no recording has a rest of the length of a window'
-            return 'the calibration alone: no recording was judged with it'
+            return 'the calibration alone: no recording was judged'
         if not self.bags:
             return 'nothing to show yet: no file could be read'
         return 'a thermal record: no calibration was judged'
@@ -245,7 +245,7 @@ def evidence_of_bags(
 
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
-    """Collect the results of a fit on its bags; `gravity_sd`: option of the fit [m/s^2]."""
+    """Return the evidence of a fit on its bags; `gravity_sd`: option of the fit [m/s^2]."""
     rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
     left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
     against = [f'{note.name}: {note.message}' for note in result.findings if _is_reservation(note)]

@@ -41,7 +41,7 @@ _EARTH_RADIUS = 6.371e6
 
 
 class ReportFigure(NamedTuple):
-    """A figure: name of its file, the question it answers, how to read it, the drawing."""
+    """A figure: file name, question that it answers, how to read it, drawing function."""
 
     name: str
     question: str
@@ -209,8 +209,8 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         of_bags.draw_dynamics,
         f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
         f'rates of the temperatures and, below, the second derivative of the {shown.leader} '
-        'temperature, whose pulses open and close the dynamic state; (c) the state that follows, '
-        'with its direction; it is unknown until the detector has enough readings. '
+        'temperature, whose pulses open and close the dynamic state; (c) the regime that follows, '
+        'with its direction, unknown until the detector has enough readings. '
         f'{read} 4 of the paper.',
     )
     if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
@@ -226,8 +226,8 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'Does |f| stay constant over the whole program?',
         of_bags.draw_gravity,
         f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
-        'for a unit at rest it is zero at any temperature. Above: before and after '
-        'the correction; below: after it, in a larger scale. '
+        'of an ideal unit at rest zero at any temperature. Above: before and after '
+        'the correction; below: after the correction, in a larger scale. '
         f'{read} 7 of the paper.',
     )
 
@@ -279,7 +279,7 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         )
     if evidence.positions:
         yield (
-            'Are the positions well spread, and is any of them an outlier?',
+            'Are the positions well spread, and is any position an outlier?',
             of_bags.draw_positions,
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '

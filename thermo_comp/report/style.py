@@ -56,7 +56,7 @@ _RC: dict[str, Any] = {
     'legend.borderaxespad': 0.0,
     'legend.borderpad': 0.0,
     'hatch.linewidth': 0.5,
-    # Names in figures come from outside: a dollar sign must not start a formula.
+    # Names in figures come from files: a dollar sign must not start a formula.
     'text.parse_math': False,
     'svg.fonttype': 'none',
     'svg.hashsalt': 'thermo_comp',
@@ -133,7 +133,7 @@ def shared_legend(figure: Figure, axes: Axes, n_columns: int) -> None:
 
 
 def log_axis(axes: Axes, low: float, high: float) -> None:
-    """Make the x axis logarithmic from `low` to `high`, with enough plain numbers on it."""
+    """Make the x axis logarithmic from `low` to `high`, with plain numbers at its ticks."""
     axes.set_xscale('log')
     axes.set_xlim(low, high)
     is_short = high < 50.0 * low

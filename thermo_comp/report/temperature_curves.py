@@ -46,7 +46,7 @@ class Curve(NamedTuple):
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """List a soak and, if ramps differ from a soak, ramps at half the fastest calibrated rate."""
+    """Return a soak and, if ramps differ from it, ramps at half the fastest calibrated rate."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:
@@ -84,7 +84,7 @@ def slopes(soak: Curve) -> Floats:
 
 
 def table_temperatures(lowest: float, highest: float) -> Floats:
-    """Choose the temperatures of a table: both ends of a range, and round numbers between them."""
+    """Return the temperatures of a table: both ends of a range, and round numbers in between."""
     span = highest - lowest
     step = next((k for k in _STEPS_K if span <= k * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
     within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)

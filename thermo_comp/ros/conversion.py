@@ -20,7 +20,7 @@ from sensor_msgs.msg import Imu, Temperature
 
 #: Compensates a sample: from stamp [ns], x, y, z to force and covariance; None if it is dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of a sample: stamp and rate in, rate and variances out.
+#: Corrects the angular rate of a sample: from stamp and rate to rate and variances.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 #: Longest message read [bytes]; an Imu with the longest frame name is shorter.
@@ -41,7 +41,7 @@ _CELSIUS = struct.Struct('<d')
 
 @dataclass(slots=True)
 class Traffic:
-    """The node's counters, in addition to the compensator's."""
+    """The counters of the node, in addition to those of the compensator."""
 
     n_lost: int = 0  # samples that the driver sent and the node did not receive
     n_unpublished: int = 0  # output messages that the middleware did not accept
@@ -100,7 +100,7 @@ class SampleConverter:
         )  # fmt: skip
 
     def _learn(self, data: bytes) -> bytes:
-        """Note the offsets of a message of new layout; return its plain form, or empty bytes."""
+        """Store the layout of a message; return the message's plain form, or empty bytes."""
         is_imu = self._kind is Imu
         skip, n_after = (_PASSED, 72) if is_imu else (0, 0)
         size = skip + 24 + n_after

@@ -40,7 +40,7 @@ class LiveTopics:
         self._feeds: dict[Role, Topic] = {}
         self._fields: dict[Role, LiveField] = {}
         self._last_ns = NO_STAMP_NS
-        self.problems: tuple[str, ...] = ()  # reasons why a topic has no messages, as sentences
+        self.problems: tuple[str, ...] = ()  # reasons why topics have no messages, as texts
 
     def __enter__(self) -> LiveTopics:
         with ExitStack() as stack:

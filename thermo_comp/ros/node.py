@@ -58,7 +58,7 @@ _USER_ERRORS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.Paramet
 
 
 class CompensationNode:
-    """The node around a `Compensator`; ThermoCompError if the node cannot start."""
+    """The ROS node with a `Compensator`; ThermoCompError if the node cannot start."""
 
     def __init__(self, context: rclpy.context.Context | None = None) -> None:
         self.node = rclpy.create_node(NODE_NAME, context=context)
@@ -197,7 +197,7 @@ class CompensationNode:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; 0 after an orderly end, 1 if it could not start, 2 for a wrong usage."""
+    """Run the node; return 0 after an orderly end, 1 if the start failed, 2 for a wrong usage."""
     args = sys.argv if args is None else args
     hold_standard_streams()
     try:

@@ -98,12 +98,12 @@ class NodeConfig:
     )
     temperature_timeout: float = _parameter(
         _DEFAULTS.temperature_timeout_s,
-        'Age of the board temperature at which publishing stops [s].',
+        'Age of the last board temperature at which publishing stops [s].',
         (0.1, 86400.0),
     )
     case_timeout: float = _parameter(
         _DEFAULTS.case_timeout_s,
-        'Age of the case temperature at which the board sensor decides the regime [s].',
+        'Age of the last case temperature from which the board sensor decides the regime [s].',
         (0.1, 86400.0),
     )
     stuck_timeout: float = _parameter(
@@ -125,7 +125,7 @@ class NodeConfig:
         '0: publishing never stops.',
         (0.0, 100.0),
     )
-    diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
+    diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))
 
     def compensator_config(self) -> CompensatorConfig:
         """Return the settings of the compensator, whose names end in the unit."""
@@ -244,7 +244,7 @@ class ParameterRequests:
                 loop.handlers[service] = partial(_reply, service)
 
     def close(self) -> None:
-        """Wait for the request that is being prepared; apply no more values."""
+        """Wait for the request in preparation; apply no more requests."""
         for pool in (self._slow, self._quick):
             pool.shutdown(cancel_futures=True)
 

@@ -29,7 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading applies once the newest reading is later by this time [ns].
+#: Without samples, a reading applies once a reading that is later by this time has arrived [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
@@ -38,7 +38,7 @@ _Reading = tuple[int, tuple[str, int, float]]
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """Everything that a reload replaces, by exchanging one reference between two samples."""
+    """All objects that a reload replaces, by exchanging a reference between two samples."""
 
     loaded: LoadedCalibration
     config: NodeConfig

@@ -299,7 +299,7 @@ class Calibration:
 
     @property
     def needs_temperature(self) -> bool:
-        """Whether the correction depends on temperature; if not, it is constant."""
+        """Whether the correction depends on temperature; otherwise the correction is constant."""
         weights: list[float] = []
         for axis in (axis for part in self.regime_sets() for axis in part.axes()):
             weights += (axis.delta, *axis.bias_function.free_coefficients)
@@ -311,7 +311,7 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether the fit used a case thermometer, or a column depends on its key `sensor`."""
+        """Whether the fit used a case thermometer, or a column depends on one of `sensors`."""
         columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
         return self.detector.case != ThermometerSettings() or any(
             column.is_of_sensor for column in columns

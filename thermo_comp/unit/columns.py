@@ -68,7 +68,7 @@ class Part(NamedTuple):
 
     tau_s, second_tau_s: time constants of the two stages [s]; the second is 0 for a single stage
     sensor_share: the part lags the board temperature plus this share of the sensor's gradient
-    lead_s: time by which the temperature that the part lags leads the board thermometer [s]
+    lead_s: lag of the board thermometer behind the temperature that drives the part [s]
     """
 
     tau_s: float

@@ -43,7 +43,7 @@ class SlowUncertainty:
             sum(share * tau for (name, tau), share in lag.singles.items() if name == BOARD_INPUT)
             for lag in lags
         ])  # fmt: skip
-        #: By axis the rows of the posterior's factor, and the added variances: of bias, scale and
+        #: For each axis, rows of the posterior's factor and added variances: of bias, scale and
         #: nonlinear terms.
         self._blocks: list[list[tuple[Floats, Floats]]] = []
         #: Rows of the posterior's factor, and added variances, of the misalignment.

@@ -111,7 +111,7 @@ class Gradient(Term):
 
 
 class Rate(Term):
-    """The rate of the board temperature: effect of a heat flow, with one thermometer."""
+    """The rate of the board temperature: effect of a heat flow, for a single thermometer."""
 
     kind, formula = 'rate', 'dT_board/dt [K/s]'
     groups = (('rate', 'rate of the board'),)
