@@ -145,7 +145,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
     # The RMS of a week follows a change late. A unit leaves its claim after a day above the limit
     # if the ageing model's error at the last rest is above the limit, too. A unit is within its
-    # claim again after two days within the limit if the ageing model's error is within, too.
+    # claim again after two days within the limit if the ageing model's error is, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]

@@ -32,7 +32,7 @@ from .status import CompensatorConfig, Counters
 
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
-SLOW_NS: Final = 10_000_000_000  # time for which the slow part of the variance is held [ns]
+SLOW_NS: Final = 10_000_000_000  # time for which `SlowState`, and so its variance, is held [ns]
 YOUNG_READINGS: Final = 30  # board readings after a start that determine the board's rate
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
@@ -41,8 +41,8 @@ UNMEASURED_SD_K: Final = 10.0
 
 class SlowState(NamedTuple):
     """
-    Arguments of the slow part of the variance: the thermal state, the remaining shares of the
-    lags' unknown initial states, `ThermalMemory.start_rate`.
+    Arguments of the variance by parameters and initial lag states: the thermal state, remaining
+    shares of the lags' unknown initial states, `ThermalMemory.start_rate`.
     """
 
     state: tuple[float, ...]
@@ -60,7 +60,7 @@ class Segment(NamedTuple):
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    slow: SlowState  # the same object in all segments with the same slow part of the variance
+    slow: SlowState  # the same object in successive segments with equal arguments
 
 
 _NO_STATE: Final = SlowState((), [], 0.0)

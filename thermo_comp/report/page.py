@@ -216,7 +216,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
         return
     yield (
-        'What does the correction leave on each axis?',
+        'Which residual does the correction leave on each axis?',
         of_bags.draw_residuals,
         'Residual of each axis in the output frame. The attitude in a position is not known: '
         'the mean direction measured there replaces it. Each panel has a separate scale. '

@@ -167,7 +167,7 @@ class Curves:
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
         Differentiate values beyond the ranges by the free coefficients of a function, (n_free, n).
-        Beyond the range of a set, values are its tangent plus the constant difference of the sets.
+        Beyond the range of a set, its values are a tangent plus the constant difference of sets.
         """
         function = self._functions.rows[regime][place]
         own_range, other_range = (

@@ -19,7 +19,7 @@ class GroupEvidence:
 
     group: Annotated[str, 'Name of the group, as in the key `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
-    explains_m_s2: Annotated[_Error, "RMS of the group's correction over the fit."]
+    explains_m_s2: Annotated[_Error, "RMS of the group's correction in the fitted data."]
     effective_parameters: Annotated[
         float, QUANTITIES['number'], 'Effective number of weights determined by the data.'
     ]

@@ -146,8 +146,8 @@ class GradientLag(Term):
         ('gradient_lag', 'parts between case and board'),
         # The columns of group `gradient_x_temperature` give coefficients that change with
         # temperature.
-        ('product', 'lags, changing with temperature'),
-        ('gradient_x_temperature', 'heat flow, changing with temperature'),
+        ('product', 'lags, with effects that change with temperature'),
+        ('gradient_x_temperature', 'heat flow, with an effect that changes with temperature'),
     )
 
     def source(self, column: Column) -> Quantity:
