@@ -207,7 +207,7 @@ def _apply(
 
 
 def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
-    """Evaluate the slow part of the variance of segments, once for each `SlowState`."""
+    """Evaluate the slowly varying variance of segments, once for each `SlowState`."""
     held = {id(segment.slow): segment.slow for segment, _ in segments}
     rows = compensator.thermal.model.slow_rows([*held.values()])
     places = {key: place for place, key in enumerate(held)}
@@ -215,7 +215,7 @@ def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
 
 
 def _line(correction: Correction, segments: Segments, slow: Floats) -> Floats:
-    """Evaluate `Correction.line` for segments, with the slow part of their variance."""
+    """Evaluate `Correction.line` for segments, with their slowly varying variance."""
     start, end = (np.array([segment[at] for segment, _ in segments]).T for at in (4, 5))
     excess = np.array([segment.noise_excess for segment, _ in segments])
     return correction.line(start, end, slow, excess)

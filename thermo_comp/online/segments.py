@@ -84,7 +84,7 @@ class Model:
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
         """
-        Evaluate the slow part of the variance of the force, `Correction.n_slow` rows, then that of
+        Evaluate the slowly varying variance of the force, `Correction.n_slow` rows, then that of
         the angular rate, shape (rows, len(held)).
         """
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
@@ -243,16 +243,16 @@ class ThermalSide:
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def slow_rows(self, slow: SlowState) -> Floats:
-        """Evaluate the slow part of the variance of a segment, once for each `SlowState`."""
+        """Evaluate the slowly varying variance of a segment, once for each `SlowState`."""
         if slow is not self._slow_evaluated:
             self._slow_evaluated = slow
             self._slow_rows = self.model.slow_rows([slow])[:, 0]
         return self._slow_rows
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
-        """Return the thermal state that determines the slow part of the variance for `SLOW_NS`."""
-        # The first readings after a start do not show the rate yet, on which the unknown initial
-        # lag states depend: evaluate the variance in each segment.
+        """Return the thermal state that determines the slowly varying variance for `SLOW_NS`."""
+        # The unknown initial lag states depend on the board's rate, which the first readings after
+        # a start do not show: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS
         key = start_ns // (SEGMENT_NS if is_young else SLOW_NS)
         if key != self._slow_key:

@@ -225,7 +225,7 @@ def _checked(name: str, value: Any) -> Any:
 class ParameterRequests:
     """Answers a node's parameter services."""
 
-    # `prepare` does the slow part of a parameter change in parallel to the samples, `apply` sets
+    # `prepare` reads files for a parameter change in parallel to the samples, `apply` sets
     # the prepared result between two samples; an exception in `prepare` or `apply` refuses it.
     def __init__(
         self,

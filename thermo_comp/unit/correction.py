@@ -110,7 +110,7 @@ class Correction:
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
-        #: Number of rows of the slow part of the error variance.
+        #: Number of rows of the slowly varying error variance of `SlowUncertainty.at`.
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
@@ -198,7 +198,7 @@ class Correction:
         Evaluate the correction of segments, linear in time between the thermal states at both
         ends.
 
-        `slow` is the slow part of the error's covariance, shape (n_slow, n), see
+        `slow` is the slowly varying error covariance, shape (n_slow, n), see
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
         segment (1 s), scale and its change, then the coefficients of the covariance with the noise
         of a message, see `covariance.covariance_at`. With a nonlinearity `slow` has 15 more rows

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns predictions for a thermal state: the slow part of the error covariance (by the parameters, and
+Owns predictions for a thermal state: the slowly varying error covariance (by the parameters, and
 by lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
