@@ -226,7 +226,7 @@ class ParameterRequests:
     """Answers a node's parameter services."""
 
     # `prepare` reads files for a parameter change in parallel to the samples, `apply` sets
-    # the prepared result between two samples; an exception in `prepare` or `apply` refuses it.
+    # the prepared result between two samples; an exception in either refuses the change.
     def __init__(
         self,
         loop: WaitLoop,
