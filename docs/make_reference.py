@@ -68,10 +68,10 @@ static:                              # the set of the static regime
 response:                            # columns of both sets
   - kind: gradient                   # T_case - T_board
     group: gradient
-    range: [-9.0, 9.0]               # held at its edges
+    range: [-9.0, 9.0]               # the value is limited to it
     bias: [0.0021, 0.0014, -0.0006]  # x, y, z: counts per K
     scale: [1.1e-06, 9.0e-07, 1.3e-06]  # relative, per K
-  - kind: board                      # T_board minus its lag
+  - kind: board                      # T_board - lagged T_board
     group: board
     tau_s: 960.0
     range: [-20.0, 20.0]
@@ -105,7 +105,8 @@ INTERFACE = """\
 # ROS interface of the node
 
 The node is `thermo_comp`, its executable `thermo_comp_node`. All topic names but `/diagnostics` are relative, and can be
-remapped. An output carries the stamp of its input; the node never stamps with its own clock and needs no `use_sim_time`.
+remapped. Samples and regime flags carry the stamps of the inputs, only `/diagnostics` that of the node's clock, so the node
+needs no `use_sim_time`.
 
 ## Topics
 
@@ -124,9 +125,9 @@ sample is sent again up to 20 ms later than with 0 s. A profile of the user (`FA
 in the user's profile.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
-current thermal state. If the input has no angular rate or no orientation, the first element of its covariance is -1 (REP
-145). If the calibration has a `gyroscope`, the bias at the current thermal state is subtracted from `angular_velocity`, and
-`angular_velocity_covariance` is the noise of a message plus the uncertainty of that bias.
+current thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
+missing quantity is -1 (REP 145). If the calibration has a `gyroscope`, the bias at the current thermal state is subtracted
+from `angular_velocity`, and `angular_velocity_covariance` is the noise of a message plus the uncertainty of that bias.
 
 ## A driver's own topics
 
@@ -164,33 +165,33 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | NaN or infinite counts | dropped, counted, WARN |
 | counts at full scale | dropped, counted, ERROR while it lasts |
 | no board temperature yet | nothing is published, ERROR |
-| no board temperature, and a calibration without temperature correction | the constants are applied, and the covariance allows for 10 K |
+| no board temperature, and a calibration without temperature correction | the constants are applied; the covariance includes a temperature sd of 10 K |
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
 | case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
 | board temperature outside the calibrated range | curves continue along their tangent for a quarter of the range, and are constant beyond; larger covariance, WARN with the distance |
 | gradient or rate outside the calibrated range | constant beyond the edge, larger covariance, WARN with the distance |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
-| a temperature that jumps faster than any part can | its readings are not used until they are plausible again or the sensor is lost |
-| a temperature that is constant while that of the other thermometer changes | its readings are not used: the last value is held, then the sensor counts as lost |
-| both temperatures constant over 20 readings and 5 s, or more | used, with a growing covariance, WARN |
-| a board that leads the case in ramps (swapped topics) | larger covariance, ERROR |
-| counts constant for `stuck_timeout`, on all axes or on one while both others move, or all zero | dropped, counted, ERROR |
+| a temperature that jumps faster than any part can | the readings are not used until they are plausible again or the thermometer counts as lost |
+| a temperature that is constant while the other temperature changes | the constant readings are not used: the last value is held, then the thermometer counts as lost |
+| both temperatures constant over at least 20 readings and 5 s | the temperatures are used with a growing covariance, WARN |
+| a board temperature that leads the case temperature in ramps (swapped topics) | larger covariance, ERROR |
+| counts constant for `stuck_timeout`, on all axes or on one axis while the other two change; three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
-| a magnitude at rest that misses gravity by `gravity_tolerance` | nothing is published, ERROR |
-| a second publisher of a topic | the topic is not used, ERROR, until only one publisher is left, or only one has sent for a second (after a kill the middleware lists the other for 20 s, WARN) |
+| a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` | nothing is published, ERROR |
+| a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or all messages of a second are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
 | a sample without a finite correction | dropped, counted, ERROR |
 | a message of more than 1 kB (a very long `frame_id`) | dropped, counted |
-| a temperature stamped more than 5 s after the next one of its sensor | not used |
-| a stamp that repeats or goes back a little | dropped, counted |
-| a stamp more than 15 s (or ten cycles) ahead, which no reading and no second sample confirms | dropped, counted |
-| a stamp that goes back by more than a second | the estimators restart, reported once |
+| a temperature stamped more than 5 s after the next reading of the same thermometer | not used |
+| a sample whose stamp repeats, or goes back by less than a second | dropped, counted |
+| a sample stamped more than 15 s (or ten cycles, if longer) ahead, until a reading or a second sample confirms the time | dropped, counted |
+| a sample whose stamp goes back by a second or more | the estimators restart, reported once |
 
 [Faults](faults.md) lists every fault with its test.
 """
 
 
 def json_schema(cls: type) -> dict[str, Any]:
-    """Return the JSON Schema of a dataclass including nested ones."""
+    """Return the JSON Schema of a dataclass including nested dataclasses."""
     definitions: dict[str, Any] = {}
     top = _schema(cls, definitions)['$ref'].rpartition('/')[2]
     result = definitions.pop(top)
@@ -315,7 +316,7 @@ def _section(
     for key, value in part.get('properties', {}).items():
         default = 'required' if key in required else f'`{json.dumps(value.get("default"))}`'
         if len(default) > 40:
-            default = 'see there'
+            default = 'in the schema'
         meaning = value.get('description', '') or _described(value, definitions)
         # Escape brackets: an element of a matrix is not a link.
         meaning = re.sub(r'\w+(\[\d\]){2}', r'`\g<0>`', meaning)

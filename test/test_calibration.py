@@ -189,7 +189,7 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
         (b'a: &x 1\nb: *x', r'aliases are not accepted \(line 2\)'),
         (b'[' * 100_000, 'nested deeper|nesting depth'),
         (b'{a: ' * 100_000, 'nested deeper'),
-        (b'a: 1\na: 2', "'a' stands twice"),
+        (b'a: 1\na: 2', "'a' occurs twice"),
         (b'? [1]\n: 2', 'a key must be a text'),
         (b'1: 2', 'a key must be a text'),
         (b'x: !!python/object:os.system ls', r'YAML tags are not accepted \(line 1\)'),

@@ -85,14 +85,14 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
     for n_days in (11, 13, 14, 16, 18, 20, 24, 26, 28, 33, 34, 40):
         result = watch(series.at(series.day < first + n_days), unit)
         since = {13: 12}.get(n_days, 20 if 20 < n_days <= 34 else None)
-        assert (result.exit_code, result.left) == (
+        assert (result.exit_code, result.outside_since) == (
             (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
         )
         assert ('outside its claim since' in str(result)) == (since is not None)
         # In an attitude along the error the error is 0.6 * sqrt(3) = 1.04 times the limit.
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
-        assert (result.back in back) == (n_days > 34)
-        assert ('again within its claim since' in str(result)) == (result.back is not None)
+        assert (result.inside_since in back) == (n_days > 34)
+        assert ('again within its claim since' in str(result)) == (result.inside_since is not None)
         # For a unit within its claim the forecast is later than the last day of the log.
         assert since is not None or f'about {result.last}' not in str(result)
 
@@ -102,7 +102,7 @@ def test_the_watch_names_the_day_and_the_class_of_temperature():
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
     healthy = watch(series_of(rests(unit, upright, no_error), unit), unit)
-    assert (healthy.exit_code, healthy.left) == (0, None)
+    assert (healthy.exit_code, healthy.outside_since) == (0, None)
     assert 'within its claim up to 2030-01-20' in str(healthy)
     assert sum(row.n_rests for row in healthy.days) == sum(
         row.n_rests for row in healthy.temperatures
@@ -114,4 +114,4 @@ def test_the_watch_names_the_day_and_the_class_of_temperature():
     assert healthy.forecast[0] < healthy.forecast[1] <= healthy.forecast[2]
     assert watch(series_of(rests(unit, upright, no_error), unit), unit, 1.0).forecast[0] == np.inf
     aged = watch(series_of(rests(unit, upright, jump_of(400.0, 10.0)), unit), unit)
-    assert (aged.exit_code, aged.left, aged.forecast) == (1, '2030-01-11', ())
+    assert (aged.exit_code, aged.outside_since, aged.forecast) == (1, '2030-01-11', ())

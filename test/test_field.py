@@ -141,7 +141,7 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     unit = known()
     updated = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     new = updated.calibration
-    assert [axis_change.is_determined for axis_change in updated.moved] == [False, False, True]
+    assert [axis.is_determined for axis in updated.axis_changes] == [False, False, True]
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
@@ -149,7 +149,7 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     assert [change.may_be_gravity for change in updated.changes] == [True]
     assert 'or another gravity' in ' '.join(change_texts(updated))
     # Upright rests determine the sum of bias and scale of z, 300 ug, to 15 ug (turn-ons of 20 ug).
-    assert updated.moved[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
+    assert updated.axis_changes[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
     old_sd, new_sd = (
         np.sqrt(np.diag(cal.posterior.covariance()))[layout.bias[0].static] for cal in (unit, new)
@@ -177,7 +177,7 @@ def test_the_present_sd_of_the_old_calibration_contains_its_ageing(rng):
     unit = known()
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
-    x, y, z = update(series_of(logged, unit), unit).moved
+    x, y, z = update(series_of(logged, unit), unit).axis_changes
     # The sd of a bias is 10 ug; a reading of z also has the sd of the scale.
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
@@ -209,7 +209,7 @@ def test_another_gravity_is_not_taken_for_three_scales(day):
     assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
     # A step before the first rest cannot be distinguished from a walk of 10 ppm of all scales.
     assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
-    for before, after in zip(aged.moved, result.moved, strict=True):
+    for before, after in zip(aged.axis_changes, result.axis_changes, strict=True):
         assert after.scale == pytest.approx(before.scale, abs=30e-6)
     assert result.judged.after < 40.0 * MICRO_G
     (text,) = (line for line in change_texts(result) if 'another gravity' in line)
@@ -218,7 +218,7 @@ def test_another_gravity_is_not_taken_for_three_scales(day):
     # If gravity is stated as certain, the step is attributed to the scales of all axes.
     certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
     assert certain.solution.gravity == ()
-    assert all(axis.scale > 150e-6 for axis in certain.moved)
+    assert all(axis.scale > 150e-6 for axis in certain.axis_changes)
 
 
 @pytest.mark.parametrize('kind', ['level', 'carried'])
@@ -277,8 +277,8 @@ def test_the_slopes_over_temperature_age_by_a_fixed_walk():
     result, n = update(series, unit), len(series) // 10
     span = np.sort(series.temperature)[[n, -1 - n]]
     expected = 1.0 * MICRO_G * np.sqrt(np.ptp(series.time) / 365.25) * np.ptp(span)
-    assert result.moved[0].curve_sd == pytest.approx(expected, rel=0.02)
-    assert 0.0 < result.moved[2].curve_sd < expected
+    assert result.axis_changes[0].curve_sd == pytest.approx(expected, rel=0.02)
+    assert 0.0 < result.axis_changes[2].curve_sd < expected
 
 
 def test_a_start_that_contradicts_all_others_is_left_out():
@@ -291,7 +291,7 @@ def test_a_start_that_contradicts_all_others_is_left_out():
     ]
     result = update(series_of(bad, unit), unit)
     assert result.n_outliers == 1
-    assert result.moved[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
+    assert result.axis_changes[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
 
 
 def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):

@@ -18,7 +18,7 @@ from thermo_comp.report.certificate import budget, combined, conformity, over_te
 from thermo_comp.report.html import rounded
 from thermo_comp.report.page import render_report
 from thermo_comp.report.statements import CertificateInfo, load_certificate_info
-from thermo_comp.report.states import table_temperatures
+from thermo_comp.report.temperature_curves import table_temperatures
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.prediction import in_a_soak

@@ -20,8 +20,8 @@ from thermo_comp.report import figures_unit as of_unit
 from thermo_comp.report.evidence import LEFT_OUT
 from thermo_comp.report.html import number
 from thermo_comp.report.page import figures_of, position_error, schuler_peak
-from thermo_comp.report.states import curves
 from thermo_comp.report.style import drawing, svg
+from thermo_comp.report.temperature_curves import curves
 from thermo_comp.report.trace import shown_bag
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings

@@ -24,19 +24,19 @@ Signs
     accelerometer measures specific force: at rest, level, z up, it reads +g on z.
 Temperatures
     ``t = T_board - T_ref`` is the argument of every temperature function. The gradient is
-    ``T_case - T_board``. The case sensor leads, the board sensor lags.
+    ``T_case - T_board``. In a ramp the case temperature leads and the board temperature lags.
 Regimes
-    Static (S = 0) and dynamic (S = 1), decided by a detector with memory; unknown until the
-    detector has enough readings. The static set of coefficients applies while the regime is
-    unknown.
+    The thermal regime is static (S = 0) or dynamic (S = 1), as a detector with memory decides, or
+    unknown until the detector has enough readings. The static set of coefficients applies while
+    the regime is unknown.
 Frames
     The output frame is fixed by the sensitivity axes: x along the x sensitivity axis, y in the
     plane of the x and y sensitivity axes (the misalignment matrix is lower triangular with a
     unit diagonal).
 Time
-    ``stamp_ns`` integers. A time difference in seconds is always computed from an integer
-    difference, so that no result depends on the origin of time, and single samples give the same
-    bits as blocks.
+    Stamps are integers, ``stamp_ns`` [ns]. A time difference in seconds is always computed from
+    an integer difference, so that no result depends on the origin of time, and a sample gives the
+    same bits alone as in an array.
 
 References
 ----------

@@ -27,7 +27,7 @@ class ThermoCompError(Exception):
     ) -> None:
         self.message, self.key, self.rule = message, key, rule
         self.path = None if path is None else str(path)
-        # The text may contain control characters from a file, a bag or the network.
+        # The error text may contain control characters from a file, a bag or the network.
         super().__init__(one_line(': '.join(part for part in (self.path, key, message) if part)))
 
 

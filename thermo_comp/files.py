@@ -4,9 +4,9 @@
 Owns the reading of files of limited size, and the writing of all output files.
 
 An output never replaces an input of the same command. Without `overwrite` an output replaces no
-existing file, even if another process writes at the same time; with `overwrite` it replaces only a
-file of the same kind. An output gets its final name once it is complete. If the output's name is a
-symbolic link, the link stays and its target is written.
+existing file, even if another process writes at the same time; with `overwrite` an output replaces
+only a file of the same kind. An output gets its final name once it is complete. If an output's
+name is a symbolic link, the link stays and the target of the link is written.
 """
 
 import errno
@@ -67,7 +67,7 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """Choose the kind of an output bag by its suffix; the error message also lists `others`."""
+    """Return the kind of an output bag by its suffix; the error message also lists `others`."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP
@@ -217,7 +217,7 @@ class Draft:
 @contextmanager
 def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
     """
-    Give a temporary path to write to, whose content becomes the output if no exception occurs.
+    Yield a temporary path; the file or folder there becomes the output if no exception occurs.
     """
     draft = Draft(path, kind, overwrite=overwrite)
     try:
@@ -247,7 +247,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def _output_errors(path: str | Path) -> Iterator[None]:
-    """Turn OSError into OutputError, with the output's name instead of its hidden file's name."""
+    """Turn OSError into OutputError, with the name `path` instead of that of the hidden file."""
     try:
         yield
     except OSError as error:

@@ -22,7 +22,7 @@ from .files import read_bounded
 
 DEPTH_LIMIT = 12
 #: Largest number of keys, values, lists and mappings of a file: three times that of a calibration
-#: with the columns of two thermometers except bends.
+#: with all columns of `unit.columns.bank` for two thermometers, except the kind `bend`.
 NODE_LIMIT = 20_000
 # Size limit of YAML files written by hand [bytes]; usual files have a few kB.
 _FILE_LIMIT = 1 << 16
@@ -38,7 +38,7 @@ class PlainYamlError(ValueError):
 
     def __init__(self, problem: str, line: int | None = None, detail: str = '') -> None:
         where = '' if line is None else f' (line {line})'
-        # The error message without `detail`, which may quote the file.
+        # The error message for users who may not read the file: without `detail`.
         self.rule = f'{problem}{where}'
         super().__init__(f'{problem}: {detail}{where}' if detail else self.rule)
 
@@ -99,7 +99,7 @@ def _load(text: str | bytes, node_limit: int) -> Any:
             if type(key) is not str:
                 raise _invalid(line, f'a key must be a text, got {key!r:.40}')
             if key in collected:
-                raise _invalid(line, f'the key {key!r:.60} stands twice')
+                raise _invalid(line, f'the key {key!r:.60} occurs twice')
             collected[key] = value(next(events), depth + 1)
         return collected
 

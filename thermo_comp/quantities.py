@@ -75,27 +75,27 @@ def _up_to(upper: float, unit: str, why: str) -> Bounds:
 
 _PREPARED: dict[str, Bounds] = {
     # Bounds of the constants of the unit.
-    'full scale': _positive(1e-6, 1e16, 'input units', 'a float holds whole counts up to 9e15'),
-    'full-scale force': _positive(1e-3, 1e7, 'm/s^2', 'from gravimeters to a gun launch'),
+    'full scale': _positive(1e-6, 1e16, 'input units', 'float64 holds integers to 9e15'),
+    'full-scale force': _positive(1e-3, 1e7, 'm/s^2', 'from a gravimeter to a gun launch'),
     'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'bounds of the magnitude'),
     'cycle time': _positive(1e-7, 1e5, 's', 'from 10 MHz to one sample a day'),
     'gravity': Bounds(above=9.0, below=10.5, unit='m/s^2', why='on Earth 9.76 to 9.84'),
     'angular rate': _between(-1e3, 1e3, 'rad/s', '1000 rad/s are 57000 deg/s'),
     # Temperatures.
-    'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='0 K to molten solder'),
-    'temperature difference': _between(-1273.15, 1273.15, 'K', 'of two possible temperatures'),
-    'temperature span': _positive(1e-2, 1273.15, 'K', 'a thermometer resolves no less'),
-    'temperature rate': _between(-1e5, 1e5, 'K/min', 'a thermal shock is 1000 K/min'),
-    'rate span': _positive(1e-6, 2e5, 'K/min', 'no less than 1 K in two years'),
-    'time constant': _positive(1e-3, 1e8, 's', 'from a bare wire to three years'),
-    'lag': _nil_or(1e-3, 1e8, 's', 'as a time constant; 0 means no lag'),
+    'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='from 0 K to red heat'),
+    'temperature difference': _between(-1273.15, 1273.15, 'K', 'of two valid temperatures'),
+    'temperature span': _positive(1e-2, 1273.15, 'K', 'narrower is thermometer noise'),
+    'temperature rate': _between(-1e5, 1e5, 'K/min', '100 times a thermal shock of 1000 K/min'),
+    'rate span': _positive(1e-6, 2e5, 'K/min', 'no ramp is slower than 1 K in two years'),
+    'time constant': _positive(1e-3, 1e8, 's', 'from a bare thermocouple to three years'),
+    'lag': _nil_or(1e-3, 1e8, 's', 'bounds of a time constant; 0: no lag'),
     # Bounds of the columns of the thermal response, and of their weights.
-    'value of a column': _between(-1e10, 1e10, 'of its kind', 'the cube of 1273 K is 2e9'),
-    'span of a column': _positive(1e-9, 2e10, 'of its kind', 'a millionth of a ramp of 0.1 K/min'),
+    'value of a column': _between(-1e10, 1e10, 'of the column', 'the cube of 1273 K is 2e9'),
+    'span of a column': _positive(1e-9, 2e10, 'of the column', 'a millionth of 0.1 K/min, in K/s'),
     'share': _between(-10.0, 10.0, '', 'no part amplifies a temperature difference tenfold'),
-    'width': _nil_or(1e-4, 1e4, 'K', 'from the resolution of a thermometer up'),
+    'width': _nil_or(1e-4, 1e4, 'K', 'no thermometer resolves 0.1 mK'),
     'gradient': _between(-1273.15, 1273.15, 'K', 'the largest temperature difference'),
-    'power': Bounds(at_least=0, at_most=4, why='powers above the third are not observed'),
+    'power': Bounds(at_least=0, at_most=4, why='no unit has shown a power above 3'),
     # Bounds of noises and standard deviations.
     'noise density': _positive(1e-12, 1e3, 'm/s^2/sqrt(Hz)', 'from far below any sensor to 100 g'),
     'rate noise density': _positive(
@@ -103,26 +103,26 @@ _PREPARED: dict[str, Bounds] = {
     ),
     'slow noise': _up_to(1e3, 'm/s^2/sqrt(h)', 'a random walk of 100 g in an hour'),
     'rate slow noise': _up_to(1e3, 'rad/s/sqrt(h)', 'a random walk of 57000 deg/s in an hour'),
-    'deviation': _up_to(1e4, 'm/s^2', 'above 1000 g the quantity is unknown'),
-    'rate deviation': _up_to(1e3, 'rad/s', 'above 57000 deg/s the rate is unknown'),
-    'misalignment deviation': _up_to(1.0, 'rad', 'above 1 rad the angle is unknown'),
+    'deviation': _up_to(1e4, 'm/s^2', 'an sd of 1000 g is no information'),
+    'rate deviation': _up_to(1e3, 'rad/s', 'an sd of 57000 deg/s is no information'),
+    'misalignment deviation': _up_to(1.0, 'rad', 'an sd of 1 rad is no information'),
     'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'an axis that reads 2 g at 1 g'),
     # Bounds of the results of a fit, and of numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
     'number': _up_to(1e15, '', 'a float64 holds integers up to 9e15 exactly'),
     'log evidence': _between(-1e15, 1e15, '', 'a sum over at most 1e15 samples'),
-    'deviation of a weight': _up_to(1e16, 'of its column', 'the largest full scale'),
+    'deviation of a weight': _up_to(1e16, 'of the weight', 'the largest full scale'),
     # Bounds of the settings of thermometers and of the regime detector.
-    'reading noise': _positive(1e-6, 1e2, 'K', 'from a microkelvin to no measurement'),
+    'reading noise': _positive(1e-6, 1e2, 'K', 'an sd above 100 K is no measurement'),
     'quantum': _up_to(1e2, 'K', 'no sensor has coarser steps'),
-    'ramp': _positive(1e-6, 1e5, 'K/min', 'from 1 K in two years to 100 thermal shocks'),
+    'ramp': _positive(1e-6, 1e5, 'K/min', 'from 1 K in two years to 100 K in 60 ms'),
     'false alarms': _positive(1e-12, 1e4, '1/h', 'from one alarm in 1e8 years to three a second'),
     'ripple': _up_to(1e3, 'K', 'the ripple of any chamber is smaller'),
     'dwell': _up_to(1e7, 's', 'no soak lasts four months'),
     # Bounds of the lengths of lists in a calibration file.
     'coefficients': Bounds(shortest=1, longest=12, why='powers up to t^11 follow any curve'),
     'knots': Bounds(longest=100, why='one knot per kelvin over 100 K'),
-    'columns': Bounds(longest=2000, why='enough for all columns of ten thermometers'),
+    'columns': Bounds(longest=2000, why='columns of ten thermometers'),
 }
 Positive = Annotated[float, Bounds(above=0.0, below=math.inf)]
 NotNegative = Annotated[float, Bounds(at_least=0.0, below=math.inf)]

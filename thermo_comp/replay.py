@@ -50,7 +50,7 @@ class ReplayResult:
     output: Path
     counters: Counters
     n_flags: int
-    #: The first regime flag, and each flag that differs from the previous one.
+    #: Stamp [ns] and value of the first regime flag, and of each flag unlike the flag before it.
     switches: list[tuple[int, bool]]
     #: Warnings that the node would give: exchanged thermometers, temperatures outside the
     #: calibrated range.
@@ -76,14 +76,14 @@ def check_unit(calibration: Calibration, info: RecordingInfo, serial: str | None
     if info.input == 'imu' and calibration.unit.input != 'm/s^2':
         raise CalibrationError(
             f'this calibration takes samples in {calibration.unit.input}, but those read from '
-            f'{info.path} are sensor_msgs/Imu in m/s^2: if it has counts, too, choose them with '
+            f'{info.path} are sensor_msgs/Imu in m/s^2: if the recording has counts, too, choose '
             '--input counts',
             key='unit.input',
         )
 
 
 def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
-    """Choose the input topics: ``auto`` reads counts for a calibration in counts, else Imu."""
+    """Return the input topics: ``auto`` reads counts for a calibration in counts, else Imu."""
     topics = topics or Topics()
     if topics.input != 'auto':
         return topics
@@ -165,7 +165,7 @@ def _beyond(calibration: Calibration, block: Block) -> float:
 
 
 def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
-    """Keep the first regime flag (stamp, regime) and each flag unlike the flag before it."""
+    """Return the first regime flag (stamp, is dynamic) and each flag unlike the flag before it."""
     return [next(run) for _, run in groupby(flags, key=itemgetter(1))]
 
 

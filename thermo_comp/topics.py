@@ -40,7 +40,7 @@ class NodeTopic:
 
     @property
     def qos(self) -> str:
-        """Describe the QoS for the reference page."""
+        """Return the QoS as text for the reference page."""
         words = ['reliable' if self.is_reliable else 'best effort']
         words += ['transient local'] * self.is_latched
         return ', '.join([*words, f'keep last {self.depth}'])
@@ -68,7 +68,7 @@ def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
 
 
 def thermometer(name: str) -> str:
-    """Name the usual topic of a thermometer."""
+    """Return the usual topic of a thermometer."""
     return f'temperature/{name}'
 
 
@@ -86,27 +86,27 @@ BOARD, CASE = (
     NodeTopic(thermometer(name), TEMPERATURE, meaning, 50, is_reliable=False)
     for name, meaning in (
         ('board', 'degC; or std_msgs/Float32, Float64, or a number in any message'),
-        ('case', 'as for the board; `temperature/NAME` for any other that a calibration names'),
+        ('case', 'degC, as `temperature/board`; further thermometers: `temperature/NAME`'),
     )
 )
 IMU_OUT = NodeTopic('imu/data_raw', IMU, 'specific force in m/s^2', 2000)
 REGIME = NodeTopic(
     'regime/dynamic',
     BOOL,
-    'whether S = 1; on every change and every reading that decides: of the case, or of the board '
-    'while there is no case; not published while S is unknown',
+    'whether the regime is dynamic (S = 1); sent at each case reading or, without case, at each '
+    'board reading; not sent while S is unknown',
     1,
     is_latched=True,
 )
 STAMPED = NodeTopic(
     'regime/stamped',
     DIAGNOSTICS,
-    'the flag with the stamp of the reading that decides; `status[0].message` is `dynamic` '
+    'the regime with the stamp of the reading that decides it; `status[0].message` is `dynamic` '
     'or `static`',
     1,
     is_latched=True,
 )
-STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz, hardware_id = serial', 10)
+STATUS = NodeTopic('/diagnostics', DIAGNOSTICS, '1 Hz; hardware_id = serial of the unit', 10)
 
 #: `SAMPLES`: topics of the samples, by the value of the parameter `input`; `INPUTS`: topics of all
 #: inputs, by their names in `Topics`.

@@ -58,10 +58,10 @@ def update(
     if 'unit' not in allowed:
         refuse_another_unit(result)
     out.points(notes)
-    _show_moved(result, out)
+    _show_axis_changes(result, out)
     out.points(change_texts(result))
     out.line(str(result.judged))
-    is_better = result.judged.is_better and any(axis.is_determined for axis in result.moved)
+    is_better = result.judged.is_better and any(axis.is_determined for axis in result.axis_changes)
     if is_better:
         save_calibration(result.calibration, output, overwrite=force)
         out.line(f'{output}: written')
@@ -69,20 +69,21 @@ def update(
         out.line(f'the update gains nothing: {output} is not written, keep {calibration}')
         sds = [
             f'{row.axis} {micro_g(row.present_sd)} ug ({micro_g(row.claimed_sd)} ug in the file)'
-            for row in result.moved
+            for row in result.axis_changes
         ]
         out.line(f'sd of bias plus scale at rest, aged to the last rest: {", ".join(sds)}')
     out.end(
         0 if is_better else NOTHING_GAINED,
         output=output if is_better else None,
-        **picked(result, 'moved changes judged'),
+        moved=result.axis_changes,
+        **picked(result, 'changes judged'),
         **_ageing(result.ageing),
         is_better=is_better,
         notes=[*notes, *change_texts(result)],
     )
 
 
-def _show_moved(result: 'Update', out: Output) -> None:
+def _show_axis_changes(result: 'Update', out: Output) -> None:
     out.table(
         ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
         [
@@ -94,7 +95,7 @@ def _show_moved(result: 'Update', out: Output) -> None:
                 *(micro_g(axis.reading), micro_g(axis.reading_sd)),
                 f'{axis.reading / axis.reading_sd:+.1f}' if axis.is_determined else 'unknown',
             )
-            for axis in result.moved
+            for axis in result.axis_changes
         ],
         title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
         'starts (at rest: bias plus scale at the mean force of the rests)',
@@ -148,7 +149,8 @@ def evaluate_rests(
     out.line(str(result))
     out.end(
         result.exit_code,
-        **picked(result, 'days temperatures left'),
+        **picked(result, 'days temperatures'),
+        left=result.outside_since,
         forecast_days=result.forecast,
         interval_days=result.interval,
         **_ageing(result.ageing),

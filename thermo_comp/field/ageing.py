@@ -10,9 +10,9 @@ and s are random walks of bias and scale since the calibration, o_k is a bias of
 unknown lag states at the start, lack is the lack of fit of the calibration, e is independent
 noise. The matrices H_i, B_i, S_i and L_i are derivatives of ``|f|``. The slopes of the bias over
 temperature are random walks of a fixed sd per root day. Jumps of the levels (bias and scale of
-each axis) or of gravity, and a change of the bias curves over temperature, are added one at a time
-while the log Bayes factor of the next is high enough. The variances of walks, offsets, lag states
-and noise maximise the marginal likelihood, with wide priors.
+each axis) or of gravity, and a change of the bias curves over temperature, are added singly while
+the log Bayes factor of the next is at least 5. The variances of walks, offsets, lag states and
+noise maximise the marginal likelihood, with wide priors.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import Series
 
-#: Centres of the priors of sd, relative to that of the turn-on offset: random walk per root day of
-#: bias and of scale times g; scatter of a rest. Prior sd of the logarithm of each sd in `Ageing`:
-#: a factor of 5.
+#: Centres of priors of sds, relative to the centre for the turn-on offset: random walk of bias and
+#: of scale times g per root day, and scatter of a rest. Prior sd of the logarithm of each sd in
+#: `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
-#: Centre of the prior of the sd of the lag states at a start, relative to the calibration's
-#: assumption: units in thermal equilibrium before their start have smaller lags.
+#: Centre of the prior of the sd of the lag states at a start, relative to the sd that the
+#: calibration assumes; a unit in thermal equilibrium before its start has smaller lags.
 _LAG_SHARE = 1.0
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
 #: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
-#: Prior sd of a jump in the biases, and in the scales times g, relative to `_JUMPS`: a shock
-#: changes scales less.
+#: Prior sd of a jump in the three biases, and in the three scales times g, relative to `_JUMPS`: a
+#: shock changes scales less than biases.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
 #: Smallest log Bayes factor at which a change is added to the model (150:1), and of a jump of
-#: gravity relative to a jump of the levels (20:1).
+#: gravity against a jump of the levels (20:1).
 _LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
@@ -133,7 +133,7 @@ class Rows:
 
 
 def rows_of(series: Series, scatter: float) -> Rows:
-    """Sum the rests of each start, weighted by their noise and an initial scatter [m/s^2]."""
+    """Return the equations of rests, weighted by noise and an initial scatter [m/s^2]."""
     parts: list[tuple[Floats, ...]] = []
     variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
@@ -146,7 +146,7 @@ def rows_of(series: Series, scatter: float) -> Rows:
         # rests is sqrt(n) times a single rest.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
-        # Another gravity changes |f| alike in all attitudes.
+        # A change of gravity changes |f| equally in all attitudes.
         ones = np.ones(len(series))
         levels = (series.by_parameter, series.by_level, ones)
         summed = (series.residual, *levels, series.by_start, series.lack)
@@ -189,7 +189,7 @@ class Model:
             np.diag(rows.scatter),
             np.where(is_same, rows.by_start @ rows.by_start.T, 0.0),
         ]
-        # Errors of the fitted model are correlated between temperatures: a Gaussian of 10 K sd.
+        # The lack of fit is correlated over temperature: a Gaussian of 10 K sd.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
@@ -262,7 +262,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centre of the priors, from the fit's residual sd or else the noise in 1 Hz."""
+    """Return the centres of the priors, from the fit's residual sd or else the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -299,7 +299,7 @@ def learn(
         bad = rows.start[np.abs(left_out) > 5.0]
         at = np.flatnonzero(is_used)
         is_bad = np.isin(used.start, bad)
-        # If more than 10 % of the rests are outliers, the model is wrong, so all rests are kept.
+        # If more than 10 % of the rests are outliers, the model is wrong: keep all rests.
         if not len(bad) or is_bad.sum() > 0.1 * len(used):
             break
         is_used[at[is_bad]] = False
@@ -307,7 +307,7 @@ def learn(
 
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
-    """Choose the most probable change, or None if no change has enough evidence."""
+    """Return the most probable change, or None if no change has enough evidence."""
     best: dict[str, Change] = {}
     for change in candidates:
         if change.log_bayes_factor > _gain(best.get(change.kind)):

@@ -5,10 +5,10 @@ Owns the detection of rests in a stream of samples: windows of 10 s without moti
 
 Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds with
 at least five samples, which is one second at 5 Hz or more. A cell is still if its standard
-deviation is that of the noise and its mean agrees with the means of the cell before and of the
-window's first cell (as in `online.checks.GravityCheck`). Still cells in a row form a window once
-they span 10 s. In a long rest all windows of the first ten minutes are kept, then one window per
-minute up to an hour, then one window per five minutes.
+deviation is that of the noise and its mean agrees with the means of the previous cell and of the
+window's first cell. Successive still cells that span 10 s form a window. In a long rest all
+windows of the first ten minutes are kept, then a window per minute up to an hour, then a window
+per five minutes.
 """
 
 from collections.abc import Callable, Sequence

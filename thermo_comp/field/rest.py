@@ -3,7 +3,7 @@
 """
 Owns the record of a rest, one line of text with a checksum, and the thinning of rest logs.
 
-A rest log is a folder of files, one per day (UTC). Each line of a rest log is a CRC-32 in
+A rest log is a folder with a file per day (UTC). Each line of a rest log is a CRC-32 in
 hexadecimal, a blank, and JSON. A JSON object describes a start of the node, a JSON list a window
 at rest since the last start. Lines with a wrong checksum are skipped, because a killed process, a
 power failure or a full disk damages only the line that is being written.
@@ -21,7 +21,7 @@ from ..thermal.state import Layout
 #: Suffix of the files of a rest log; the name of a file is the day, as in 2026-11-25.rests.
 SUFFIX = '.rests'
 
-#: First bytes after the checksum, for the record of a start and for that of a rest.
+#: First bytes after the checksum, in the record of a start and in the record of a rest.
 _OF_START, _OF_REST = b' {', b' ['
 
 
@@ -60,7 +60,7 @@ class Rest:
 
 
 def encode(record: Start | Rest) -> bytes:
-    """Write a start or a rest as a line."""
+    """Return a start or a rest as a line of a rest log."""
     if isinstance(record, Start):
         # Earlier releases cannot read angular rates and the newer fields of lags and plays: such
         # fields are written only if they differ from their defaults.
@@ -86,7 +86,7 @@ def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
 
 
 def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
-    """Read the rests of a file, each with its start of the node; count the damaged lines."""
+    """Return a file's rests, each with its start of the node, and the number of damaged lines."""
     rests: list[tuple[Start, Rest]] = []
     start: Start | None = None
     n_damaged = 0

@@ -36,8 +36,8 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-#: Parts of the name of an update's source: before the time of the last rest, and before the number
-#: of days by which the covariance was aged.
+#: Parts of the name of an update's source: texts before the time of the last rest, and before the
+#: number of days by which the covariance was aged.
 _UNTIL, _AGED = 'rests until ', ', claim aged '
 
 
@@ -142,7 +142,7 @@ def read_rests(
     if others:
         notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
     if not rests:
-        found = ': no rest at all, is it a rest log?'
+        found = ': the files hold no rest'
         if others:
             found = f': the rests are of {", ".join(sorted(others))}'
         raise RecordingError(f'no rest of unit {wanted}{found}', ', '.join(map(str, paths)))
@@ -281,7 +281,7 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
 
 
 def _numbered(start: Ints) -> Ints:
-    """Return the number of each start of the node, from 0 in order of appearance."""
+    """Return the number of each rest's start of the node, from 0 in order of appearance."""
     _, first, start = np.unique(start, return_index=True, return_inverse=True)
     return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
 
@@ -291,8 +291,8 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     Assign windows to groups of consecutive windows that are averaged, at most 60.
 
     All windows of a group belong to the same start of the node. Direction and temperature of a
-    group's windows differ by less than 1e-3 rad and 1 K from those of the first window. Different
-    directions reduce the norm of a mean of vectors by a share of half the squared angle.
+    group's windows differ by less than 1e-3 rad and 1 K from those of the first window. An angle
+    between vectors reduces the norm of their mean by a share of at most half the squared angle.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)
@@ -323,7 +323,7 @@ def _uncertainty(
     calibration claims, (n,), and the sd of the lack of fit of each axis, (n, 3).
     """
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
-    bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
+    bare, full = (SlowUncertainty(tried, correction) for tried in (without, calibration))
     slow = _variance_along(correction, states, np.zeros_like(shares), bare, u, x)
     claim = _variance_along(correction, states, shares, full, u, x)
     of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)

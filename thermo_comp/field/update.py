@@ -30,18 +30,18 @@ from .series import Series, last_rest, valid_since
 #: Names of the conclusions that a user can override: another gravity than stated at the rests, and
 #: samples of another unit.
 OVERRIDES = ('gravity', 'unit')
-#: Limits of the RMS of |f| - g of a start, relative to gravity (a shock of 1 mg) and in claimed sd
-#: (some milli-g for a poor sensor); rests of another unit exceed both limits.
+#: Largest RMS of |f| - g of a start, relative to gravity (a shock of 1 mg) and in claimed sd (some
+#: milli-g for a poor sensor); the RMS of rests of another unit exceeds both limits.
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
 #: Default time after the last rest for which the covariance is aged [days].
 AHEAD_DAYS = 1.0
 
 
 @dataclass(frozen=True)
-class Moved:
+class AxisChange:
     """
-    Changes of an axis' constants, each with posterior sd; if the rests do not determine the axis,
-    the changes are 0 and the sds are prior sds.
+    Changes of an axis' constants by an update, each with its posterior sd; for an axis that the
+    rests do not determine, the changes are 0 and the sds are prior sds.
 
     bias: change of the bias at the temperature of the rests [m/s^2]
     scale: relative change of the scale
@@ -73,8 +73,8 @@ class Judged:
     over, n: kind of the folds, days or starts, and their number
     before, after: RMS of ``|f| - g`` over all folds with the calibration, and with an update from
         the folds before each fold [m/s^2]
-    gain, gain_sd: mean over the folds of the difference of the mean squares, and its standard
-        error [m^2/s^4]
+    gain, gain_sd: mean over the folds of the decrease of the mean square, and the standard error
+        of this mean [m^2/s^4]
     """
 
     over: str
@@ -103,7 +103,7 @@ class Update:
     """An updated calibration with the results of the ageing model."""
 
     calibration: Calibration
-    moved: tuple[Moved, ...]
+    axis_changes: tuple[AxisChange, ...]
     ageing: Ageing
     changes: tuple[Change, ...]
     judged: Judged
@@ -127,7 +127,7 @@ def update(
 
     `source`, `created`: source and date for the new file's provenance; `ahead`: time after the
     last rest for which the covariance is aged [days]; `is_gravity_certain`: never explain the
-    rests by another gravity than stated. Raises FitError if the rests belong to fewer than three
+    rests by a gravity other than stated. Raises FitError if the rests belong to fewer than three
     starts of the node.
     """
     n_starts = int(series.start.max()) + 1
@@ -143,13 +143,13 @@ def update(
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     to_file, bend = _levels(calibration), _slopes(calibration)
     solution = solve(model, ageing, to_file, bend, ahead)
-    determined, moved = _axis_changes(used, calibration, model, solution, ageing)
+    determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
     # For parameters that are not updated, the shift that is not applied is an additional error.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
-    axis_determined = [change.is_determined for change in moved]
+    axis_determined = [change.is_determined for change in by_axis]
     new = _shifted(calibration, shift, covariance)
     before = calibration.provenance
     new = replace(
@@ -164,7 +164,7 @@ def update(
         ),
     )
     n_outliers = len(series) - len(used)
-    return Update(new, moved, ageing, model.changes, judged, used, n_outliers, model, solution)
+    return Update(new, by_axis, ageing, model.changes, judged, used, n_outliers, model, solution)
 
 
 def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
@@ -212,7 +212,7 @@ def _slopes(calibration: Calibration) -> Floats:
 
 def _axis_changes(
     series: Series, calibration: Calibration, model: Model, solution: Solution, ageing: Ageing
-) -> tuple[Bools, tuple[Moved, ...]]:
+) -> tuple[Bools, tuple[AxisChange, ...]]:
     """Find the parameters that the rests determine, and list the changes of each axis."""
     layout, correction = parameter_layout(calibration), Correction(calibration)
     coolest, warmest = np.argsort(series.temperature)[[len(series) // 10, -1 - len(series) // 10]]
@@ -245,13 +245,13 @@ def _axis_changes(
         of_scale = change[1] / gravity, sd[1] / gravity
         values = [change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3]]
         values += [claimed, present]
-        shifts.append(Moved(name, is_determined, *map(float, values)))
+        shifts.append(AxisChange(name, is_determined, *map(float, values)))
     determined[layout.misalignment :] = all(shift.is_determined for shift in shifts)
     return determined, tuple(shifts)
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score the update by earlier rests on each day or, with less than five days, each start."""
+    """Score updates by earlier rests on each day or, if there are less than five, each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -345,7 +345,7 @@ def _gravity_texts(result: Update) -> Iterator[str]:
 
 
 def change_texts(result: Update) -> list[str]:
-    """Describe the ageing, the changes, and the axes that the rests do not determine."""
+    """Return sentences on the ageing, the changes, and axes that the rests do not determine."""
     ageing = result.ageing
     lines = [
         f'random walk of the bias {ug_text(ageing.bias)}, of the scale '
@@ -354,11 +354,11 @@ def change_texts(result: Update) -> list[str]:
         f'{ug_text(ageing.rest)}'
     ]
     if result.series.by_start.any():
-        lines[0] += f'; sd of the lags at a start {ageing.lags:.2g} times that of the calibration'
+        lines[0] += f'; sd of the lags at a start {ageing.lags:.2g} times the calibrated sd'
     for change in result.changes:
         if change.time is None:
             lines.append(
-                'the curves of the bias over temperature have changed, not only its level'
+                'the curves of the bias over temperature have changed, not only the level'
             )
         elif change.kind == 'levels':
             day = np.datetime64(int(change.time * 86400.0), 's')
@@ -371,7 +371,7 @@ def change_texts(result: Update) -> list[str]:
                 )
             lines.append(text)
     lines += _gravity_texts(result)
-    undetermined = [change.axis for change in result.moved if not change.is_determined]
+    undetermined = [change.axis for change in result.axis_changes if not change.is_determined]
     if undetermined:
         lines.append(
             f'the rests do not determine {", ".join(undetermined)}: these axes keep their values, '

@@ -25,13 +25,13 @@ from .update import Update, update
 #: Largest error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
 #: Length of the window whose RMS decides the verdict [days]: long enough to average the scatter of
-#: single starts, and short against the time in which a unit drifts to its limit.
+#: single starts, and short against the time in which a unit drifts to the limit.
 _WINDOW_DAYS = 7
-#: Smallest number of starts whose attitudes the forecast uses, if the last window has fewer.
+#: Smallest number of starts of the node whose attitudes the forecast uses.
 _LEAST_STARTS = 10
 #: Probabilities of the forecast, its horizon [days], and number of simulated random walks.
 _QUANTILES, _HORIZON, _WALKS = (0.1, 0.5, 0.9), 3650.0, 2000
-#: Width of a temperature class [K], and largest number of periods, in the tables of a watch.
+#: Width of a temperature class [K], and largest number of periods, in the tables of `Watch`.
 _CLASS_K, _PERIODS = 10.0, 30
 
 
@@ -61,8 +61,8 @@ class Watch:
     days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
     week: rows of the days with rests in the last week
     recent: RMS over the last week divided by the limit, robust against one disturbed day
-    left: first day from which the unit stays outside its claim, None for a unit within its claim
-    back: first day after an earlier time outside the claim, for a unit within its claim
+    outside_since: first day from which the unit stays outside its claim, None if it is within
+    inside_since: first day after a time outside the claim; None if still, or never, outside
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years
     interval: the quantiles of `forecast` for a unit that has just been updated
@@ -74,8 +74,8 @@ class Watch:
     last: str
     week: tuple[Row, ...]
     recent: float
-    left: str | None
-    back: str | None
+    outside_since: str | None
+    inside_since: str | None
     forecast: tuple[float, ...]
     interval: tuple[float, ...]
     ageing: Ageing | None
@@ -83,7 +83,7 @@ class Watch:
     @property
     def exit_code(self) -> int:
         """Exit code of the command: 1 if the error of the unit exceeds its claim, else 0."""
-        return 1 if self.left else 0
+        return 1 if self.outside_since else 0
 
     def __str__(self) -> str:
         n_out = sum(not row.is_within for row in self.week)
@@ -91,15 +91,16 @@ class Watch:
             f'RMS of |f| - g {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} days'
         )
         week += f', {n_out} of {counted(len(self.week), "day")} outside'
-        if self.left and self.recent <= 1.0:
+        if self.outside_since and self.recent <= 1.0:
             week += ', above the limit at the last rest by the ageing model'
-        if self.left:
+        if self.outside_since:
             text = (
-                f'the unit is outside its claim since {self.left} ({week}): update its '
+                f'the unit is outside its claim since {self.outside_since} ({week}): update its '
                 'calibration by rests, or recalibrate the unit'
             )
         else:
-            how = f'again within its claim since {self.back}' if self.back else 'within its claim'
+            since = self.inside_since
+            how = f'again within its claim since {since}' if since else 'within its claim'
             text = f'the unit is {how} up to {self.last} ({week}); '
             if self.forecast:
                 when = 'on any day' if self.forecast[1] < 1.0 else f'about {self._date(1)}'
@@ -144,27 +145,27 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
     # The RMS of a week follows a change late. A unit leaves its claim after a day above the limit
     # if the ageing model's error at the last rest is above the limit, too. A unit is within its
-    # claim again after two days within the limit if the ageing model's error is within, too.
+    # claim again after two days within the limit if the ageing model's error is, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
-    left = back = None
+    outside_since = inside_since = None
     if is_out[-1]:
         is_early = ~is_out if recent[-1] > 1.0 else ~is_row_out
         begin = min(int(np.append(-1, np.flatnonzero(is_early))[-1]) + 1, len(days) - 1)
         window = days[first[begin] if recent[-1] > 1.0 else begin : begin + 1]
-        left = next((row.name for row in window if not row.is_within), window[-1].name)
+        outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
         # If the last week of a unit within its claim is above the limit, the last two days are
         # within the limit, so a day follows the last day outside.
         until = int(np.flatnonzero(recent > 1.0)[-1])
-        back = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
+        inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
     temperatures = _rows(series, np.array(classes), warmer, tolerance)
     return Watch(
         *(days, periods, temperatures, last, days[first[-1] :], float(recent[-1])),
-        *(left, back, forecast, interval, ageing),
+        *(outside_since, inside_since, forecast, interval, ageing),
     )
 
 
@@ -191,7 +192,7 @@ def _forecasts(
     """
     Forecast when the unit leaves its claim, with the present calibration and just after an update.
 
-    The attitudes of use are those of the rests in the last window, and of ten starts at least.
+    The attitudes of use are those of the rests in the last week, and of ten starts at least.
     """
     used, ageing, solution = updated.series, updated.ageing, updated.solution
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS
@@ -266,7 +267,7 @@ def passage(
     for step in np.diff(times):
         if stays[-1] <= 1.0 - _QUANTILES[-1]:
             break
-        # Remove the walks beyond the bound once they are more than a fifth of all walks.
+        # Remove the walks beyond the bound once more than a fifth of the walks are beyond it.
         is_in = inside > 0.0
         if is_in.mean() < 0.8:
             error, speed, left, inside = error[is_in], speed[is_in], left[is_in], inside[is_in]

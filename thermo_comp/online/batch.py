@@ -3,7 +3,7 @@
 """
 Owns the correction of whole arrays at once, bit-identical to that of single samples.
 
-The compensator takes the temperature readings one by one, as for single samples. The segments
+The compensator takes each temperature reading separately, as for single samples. The segments
 between the readings are collected, evaluated together and applied to all samples with the
 arithmetic of single samples.
 """
@@ -23,8 +23,8 @@ from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Segment
 from .status import DROPPED
 
-#: Readings not queued yet, in reverse order; per reading the number of samples before it, the
-#: latest stamp of its thermometer so far, the thermometer, stamp [ns] and temperature [degC].
+#: Readings not queued yet, last reading first: number of samples before the reading, latest stamp
+#: of the thermometer up to the reading [ns], thermometer, stamp [ns], temperature [degC].
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
@@ -56,7 +56,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct a block, and its angular rate (n, 3), bit for bit as sample by sample."""
+    """Correct a block's samples, and angular rates (n, 3), with the bits of single samples."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -207,7 +207,7 @@ def _apply(
 
 
 def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
-    """Evaluate the slow part of the variance of segments, once for each `SlowState`."""
+    """Evaluate the slowly varying variance of segments, once for each `SlowState`."""
     held = {id(segment.slow): segment.slow for segment, _ in segments}
     rows = compensator.thermal.model.slow_rows([*held.values()])
     places = {key: place for place, key in enumerate(held)}
@@ -215,7 +215,7 @@ def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
 
 
 def _line(correction: Correction, segments: Segments, slow: Floats) -> Floats:
-    """Evaluate `Correction.line` for segments, with the slow part of their variance."""
+    """Evaluate `Correction.line` for segments, with their slowly varying variance."""
     start, end = (np.array([segment[at] for segment, _ in segments]).T for at in (4, 5))
     excess = np.array([segment.noise_excess for segment, _ in segments])
     return correction.line(start, end, slow, excess)

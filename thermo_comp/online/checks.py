@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the plausibility checks of samples: a stuck converter, samples faster than conversions can be,
-and |f| at rest, which must be gravity.
+Owns the plausibility checks of samples: a stuck converter, samples faster than the converter, and
+|f| at rest, which must be gravity.
 
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
-calibration, or that of another unit, |f| at rest differs from gravity by more than the claimed
-uncertainty. |f| is averaged over still windows of a second or longer: their scatter is the
-sensor's noise, and their mean agrees with that of the window before. A step of |f| from one rest
-to another is not a motion, and is judged within a second.
+calibration, or the calibration of another unit, |f| at rest differs from gravity by more than the
+claimed uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
+scatter is the sensor's noise and its mean agrees with the mean of the previous window. A step of
+|f| from a rest to another rest is not a motion, and is judged within a second.
 """
 
 import math
@@ -64,11 +64,11 @@ Run: TypeAlias = tuple[tuple[float, float, float, int], int, float]
 
 class StuckCheck:
     """
-    Counts equal readings in a row of each axis; after the time-out [s] (0 = never) they are stuck.
+    Counts equal readings in a row of each axis, which are stuck after the time-out [s], 0 = never.
 
-    Samples are stuck if all three axes repeat their readings, or if one axis does while both
-    others change by `motion` [input unit]: no motion leaves one axis at exactly one number. At
-    rest an axis whose noise is less than the converter's step may repeat its reading for long.
+    Samples are stuck if all three axes repeat their readings, or if an axis repeats its reading
+    while both other axes change by `motion` [input unit]: no motion leaves an axis at exactly the
+    same number. At rest an axis with noise below the converter's step may repeat its reading.
     """
 
     def __init__(self, timeout_s: float, motion: float) -> None:
@@ -76,11 +76,11 @@ class StuckCheck:
         self.limit_ns = round(timeout_s * 1e9) if self.is_on else NEVER_NS
         self.motion = motion
         self.last = (math.nan, math.nan, math.nan, 0)  # the last sample and its stamp
-        #: Present run of each axis, or empty if the last sample changed all three.
+        #: Present run of equal readings of each axis; empty if the last sample changed all axes.
         self.runs: tuple[Run, ...] = ()
 
     def again(self, stamp_ns: int, x: float, y: float, z: float) -> bool:
-        """Take a sample that repeats at least one axis; return whether it is stuck."""
+        """Take a sample with the last reading of any axis; return whether the sample is stuck."""
         last = self.last
         self.last = sample = (x, y, z, stamp_ns)
         runs = self.runs or ((last, 0, 0.0),) * 3
@@ -155,8 +155,8 @@ class RateCheck:
     @property
     def noise_excess(self) -> float:
         """
-        Excess of the noise variance of a sample over its calibrated value, as a share of the
-        calibrated value; it follows from the rate of samples.
+        Excess of the noise variance of a sample over the calibrated variance, relative to the
+        calibrated variance, because of the rate of samples.
         """
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
@@ -198,7 +198,7 @@ class GravityCheck:
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
         self._tolerance = tolerance or math.inf
-        # Whether |f| of the last windows differed from gravity by more than the tolerance.
+        # Whether |f| of the last windows refutes the calibration.
         self.is_refuted = False
         self._n_agreeing = 0
         self._is_against = False

@@ -7,7 +7,7 @@ regime and status.
 A temperature reading applies from the first later-arriving sample with an equal or later stamp, so
 stamps and order of arrival determine the output, and a node that received all messages in order
 publishes the bits of the offline replay. The rate of the samples, and |f| against gravity, are
-checked at the first sample of each segment, so that the checks cost nothing per sample.
+checked at the first sample of each segment only, to save time.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class CompensatorStatus:
     """State of a compensator at the stamp of its last sample."""
 
     stamp_ns: int | None
-    #: Fault of each thermometer, and the size of a rejected step of its readings [K].
+    #: Fault of each thermometer; size of a rejected step, or excess of a loose thermometer [K].
     faults: Mapping[str, tuple[Fault, float]]
     #: Time from the last sample to the latest queued temperature reading [s].
     pending_ahead_s: float
@@ -267,7 +267,7 @@ class Compensator:
         self.last_ns = stamp_ns - 1
 
     def take_flags(self) -> list[tuple[int, bool]]:
-        """Take the new regime flags: stamp of the deciding reading [ns], whether dynamic."""
+        """Return new regime flags, once each: stamp of the deciding reading [ns], is dynamic."""
         flags, self.thermal.flags = self.thermal.flags, []
         return flags
 
@@ -302,7 +302,7 @@ class Compensator:
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Use another model or settings; the original of a copied `self` stays as it is."""
+        """Use another model or settings; if `self` is a copy, the original does not change."""
         gravity, before = copy(self.gravity), self._gravity_settings
         stuck = self.stuck
         self.config, self.thermal = config, copy(self.thermal)
@@ -367,7 +367,7 @@ class Compensator:
 
     @property
     def scale_sd(self) -> tuple[float, ...]:
-        """Sd of the relative scale of each axis in the present segment; empty at first."""
+        """Sd of the relative scale of each axis in the present segment, () before the first."""
         line = self._segment[1]
         return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
 

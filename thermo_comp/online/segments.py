@@ -5,8 +5,8 @@ Owns the segments: time intervals between temperature readings, with a correctio
 
 A segment ends at a temperature reading, or after one second. The correction is evaluated in full
 at both ends of a segment, so a sample costs a few operations, the output has no steps between two
-readings, and a batch needs one evaluation per segment. The slow part of the variance is evaluated
-at the first segment in each ten seconds.
+readings, and a batch needs one evaluation per segment. The part of the variance by parameters and
+initial lag states, which changes slowly, is evaluated at the first segment in each ten seconds.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ from .status import CompensatorConfig, Counters
 
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
-SLOW_NS: Final = 10_000_000_000  # time for which the slow part of the variance is held [ns]
+SLOW_NS: Final = 10_000_000_000  # time for which `SlowState`, and so its variance, is held [ns]
 YOUNG_READINGS: Final = 30  # board readings after a start that determine the board's rate
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
@@ -41,8 +41,8 @@ UNMEASURED_SD_K: Final = 10.0
 
 class SlowState(NamedTuple):
     """
-    Arguments of the slow part of the variance: the thermal state, the remaining shares of the
-    lags' unknown initial states, `ThermalMemory.start_rate`.
+    Arguments of the variance by parameters and initial lag states: the thermal state, remaining
+    shares of the lags' unknown initial states, `ThermalMemory.start_rate`.
     """
 
     state: tuple[float, ...]
@@ -60,7 +60,7 @@ class Segment(NamedTuple):
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    slow: SlowState  # the same object in all segments with the same slow part of the variance
+    slow: SlowState  # the same object in successive segments with equal arguments
 
 
 _NO_STATE: Final = SlowState((), [], 0.0)
@@ -84,7 +84,7 @@ class Model:
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
         """
-        Evaluate the slow part of the variance of the force, `Correction.n_slow` rows, then that of
+        Evaluate the slowly varying variance of the force, `Correction.n_slow` rows, then that of
         the angular rate, shape (rows, len(held)).
         """
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
@@ -92,7 +92,7 @@ class Model:
 
 
 class ThermalSide:
-    """The code that streaming and batch share: queued readings, thermal state, segments."""
+    """Queued readings, thermal state and segments, which streaming and batch share."""
 
     def __init__(self, model: Model, config: CompensatorConfig, counters: Counters) -> None:
         self.counters = counters
@@ -133,12 +133,12 @@ class ThermalSide:
         return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Use another model or configuration; the original of a copied `self` stays as it is."""
+        """Use another model or settings; if `self` is a copy, the original does not change."""
         old, self.queue = self.tracker, copy(self.queue)
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # A change of other settings does not end a stop by the rate of samples.
+            # A stop because of the samples' rate persists while the unit is the same.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
@@ -158,7 +158,7 @@ class ThermalSide:
         self._forget_samples()
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Queue a reading, if the calibration knows its thermometer."""
+        """Queue a reading, if the calibration has a thermometer of this name."""
         if name in self.inputs:
             self._count_rejected(name, self.queue.push(name, stamp_ns, celsius))
 
@@ -243,16 +243,16 @@ class ThermalSide:
         return tuple(sqrt(max(0.0, whole - excess * noise)) for whole, noise in pairs)
 
     def slow_rows(self, slow: SlowState) -> Floats:
-        """Evaluate the slow part of the variance of a segment, once for each `SlowState`."""
+        """Evaluate the slowly varying variance of a segment, once for each `SlowState`."""
         if slow is not self._slow_evaluated:
             self._slow_evaluated = slow
             self._slow_rows = self.model.slow_rows([slow])[:, 0]
         return self._slow_rows
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
-        """Return the thermal state that determines the slow part of the variance for `SLOW_NS`."""
-        # The first readings after a start do not show the rate yet, on which the unknown initial
-        # lag states depend: evaluate the variance in each segment.
+        """Return the thermal state that determines the slowly varying variance for `SLOW_NS`."""
+        # The unknown initial lag states depend on the board's rate, which the first readings after
+        # a start do not show: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS
         key = start_ns // (SEGMENT_NS if is_young else SLOW_NS)
         if key != self._slow_key:

@@ -11,10 +11,10 @@ from ..thermal.settings import ThermalConfig
 
 @dataclass(frozen=True)
 class CompensatorConfig(ThermalConfig):
-    """Settings of the user; ValueError if a value is out of its range."""
+    """Settings of the compensator; ValueError if a value is out of its range."""
 
-    #: Time after which samples that repeat their values on all axes, or on one while both others
-    #: move, are dropped [s]; samples of three exact zeros are dropped at once; 0 drops neither.
+    #: Time after which samples that repeat their values on all axes, or on one axis while the two
+    #: other axes change, are dropped [s]; three zeros are dropped at once; 0 = no such drops.
     stuck_timeout_s: NotNegative = 2.0
     #: Gravity at the place of use [m/s^2]; 0 = the gravity of the calibration.
     local_gravity_m_s2: NotNegative = 0.0

@@ -15,7 +15,7 @@ from ..unit.prediction import bias_and_scale, in_a_soak, nonlinear_coefficients,
 from .evidence import Evidence
 from .html import minus, number, rounded
 from .statements import CertificateInfo
-from .states import curves, evaluate, programs, slopes, table_temperatures
+from .temperature_curves import curves, evaluate, programs, slopes, table_temperatures
 
 #: Coverage factor of an expanded uncertainty: 95 % of a normal distribution.
 COVERAGE = 2.0
@@ -44,7 +44,7 @@ class StateResult(NamedTuple):
     """
     One axis in a soak or a ramp at one temperature of the board.
 
-    A deviation is the preceding value less a straight line over temperature: the line through the
+    A deviation is the bias or scale less a straight line over temperature: the line through the
     value in a soak at the reference temperature, with the fitted slope of soaks.
     """
 
@@ -59,7 +59,7 @@ class StateResult(NamedTuple):
 
 
 class AxisOverTemperature(NamedTuple):
-    """The table of one axis, and the slopes of its lines [micro-g/K, ppm/K]."""
+    """Bias and scale of one axis by state, and slopes of the straight lines [micro-g/K, ppm/K]."""
 
     axis: str
     bias_slope: float
@@ -68,7 +68,7 @@ class AxisOverTemperature(NamedTuple):
 
 
 def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...]:
-    """Split the uncertainty of ``|f|`` at rest into its contributions; empty without bags."""
+    """Return the contributions to the uncertainty of ``|f|`` at rest; empty without bags."""
     judgement, calibration = evidence.judgement, evidence.calibration
     if judgement is None or calibration is None or not judgement.sections['all'].n:
         return ()
@@ -90,7 +90,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         slope = f'{drift_k:g} K times the slope of the correction'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
     beyond = 'residual in excess of noise, attitude and model'
-    # The gravity uncertainty that was given to the fit is a part of the claimed sd already.
+    # The claimed sd already contains the uncertainty of gravity that was given to the fit.
     gravity = unclaimed_gravity_sd(evidence, info)
     in_fit = 'given to the fit, included in the model' if evidence.gravity_sd else ''
     return (
@@ -165,7 +165,7 @@ def results(
 
 
 def own_heat(calibration: Calibration | None) -> str:
-    """State the gradient in a soak, which the unit's own heat causes; '' if not known."""
+    """Return the gradient in a soak, due to self-heating, as text; '' if not known."""
     if calibration is None or calibration.soak_gradient_k is None:
         return ''
     gradient, sd = (minus(f'{part:.2f}') for part in calibration.soak_gradient_k)
@@ -232,7 +232,7 @@ def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
     if unclaimed_gravity_sd(evidence, info) is None:
         return (
             'U of the scale factors and of |f| − g is withheld: the uncertainty of local gravity, '
-            'which is a part of it, is not stated.'
+            'a part of U, is not stated.'
         )
     return ''
 

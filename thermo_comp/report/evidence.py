@@ -34,7 +34,7 @@ RAW = 'raw'
 CHOSEN = 'calibration'
 #: The correction of each position of a fit by a calibration fitted to the other positions.
 LEFT_OUT = 'left out'
-# Rate of heating (cooling) that bags must reach to hold heating (cooling) ramps [K/min].
+# Rate from which the heating (cooling) in bags counts as a heating (cooling) ramp [K/min].
 _SLOWEST_RAMP_K_MIN = 0.05
 #: Key of a bag's metadata in which the simulator stores the truth.
 _SIMULATED = 'truth'
@@ -105,14 +105,14 @@ class Evidence:
         if self.calibration is not None:
             if self.bags:
                 return 'not judged: no recording has a rest of the length of a window'
-            return 'the calibration alone: no recording was judged with it'
+            return 'the calibration alone: no recording was judged'
         if not self.bags:
             return 'nothing to show yet: no file could be read'
         return 'a thermal record: no calibration was judged'
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Colour of the verdict: valid; valid with reservations; not valid; nothing judged."""
+        """Class of the verdict: valid, valid with reservations, not valid, or nothing judged."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -131,7 +131,7 @@ class Evidence:
 
     @property
     def forces(self) -> dict[str, Floats]:
-        """Specific force of the windows by correction; empty without windows."""
+        """Specific force of the windows, raw and corrected; {} if not known."""
         windows = self.windows
         if windows is None or not len(windows):
             return {}
@@ -179,14 +179,14 @@ class Evidence:
 
     @property
     def positions_text(self) -> str:
-        """Count the distinct directions, and the rests if there are more rests than directions."""
+        """Numbers of distinct directions and, if different, of rests, as text."""
         n_rests = len(self.positions)
         n = len(distinct_directions(np.array([rest.up for rest in self.positions]).reshape(-1, 3)))
         text = counted(n, 'position')
         return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return each axis' residual about its position's mean by correction, (n, 3) [m/s^2]."""
+        """Return each axis' residual from its position's mean [m/s^2], (n, 3), by correction."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -196,7 +196,7 @@ class Evidence:
         return {name: force - true for name, force in self.forces.items()}
 
 
-def given(value: _T | None) -> _T:
+def required(value: _T | None) -> _T:
     """Return a value that a figure needs; ValueError if the value is None."""
     if value is None:
         raise ValueError('`evidence` lacks the data of this figure')
@@ -214,7 +214,7 @@ def evidence_of_bags(
     others: Sequence[Calibration] = (),
 ) -> Evidence:
     """
-    Judge bags with or without a calibration; without bags, report on the calibration alone.
+    Return the evidence of bags, judged with a calibration if given, or of a calibration alone.
 
     `window_s` and `tolerance` are as for `evaluate`; an empty `serial` accepts any calibration;
     `others` are earlier or later calibrations of the unit. Raises CalibrationError for a
@@ -245,7 +245,7 @@ def evidence_of_bags(
 
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
-    """Collect the results of a fit on its bags; `gravity_sd`: option of the fit [m/s^2]."""
+    """Return the evidence of a fit on its bags; `gravity_sd`: option of the fit [m/s^2]."""
     rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
     left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
     against = [f'{note.name}: {note.message}' for note in result.findings if _is_reservation(note)]
@@ -267,7 +267,7 @@ def _is_reservation(finding: Finding) -> bool:
 
 
 def _against(calibration: Calibration) -> tuple[str, ...]:
-    """List the reservations about a calibration, except the advice to record more positions."""
+    """Return the reservations about a calibration, except advice to record more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     notes = [
         f'the bags hold no {name} ramp: the correction in such ramps is extrapolated'
@@ -278,8 +278,8 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
         left_out = part.left_out_rms_m_s2
         if part.section == 'all' and left_out is not None and left_out >= part.raw_rms_m_s2:
             notes.append(
-                f'on positions left out {ug_text(left_out)} are no better than '
-                f'{ug_text(part.raw_rms_m_s2)} raw: the positions do not predict a new attitude'
+                f'the RMS on positions left out, {ug_text(left_out)}, is no better than '
+                f'{ug_text(part.raw_rms_m_s2)} raw: the fit does not predict a new attitude'
             )
     if not calibration.has_uncertainty:
         notes.append('the calibration states no uncertainty')

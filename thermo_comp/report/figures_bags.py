@@ -15,7 +15,7 @@ from ..unit.calibration import AXES
 from ..unit.gravity import MICRO_G, ug_text
 from ..unit.metrics import statistics_by_regime
 from . import style
-from .evidence import LEFT_OUT, RAW, Evidence, Position, given
+from .evidence import LEFT_OUT, RAW, Evidence, Position, required
 from .html import number
 from .trace import ShownBag
 
@@ -24,7 +24,7 @@ _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
 _RING = 22.0
-# Largest number of positions in `draw_every_position`, a row each.
+# Largest number of positions, and so of rows, in `draw_every_position`.
 _MOST = 24
 
 
@@ -44,7 +44,7 @@ def draw_temperatures(evidence: Evidence) -> Figure:
 
 
 def draw_dynamics(evidence: Evidence) -> Figure:
-    """Draw the readings' drift, the temperatures' derivatives and the flag (Fig. 4 a, b, c)."""
+    """Draw drift, derivatives of the temperatures and regime flag (the paper's Fig. 4 a, b, c)."""
     drift, name = _drift(evidence)
     heights = [1.725] * bool(len(drift)) + [1.495, 1.15, 0.8625]
     figure, panels, shown, unit = _panels(evidence, heights, is_flagged=True)
@@ -76,7 +76,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
     """Draw the residual of each axis, without and with the calibration (the paper's Fig. 6)."""
     residuals = evidence.axis_residuals()
     rows = _rows(evidence)
-    dynamic = given(evidence.windows).is_dynamic[rows]
+    dynamic = required(evidence.windows).is_dynamic[rows]
     figure, panels, _, unit = _panels(evidence, [1.05] * len(residuals), more=0.5)
     for axes, (name, residual) in zip(panels, residuals.items(), strict=True):
         axes.set_prop_cycle(style.AXIS_CYCLE)
@@ -119,8 +119,8 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """Make panels over time for the shown bag, grey where dynamic; return also the time unit."""
-    shown = given(evidence.shown)
+    """Return figure, panels over time (dynamic regime in grey), shown bag and time unit [s]."""
+    shown = required(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
     panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
@@ -140,12 +140,12 @@ def _panels(
 
 def _rows(evidence: Evidence) -> Bools:
     """Select the windows of the shown bag."""
-    return np.asarray(given(evidence.windows).bag == given(evidence.shown).index)
+    return np.asarray(required(evidence.windows).bag == required(evidence.shown).index)
 
 
 def _plot(axes: Axes, evidence: Evidence, value: Floats, unit: float, **line: Any) -> None:
-    """Draw a value of the windows over time, with a gap between positions."""
-    windows, rows = given(evidence.windows), _rows(evidence)
+    """Draw a value of the shown bag's windows over time, with gaps between positions."""
+    windows, rows = required(evidence.windows), _rows(evidence)
     time, value = style.broken(windows.time[rows], value[rows], windows.position[rows])
     axes.plot(time / unit, value, **line)
 
@@ -197,7 +197,7 @@ def _symmetric(axes: Axes, residual: Floats) -> None:
 
 def draw_every_position(evidence: Evidence) -> Figure:
     """Draw |f| - g over time in every position, or in the positions with the largest residuals."""
-    windows = given(evidence.windows)
+    windows = required(evidence.windows)
     judged, residual = list(evidence.residuals.items())[-1]
     worst = sorted(evidence.positions, key=lambda place: -place.residual_rms[judged])[:_MOST]
     shown = sorted(worst, key=lambda place: place.number)

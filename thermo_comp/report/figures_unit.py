@@ -14,9 +14,9 @@ from ..unit.gravity import MICRO_G
 from ..unit.metrics import means_by
 from ..unit.rate_bias import MILLIDEGREE
 from . import style
-from .evidence import CHOSEN, Evidence, given
+from .evidence import CHOSEN, Evidence, required
 from .html import minus, number
-from .states import Curve, curves, slopes
+from .temperature_curves import Curve, curves, slopes
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
@@ -32,7 +32,7 @@ _POINT: style.Line = {'color': style.BLACK, 'ms': 3.0, 'mfc': 'none', 'mew': 0.8
 
 def draw_functions(evidence: Evidence) -> Figure:
     """Draw bias and scale over temperature, less a straight line, with bands and measurements."""
-    calibration = given(evidence.calibration)
+    calibration = required(evidence.calibration)
     figure = style.new_figure(4.4)
     panels = figure.subplots(2, 3, sharex=True)
     drawn = curves(calibration)
@@ -53,7 +53,7 @@ def draw_functions(evidence: Evidence) -> Figure:
 
 def draw_rates(evidence: Evidence) -> Figure:
     """Draw the bias of the angular rate over temperature, less a straight line, with bands."""
-    triad = rate_triad(given(evidence.calibration))
+    triad = rate_triad(required(evidence.calibration))
     figure = style.new_figure(2.5)
     panels = figure.subplots(1, 3, sharex=True)
     panels[0].set_ylabel('bias less the line, mdeg/s')
@@ -93,9 +93,9 @@ def _draw_less_line(
 
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
-    Average the residual in each soak of each position: temperatures (n,), bias [micro-g] and scale
-    [ppm] (n, 6), attributed to bias or to scale alone; scale is NaN if the axis senses less
-    than half of gravity.
+    Average the residual in each soak of each position; return temperatures (n,), and the residual
+    as a bias [micro-g] and as a scale error [ppm], (n, 6). The scale error is NaN if the axis
+    senses less than half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:

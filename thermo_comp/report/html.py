@@ -54,12 +54,12 @@ def _templates() -> Environment:
 
 
 def utc(stamp_ns: int) -> dt.datetime:
-    """Give a stamp as a date with time, in UTC."""
+    """Return a stamp as date and time, in UTC."""
     return dt.datetime.fromtimestamp(stamp_ns // 10**9, dt.timezone.utc)
 
 
 def _css_text(value: str) -> Markup:
-    """Quote a text for a style sheet: characters other than letters and digits are escaped."""
+    """Return a quoted text for a style sheet; only ASCII letters and digits stay unescaped."""
     text = ''.join(
         c if c.isalnum() and c.isascii() else f'\\{ord(c):06x}'
         for c in label_text(value, _LONGEST_MARGIN)
@@ -104,6 +104,6 @@ def rounded(value: float, expanded: float) -> tuple[str, str]:
 
 
 def label_text(value: str, limit: int = 40) -> str:
-    """Make text from outside safe for a figure: one line, printable, at most `limit` long."""
+    """Return a text of unknown origin for a figure: printable, at most `limit` characters."""
     clean = ''.join(c if c.isprintable() else ' ' for c in value).strip()
     return clean if len(clean) <= limit else f'{clean[: limit - 1]}…'

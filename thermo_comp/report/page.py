@@ -32,8 +32,8 @@ from .certificate import (
 from .evidence import LEFT_OUT, Evidence
 from .html import label_text, render, utc
 from .statements import CertificateInfo
-from .states import programs
 from .style import drawing, png, svg
+from .temperature_curves import programs
 from .trace import span_of
 
 # Mean radius of the Earth [m]: GRS 80.
@@ -41,7 +41,7 @@ _EARTH_RADIUS = 6.371e6
 
 
 class ReportFigure(NamedTuple):
-    """A figure: name of its file, the question it answers, how to read it, the drawing."""
+    """A figure: file name, question that it answers, how to read it, drawing function."""
 
     name: str
     question: str
@@ -78,7 +78,7 @@ def render_report(
     *,
     figures: Sequence[tuple[ReportFigure, str]] | None = None,
 ) -> str:
-    """Render the page with the given figures; by default all that the evidence allows."""
+    """Return the page with the given figures, by default all that the evidence allows."""
     if figures is None:
         figures = drawn_figures(figures_of(evidence))
     info = info or CertificateInfo()
@@ -127,7 +127,7 @@ def schuler_peak(bias: float) -> float:
 
 
 def remarks_of(bag: ReducedBag) -> list[str]:
-    """List losses and peculiarities of a bag."""
+    """Return remarks on a bag: lost samples, no rest, several rests, no case temperature."""
     n = len(bag.intervals)
     return [
         text
@@ -145,7 +145,7 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _judged_bags(evidence: Evidence) -> list[str]:
-    """Describe the bags of the verdict; add a sentence if the shown bag has no known regime."""
+    """Return sentences on the judged bags and, if so, on a shown bag without known regime."""
     collected = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
@@ -196,7 +196,7 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     if shown is None:
         return
     bag = f'Bag {label_text(shown.bag.source.name, 60)}.'
-    read = f'Grey: the time in which the flag says dynamic. {bag} After Fig.'
+    read = f'Grey: dynamic regime. {bag} After Fig.'
     yield (
         'How did the unit follow the chamber?',
         of_bags.draw_temperatures,
@@ -209,14 +209,14 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         of_bags.draw_dynamics,
         f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
         f'rates of the temperatures and, below, the second derivative of the {shown.leader} '
-        'temperature, whose pulses open and close the dynamic state; (c) the state that follows, '
-        'with its direction; it is unknown until the detector has enough readings. '
+        'temperature, whose pulses open and close the dynamic state; (c) the regime that follows, '
+        'with its direction, unknown until the detector has enough readings. '
         f'{read} 4 of the paper.',
     )
     if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
         return
     yield (
-        'What does the correction leave on each axis?',
+        'Which residual does the correction leave on each axis?',
         of_bags.draw_residuals,
         'Residual of each axis in the output frame. The attitude in a position is not known: '
         'the mean direction measured there replaces it. Each panel has a separate scale. '
@@ -226,8 +226,8 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'Does |f| stay constant over the whole program?',
         of_bags.draw_gravity,
         f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
-        'for a unit at rest it is zero at any temperature. Above: before and after '
-        'the correction; below: after it, in a larger scale. '
+        'of an ideal unit at rest zero at any temperature. Above: before and after '
+        'the correction; below: after the correction, in a larger scale. '
         f'{read} 7 of the paper.',
     )
 
@@ -279,7 +279,7 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         )
     if evidence.positions:
         yield (
-            'Are the positions well spread, and is any of them an outlier?',
+            'Are the positions well spread, and is any position an outlier?',
             of_bags.draw_positions,
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '

@@ -54,7 +54,7 @@ class GravityStatement:
 
 @dataclass(frozen=True)
 class Thermometers:
-    """How far the unit's thermometers may drift between the calibration and its use."""
+    """Standard uncertainty by drift of the unit's thermometers from calibration to use."""
 
     standard_uncertainty_k: NotNegative | None = None
 

@@ -56,11 +56,11 @@ _RC: dict[str, Any] = {
     'legend.borderaxespad': 0.0,
     'legend.borderpad': 0.0,
     'hatch.linewidth': 0.5,
-    # Names in figures come from outside: a dollar sign must not start a formula.
+    # Names in figures come from files: a dollar sign must not start a formula.
     'text.parse_math': False,
     'svg.fonttype': 'none',
     'svg.hashsalt': 'thermo_comp',
-    # matplotlib draws only the extremes of many points in one pixel.
+    # Simplify lines: drop vertices within half a pixel of the line.
     'path.simplify_threshold': 0.5,
 }
 _PNG_DPI = 160
@@ -68,17 +68,17 @@ _WIDTH = 7.1
 
 
 def drawing() -> AbstractContextManager[None]:
-    """Draw in the report's style, independent of the user's matplotlib settings."""
+    """Return a context for drawing in the report's style, whatever the matplotlib settings."""
     return style.context(_RC, after_reset=True)
 
 
 def new_figure(height: float) -> Figure:
-    """Make an empty figure as wide as a printed page, `height` inches high."""
+    """Return an empty figure as wide as a printed page, `height` inches high."""
     return Figure(figsize=(_WIDTH, height), layout='constrained')
 
 
 def svg(figure: Figure, name: str, label: str) -> str:
-    """Write a figure as an SVG element; `name` prefixes all ids, `label` is for screen readers."""
+    """Return a figure as an SVG element with id prefix `name` and ARIA label `label`."""
     buffer = io.StringIO()
     nothing = {'Date': None, 'Creator': None, 'Format': None, 'Type': None}
     figure.savefig(buffer, format='svg', metadata=nothing)
@@ -91,14 +91,14 @@ def svg(figure: Figure, name: str, label: str) -> str:
 
 
 def png(figure: Figure) -> bytes:
-    """Write a figure as a PNG file's content."""
+    """Return a figure as the content of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format='png', dpi=_PNG_DPI, metadata={'Software': None})
     return buffer.getvalue()
 
 
 def time_unit(duration_s: float) -> tuple[float, str]:
-    """Choose the unit of a time axis: its length in seconds, and the label of the axis."""
+    """Return the unit of a time axis: length of the unit [s], and label of the axis."""
     if duration_s >= 2.5 * 3600.0:
         return 3600.0, 'time, h'
     if duration_s >= 300.0:
@@ -133,7 +133,7 @@ def shared_legend(figure: Figure, axes: Axes, n_columns: int) -> None:
 
 
 def log_axis(axes: Axes, low: float, high: float) -> None:
-    """Make the x axis logarithmic from `low` to `high`, with enough plain numbers on it."""
+    """Make the x axis logarithmic from `low` to `high`, with plain numbers at its ticks."""
     axes.set_xscale('log')
     axes.set_xlim(low, high)
     is_short = high < 50.0 * low

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bag that the time figures show, with the thermal state by the node's tracker."""
+"""Owns the bag that figures over time show, with rates and regimes by the node's tracker."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """A bag since `start_ns`: rates [K/s], leading sensor's acceleration [K/s^2] or NaN."""
+    """A bag over time [s] since `start_ns`: rates [K/s], NaN before they settle, and regimes."""
 
     index: int
     bag: ReducedBag
@@ -60,7 +60,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 
 
 def widest(bags: Sequence[ReducedBag]) -> int:
-    """Choose the bag to show: the widest in temperature, then the longest."""
+    """Return the index of the bag with the widest range of T_board, then of the longest bag."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
     # Spans within 5 % and lengths within a minute count as equal; of equal bags take the first.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
@@ -80,7 +80,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
-    # The last of several regimes at one time applies; equal consecutive regimes are joined.
+    # If several regimes have the same time, the last applies; equal successive regimes are joined.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),
         **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),

@@ -6,7 +6,7 @@ Owns the conversion of serialized samples to serialized Imu messages, without rc
 Samples are read, and an Imu is written, at fixed offsets of their plain form, little-endian CDR: 4
 bytes of encapsulation, int32 seconds, uint32 nanoseconds, uint32 length of the `frame_id` with its
 final NUL, the string, and, at the next multiple of 8 from the end of the encapsulation, float64
-values. rclpy first rewrites a message that is not in the plain form, as a big-endian message.
+values. A message in another form, such as big-endian, is first rewritten by rclpy.
 """
 
 import struct
@@ -18,9 +18,9 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, Temperature
 
-#: Compensates a sample: stamp [ns] and three components to force and covariance; None: dropped.
+#: Compensates a sample: from stamp [ns], x, y, z to force and covariance; None if it is dropped.
 Process = Callable[[int, float, float, float], 'tuple[float, ...] | None']
-#: Corrects the angular rate of a sample: stamp and rate in, rate and variances out.
+#: Corrects the angular rate of a sample: from stamp and rate to rate and variances.
 CorrectRate = Callable[[int, float, float, float], 'tuple[float, ...]']
 
 #: Longest message read [bytes]; an Imu with the longest frame name is shorter.
@@ -41,7 +41,7 @@ _CELSIUS = struct.Struct('<d')
 
 @dataclass(slots=True)
 class Traffic:
-    """The node's counters, in addition to the compensator's."""
+    """The counters of the node, in addition to those of the compensator."""
 
     n_lost: int = 0  # samples that the driver sent and the node did not receive
     n_unpublished: int = 0  # output messages that the middleware did not accept
@@ -52,7 +52,7 @@ class Traffic:
 
 
 class SampleConverter:
-    """Turns samples into Imu, both serialized; an empty `frame_id` keeps the input's."""
+    """Converts serialized samples to serialized Imu; empty `frame_id`: the frame of the input."""
 
     def __init__(self, kind: Any, frame_id: str = '', traffic: Traffic | None = None) -> None:
         self._kind, self._frame_id = kind, frame_id
@@ -100,7 +100,7 @@ class SampleConverter:
         )  # fmt: skip
 
     def _learn(self, data: bytes) -> bytes:
-        """Note the offsets of a message of new layout; return its plain form, or empty bytes."""
+        """Store the layout of a message; return the message's plain form, or empty bytes."""
         is_imu = self._kind is Imu
         skip, n_after = (_PASSED, 72) if is_imu else (0, 0)
         size = skip + 24 + n_after

@@ -3,8 +3,8 @@
 """
 Owns the node's diagnostics: the compensator's status as a `DiagnosticStatus`.
 
-ERROR: no valid output, or samples are saturated. WARN: the output is worse than the calibration
-states. The message names every reason, the worst first; the values hold the figures.
+The level is ERROR if there is no valid output, or if samples are saturated; WARN if the output is
+worse than the calibration states. The message names every reason, the most severe first.
 """
 
 import math
@@ -31,10 +31,10 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # silence of samples after which readings apply [s]; Fast DDS may deliver 3 s late
+IDLE_S = 5.0  # time without samples until readings apply [s]; Fast DDS may deliver 3 s late
 #: Readings stamped later than the samples by more than this time are of another clock [s].
 AHEAD_S = 5.0
-#: Delay of the next sample, in cycles and in s, beyond both of which the samples have stopped.
+#: The samples have stopped if the next sample is late by more than both times [cycles], [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
@@ -73,7 +73,7 @@ Finding = tuple[int, str]  # level and text
 
 
 class Reporter:
-    """Publishes the diagnostics of a node; logs when their level changes."""
+    """Publishes the diagnostics of a node; logs each change of their level."""
 
     def __init__(self, loop: WaitLoop, relay: Relay) -> None:
         self._loop, self._node, self._relay = loop, loop.node, relay
@@ -157,7 +157,7 @@ class Reporter:
             self._relay.traffic.n_lost += n_lost
 
     def _inputs(self) -> Iterator[Finding]:
-        """List the problems of the publishers of the inputs."""
+        """Yield the problems with publishers of inputs."""
         for name, source in self._relay.inputs.items():
             n_publishers, topic = source.count_publishers(), source.subscription.topic_name
             if n_publishers > 1 and source.sources.is_contested:
@@ -171,7 +171,7 @@ class Reporter:
                 yield level, f'no messages of a publisher on {topic}: {mismatch}'
 
     def _lost_rests(self) -> Iterator[Finding]:
-        """Name the reason if rests could not be kept."""
+        """Yield a warning with the reason if rests could not be written to the rest log."""
         rests = self._relay.rests
         if rests is not None and rests.log.reason:
             lost = counted(rests.log.n_lost, 'rest')
@@ -184,7 +184,7 @@ class Reporter:
         counts: dict[str, int],
         rate: float | None,
     ) -> dict[str, str]:
-        """List the figures, the most important first."""
+        """Return the values of the diagnostics, the most important first."""
         calibration = loaded.calibration
         return {
             **_thermal_values(status),
@@ -210,7 +210,7 @@ class Reporter:
         }
 
     def _force_values(self, calibration: Calibration, status: CompensatorStatus) -> dict[str, str]:
-        """List the figures of the samples: |f|, rests, noise and uncertainty of each axis."""
+        """Return the values on the samples: |f|, rests, noise and uncertainty of each axis."""
         values, gravity = {'force excess [m/s^2]': f'{self._force_excess():.3f}'}, status.gravity
         if gravity is not None:
             values |= {
@@ -243,7 +243,7 @@ class Reporter:
 
 
 def _thermal_values(status: CompensatorStatus) -> dict[str, str]:
-    """List regime, temperatures, their faults, and distances outside the calibrated ranges."""
+    """Return regime, temperatures, their faults, and distances outside the calibrated ranges."""
     values, state = {'regime': status.regime.name.lower()}, status.state
     if state:
         values |= {
@@ -270,7 +270,7 @@ def _of_axes(key: str, values: Iterable[float]) -> dict[str, str]:
 
 
 def _mismatch(node: Node, subscription: Subscription) -> str:
-    """Return why no publisher on a topic is heard: type or QoS; empty if there is none."""
+    """Return why a publisher's messages are not received (type or QoS), or an empty text."""
     topic, expected = subscription.topic_name, type_name(subscription.msg_type)
     for publisher in node.get_publishers_info_by_topic(topic):
         if publisher.topic_type != expected:
@@ -289,7 +289,7 @@ def findings_of(
     rate: float | None,
     silence_s: float,
 ) -> Iterator[Finding]:
-    """List the problems of the inputs and of the correction."""
+    """Yield the problems of the inputs and of the correction."""
     unit, needs_board = loaded.calibration.unit, loaded.calibration.needs_temperature
     if new['n_in'] == 0 and silence_s > max(SILENT_S, SILENT_CYCLES * unit.cycle_time_s):
         yield _ERROR, 'no samples are coming in'

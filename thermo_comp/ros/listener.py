@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a node that only listens: the inputs of the live topics as blocks, for `record`."""
+"""Owns the node of `record`, which subscribes to live inputs and yields blocks of messages."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ _AS_OFFERED = QoSProfile(
 
 
 class LiveTopics:
-    """Listens to the node's inputs; it subscribes to a topic once the topic has a publisher."""
+    """Receives the inputs of the compensating node, each topic once it has a publisher."""
 
     def __init__(self, topics: Topics, ros_args: Sequence[str] = ()) -> None:
         self._topics, self._ros_args = topics, ros_args
-        self._heard: dict[Role, RawSubscription] = {}
+        self._inputs: dict[Role, RawSubscription] = {}
         #: Received messages: role, messages, times of reception [ns].
         self._received: list[tuple[Role, list[bytes], list[int]]] = []
         self._feeds: dict[Role, Topic] = {}
         self._fields: dict[Role, LiveField] = {}
         self._last_ns = NO_STAMP_NS
-        self.problems: tuple[str, ...] = ()  # reasons why a topic has no messages, as sentences
+        self.problems: tuple[str, ...] = ()  # reasons why topics have no messages, as texts
 
     def __enter__(self) -> LiveTopics:
         with ExitStack() as stack:
@@ -61,7 +61,7 @@ class LiveTopics:
         self._stack.close()
 
     def _take(self) -> None:
-        for role, subscription in self._heard.items():
+        for role, subscription in self._inputs.items():
             messages, received_ns, _ = subscription.drain()
             if messages:
                 self._received.append((role, messages, received_ns))
@@ -69,7 +69,7 @@ class LiveTopics:
     @property
     def n_lost(self) -> int:
         """Number of messages that were sent and not received."""
-        return sum(topic.n_lost for topic in self._heard.values())
+        return sum(topic.n_lost for topic in self._inputs.values())
 
     def blocks(self, wait: Callable[[float], bool]) -> Iterator[News | None]:
         """Yield the received blocks, and None after each `wait` [s], until `wait` returns True."""
@@ -131,8 +131,8 @@ class LiveTopics:
     def _subscribe(self, role: Role, topic: str, kind: str, problems: list[str]) -> bool:
         """Subscribe to a topic if it has a publisher; return whether it is subscribed."""
         name = self._node.resolve_topic_name(split_field(topic)[0])
-        if role in self._heard:
-            n_publishers = self._heard[role].count_publishers()
+        if role in self._inputs:
+            n_publishers = self._inputs[role].count_publishers()
             if n_publishers != 1:
                 problems.append(f'{n_publishers or "no"} publishers on {name}, expected one')
             return True
@@ -144,12 +144,12 @@ class LiveTopics:
             return False
         if field is not None:
             self._fields[role], self._feeds[role] = field, Topic(name, TEMPERATURE, 'cdr')
-            self._heard[role] = self._loop.subscribe(field.kind, name, _AS_OFFERED, wakes=False)
+            self._inputs[role] = self._loop.subscribe(field.kind, name, _AS_OFFERED, wakes=False)
         elif any(offer.topic_type != kind for offer in offers):
             problems.append(f'{name} has the type {offers[0].topic_type}, expected {kind}')
         elif offers:
             self._feeds[role] = Topic(name, kind, 'cdr')
-            self._heard[role] = self._loop.subscribe(
+            self._inputs[role] = self._loop.subscribe(
                 message_class(kind), topic, _AS_OFFERED, wakes=role == 'accel'
             )
-        return role in self._heard
+        return role in self._inputs

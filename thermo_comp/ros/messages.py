@@ -3,8 +3,8 @@
 """
 Owns the step from the names of topics and types to rclpy: message classes, QoS profiles, readings.
 
-A temperature is a field of a message of any type. The class of a message is imported at run time,
-so the package of a driver's messages is not a dependency: it is installed with the driver.
+A temperature may be a number in a message of any type. The class of a message is imported at run
+time: the package of a driver's messages is installed with the driver and is no dependency.
 """
 
 import re
@@ -32,7 +32,7 @@ def message_class(kind: str) -> Any:
 
 
 def type_name(message_type: Any) -> str:
-    """Name a message type as ROS tools and bags do."""
+    """Return the name of a message type as ROS tools and bags write it."""
     return f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'
 
 

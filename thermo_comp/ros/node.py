@@ -50,15 +50,15 @@ example: thermo_comp_node --ros-args -p calibration_file:=unit42.yaml -r accel/c
 parameters:
 """
 
-#: Prefix that the launch file gives to a parameter whose argument was not given.
+#: Prefix that the launch file puts before the name of a parameter whose argument is missing.
 NOT_GIVEN = 'not_given.'
 
-#: Errors that are no bug of the node: of files, values, environment, middleware (RuntimeError).
-_NOT_OURS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
+#: Errors by the user's files, values or environment, or by the middleware (RuntimeError).
+_USER_ERRORS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 
 class CompensationNode:
-    """The node around a `Compensator`; ThermoCompError if the node cannot start."""
+    """The ROS node with a `Compensator`; ThermoCompError if the node cannot start."""
 
     def __init__(self, context: rclpy.context.Context | None = None) -> None:
         self.node = rclpy.create_node(NODE_NAME, context=context)
@@ -122,7 +122,7 @@ class CompensationNode:
         return self._relay.running.compensator
 
     def _prepare(self, changes: list[Parameter]) -> tuple[LoadedCalibration, Model] | None:
-        """Read, try and build the calibration of a parameter change, parallel to the samples."""
+        """Read, test and prepare a changed calibration, in parallel to the samples."""
         names = [change.value for change in changes if change.name == 'calibration_file']
         if not names or not isinstance(names[-1], str):
             return None
@@ -149,7 +149,7 @@ class CompensationNode:
             if new:
                 self._print_calibration(before.loaded.calibration.unit.serial)
             self._loop.call_soon(partial(self._relay.release, before.samples))
-            # `return` is inside `try`: any failure restores the previous calibration.
+            # Any failure up to this `return` restores the previous calibration and parameters.
             return result  # noqa: TRY300
         except BaseException:
             self._run_with(before)
@@ -169,7 +169,7 @@ class CompensationNode:
         self, loaded: LoadedCalibration, config: parameters.NodeConfig, inputs: tuple[str, ...]
     ) -> None:
         """Refuse a calibration of another unit, input or set of thermometers."""
-        unit, heard = loaded.calibration.unit, inputs[1:]
+        unit, listened_sensors = loaded.calibration.unit, inputs[1:]
         message = key = ''
         taken = {'counts': 'counts', 'imu': 'm/s^2'}[config.input]
         if config.serial and unit.serial != config.serial:
@@ -180,10 +180,10 @@ class CompensationNode:
                 f'must be {taken!r} (parameter `input` is {config.input}), got {unit.input!r}'
             )
             key = 'unit.input'
-        elif loaded.calibration.sensors != heard:
+        elif loaded.calibration.sensors != listened_sensors:
             named, key = ', '.join(loaded.calibration.sensors), 'sensors'
-            message = f'must be {", ".join(heard)}, which this node listens to, got {named}: '
-            message += 'restart the node with this file'
+            message = f'must be {", ".join(listened_sensors)}, which this node listens to, '
+            message += f'got {named}: restart the node with this file'
         if message:
             raise CalibrationError(message, loaded.path, key)
 
@@ -197,7 +197,7 @@ class CompensationNode:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; 0 after an orderly end, 1 if it could not start, 2 for a wrong usage."""
+    """Run the node; return 0 after an orderly end, 1 if the start failed, 2 for a wrong usage."""
     args = sys.argv if args is None else args
     hold_standard_streams()
     try:
@@ -230,7 +230,7 @@ def main(args: list[str] | None = None) -> int:
                 node.close()
         except ExternalShutdownException:
             pass
-        except _NOT_OURS as error:
+        except _USER_ERRORS as error:
             return _fail(error, 1)
         finally:
             rclpy.try_shutdown()

@@ -6,7 +6,7 @@ Owns the node's parameters: their table, and the services that set them.
 The table of the parameters is `NodeConfig`. The node runs with one immutable `NodeConfig`; a
 change makes a new `NodeConfig` or is refused as a whole. A thread waits while a file is read; the
 loop then replaces the reference to the `NodeConfig`. Requests are answered in order of arrival,
-but a request without a file does not wait for files.
+but a request without a file does not wait for requests with files.
 """
 
 import math
@@ -57,25 +57,25 @@ class NodeConfig:
     )
     calibration_directory: str = _parameter(
         '',
-        'Folder that `calibration_file` must be in after links are resolved; empty allows any. '
-        'Only at start.',
+        'Folder that `calibration_file` must be in after links are resolved; empty: any folder. '
+        'Fixed at start.',
         longest=4096,
         is_fixed=True,
     )
     serial: str = _parameter(
-        '', 'Serial number that the calibration must have; empty accepts any.'
+        '', 'Serial number that the calibration must have; empty: any number.'
     )
     topics: str = _parameter(
         '',
-        'Topics of inputs with other names: INPUT=TOPIC[:FIELD], separated by commas, or a file '
-        'of such lines, as in config/drivers. Only at start.',
+        'Inputs whose topics have other names: INPUT=TOPIC[:FIELD], separated by commas, or a '
+        'file of such lines, as in config/drivers. Fixed at start.',
         longest=4096,
         is_fixed=True,
     )
     rest_log: str = _parameter(
         '',
         'Folder for windows of 10 s at rest, which `thermo_comp update` and `evaluate` read, at '
-        'most 10 MB a month; empty keeps none. Only at start.',
+        'most 10 MB a month; empty: no rests are stored. Fixed at start.',
         longest=4096,
         is_fixed=True,
     )
@@ -87,45 +87,45 @@ class NodeConfig:
     )
     frame_id: str = _parameter(
         '',
-        "Frame of the output; empty keeps the input's. The node does not rotate samples.",
+        'Frame of the output; empty: frame of the input. The node does not rotate samples.',
         longest=LONGEST_FRAME,
     )
     transition_time: float = _parameter(
         _DEFAULTS.transition_time_s,
-        'Time over which the sets are blended at a switch [s], up to ten times as long if the '
-        'output would change faster than 1 ug per second; 0 switches at once.',
+        'Time over which the coefficients change from one regime to the other [s]; up to ten '
+        'times as long if the output would change faster than 1 ug per second; 0: at once.',
         (0.0, 3600.0),
     )
     temperature_timeout: float = _parameter(
         _DEFAULTS.temperature_timeout_s,
-        'Age of the board temperature at which publishing stops [s].',
+        'Age of the last board temperature at which publishing stops [s].',
         (0.1, 86400.0),
     )
     case_timeout: float = _parameter(
         _DEFAULTS.case_timeout_s,
-        'Age of the case temperature at which the board sensor decides the regime [s].',
+        'Age of the last case temperature from which the board sensor decides the regime [s].',
         (0.1, 86400.0),
     )
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
-        'Time after which samples that repeat their values on all axes, or on one while both '
-        'others move, are not published [s]; samples of three zeros are never published; '
-        '0 publishes all of them.',
+        'Time after which samples that repeat their values on all axes, or on one axis while the '
+        'other two change, are not published [s]; samples of three zeros are never published; '
+        '0: repeated values and zeros are published.',
         (0.0, 3600.0),
     )
     local_gravity: float = _parameter(
         _DEFAULTS.local_gravity_m_s2,
-        'Gravity at this place [m/s^2], for the check at rest; 0 takes that of the calibration.',
+        'Local gravity [m/s^2], for the check of |f| at rest; 0: gravity of the calibration.',
         (0.0, 100.0),
     )
     gravity_tolerance: float = _parameter(
         _DEFAULTS.gravity_tolerance_m_s2,
         'Error of |f| at rest [m/s^2] at which publishing stops (another unit; a reversed '
         'axis changes |f| by at most twice the bias of the axis); '
-        '0 never stops.',
+        '0: publishing never stops.',
         (0.0, 100.0),
     )
-    diagnostics_period: float = _parameter(1.0, 'Time between diagnostics [s].', (0.01, 60.0))
+    diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))
 
     def compensator_config(self) -> CompensatorConfig:
         """Return the settings of the compensator, whose names end in the unit."""
@@ -167,7 +167,7 @@ def named_topics(text: str) -> dict[str, str]:
 
 
 def descriptor(name: str) -> ParameterDescriptor:
-    """Describe one parameter as ROS tools show it: type, range and description."""
+    """Return the descriptor of a parameter for ROS tools: type, range and description."""
     entry = _TABLE[name]
     described = ParameterDescriptor(
         name=name,
@@ -190,7 +190,7 @@ def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
 
 
 def parameters_help() -> str:
-    """Write the parameters as plain text for a terminal."""
+    """Return the parameters as text for a terminal."""
     return '\n'.join(
         f'  {name}:={entry.default!r}\n      {entry.metadata["description"]}'
         for name, entry in _TABLE.items()
@@ -225,8 +225,8 @@ def _checked(name: str, value: Any) -> Any:
 class ParameterRequests:
     """Answers a node's parameter services."""
 
-    # `prepare` does the slow part of a parameter change in parallel to the samples, `apply` sets
-    # its result between two samples; an exception of either refuses the change.
+    # `prepare` reads files for a parameter change in parallel to the samples, `apply` sets
+    # the prepared result between two samples; an exception in either refuses the change.
     def __init__(
         self,
         loop: WaitLoop,
@@ -235,7 +235,7 @@ class ParameterRequests:
     ) -> None:
         self._loop, self._prepare, self._apply = loop, prepare, apply
         self._n_waiting = 0
-        # Two threads: a request without a file does not wait for files.
+        # With two threads a request without a file does not wait for requests with files.
         self._slow, self._quick = (ThreadPoolExecutor(1, 'parameters') for _ in range(2))
         for service in loop.node.services:
             if service.srv_type in (srv.SetParameters, srv.SetParametersAtomically):
@@ -244,7 +244,7 @@ class ParameterRequests:
                 loop.handlers[service] = partial(_reply, service)
 
     def close(self) -> None:
-        """Wait for the request that is being prepared; apply no more values."""
+        """Wait for the request in preparation; apply no more requests."""
         for pool in (self._slow, self._quick):
             pool.shutdown(cancel_futures=True)
 
@@ -288,7 +288,7 @@ class ParameterRequests:
         """Apply one group of parameters; an unexpected error refuses the group and is logged."""
         try:
             changes, preparation = prepared.result()
-            news = [change for change in changes if not self._is_in_force(change)]
+            news = [change for change in changes if not self._repeats_fixed_value(change)]
             result = (
                 self._apply(news, preparation) if news else SetParametersResult(successful=True)
             )
@@ -301,8 +301,8 @@ class ParameterRequests:
             )
             raise
 
-    def _is_in_force(self, change: Parameter) -> bool:
-        """Whether a change keeps a fixed parameter's value, as `param load` of a dump does."""
+    def _repeats_fixed_value(self, change: Parameter) -> bool:
+        """Whether a change sets a fixed parameter to its value, as `param load` of a dump does."""
         node = self._loop.node
         return bool(
             node.has_parameter(change.name)

@@ -114,7 +114,7 @@ class Player:
         self._next_clock = 0.0
 
     def unheard(self) -> list[str]:
-        """Name the topics that have no subscriber."""
+        """Return the topics without a subscriber."""
         return [
             out.topic_name for out in self._publishers.values() if not out.get_subscription_count()
         ]
@@ -122,7 +122,7 @@ class Player:
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
     ) -> PlayReport:
-        """Send the bag; after each window `throttle` gets the number of samples, and may block."""
+        """Send the bag; `throttle` gets the number of samples after each WINDOW, and may block."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {publisher.topic_name: role for role, publisher in self._publishers.items()}

@@ -45,7 +45,7 @@ class LoadedCalibration:
 
 
 def read(name: str, directory: str = '') -> LoadedCalibration:
-    """Read and try a calibration; errors quote no content of a file that is not a calibration."""
+    """Read and test a calibration; errors quote no content of a file that is no calibration."""
     if not name:
         raise CalibrationError(
             'parameter `calibration_file` is not set; start with '

@@ -4,7 +4,7 @@
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
 Messages do not identify their publisher. A topic with more than one publisher is ignored, as is
-the first batch after a publisher has left, which may hold its messages (`waitloop.Sources`).
+the first batch after a publisher has left, which may hold messages of this publisher.
 """
 
 from bisect import bisect_left, bisect_right
@@ -29,7 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading applies once the newest reading is later by this time [ns].
+#: Without samples, a reading applies once a reading that is later by this time has arrived [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
@@ -38,7 +38,7 @@ _Reading = tuple[int, tuple[str, int, float]]
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """Everything that a reload replaces, by exchanging one reference between two samples."""
+    """All objects that a reload replaces, by exchanging a reference between two samples."""
 
     loaded: LoadedCalibration
     config: NodeConfig
@@ -91,8 +91,8 @@ class Relay:
     def _check_topics(self, output: str) -> None:
         """Refuse a topic shared by two thermometers, and an output equal to the input."""
         roles: dict[tuple[str, str], str] = {}
-        for name, heard in self.thermometers.items():
-            topic = heard.subscription.topic_name
+        for name, raw in self.thermometers.items():
+            topic = raw.subscription.topic_name
             twin = roles.setdefault((topic, split_field(self._topic(name))[1]), name)
             if twin != name:
                 raise ThermoCompError(TWINS.format(twin, name), key=topic)
@@ -102,8 +102,8 @@ class Relay:
 
     def follow_types(self) -> None:
         """Subscribe again to thermometers whose messages have another type."""
-        for name, heard in list(self.thermometers.items()):
-            if self._fields[name].kind is not Temperature or heard.count_publishers():
+        for name, raw in list(self.thermometers.items()):
+            if self._fields[name].kind is not Temperature or raw.count_publishers():
                 continue
             try:
                 field = live_field(self._loop.node, self._topic(name))
@@ -113,7 +113,7 @@ class Relay:
                     self._loop.node.get_logger().error(str(error))
                 continue
             if field is not None:
-                topic = heard.subscription.topic_name
+                topic = raw.subscription.topic_name
                 self._loop.unsubscribe(self.thermometers.pop(name))
                 # The middleware allows one type per topic: the loop must release the old
                 # subscription first.
@@ -121,8 +121,8 @@ class Relay:
 
     def _subscribe(self, name: str, topic: str, field: LiveField) -> None:
         self._fields[name] = field
-        heard = self._loop.subscribe(field.kind, topic, qos_of(BOARD), wakes=False)
-        self.thermometers[name] = heard
+        raw = self._loop.subscribe(field.kind, topic, qos_of(BOARD), wakes=False)
+        self.thermometers[name] = raw
 
     @property
     def samples(self) -> RawSubscription:

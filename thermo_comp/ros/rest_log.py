@@ -40,13 +40,13 @@ _EPOCH_NS = 946_684_800 * 10**9
 #: Smallest backward step of the stamps [ns] that begins a new recording.
 _JUMP_NS = 10**9
 # First bytes of a message in plain form (see `conversion`); offsets of counts, force and angular
-# rate from the end of the message [bytes].
+# rate from the end of a message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
 _SHORTEST = {False: 44, True: 316}  # shortest message [bytes]: of counts, and of an Imu (True)
 
 
 class RestLog:
-    """A folder of rests, written by a thread; `n_lost` lines could not be kept, for `reason`."""
+    """A folder of rests, written by a thread; `n_lost` lines were not written, for `reason`."""
 
     def __init__(self, folder: str) -> None:
         self._folder = Path(folder).expanduser()

@@ -52,7 +52,7 @@ _KINDS = {Subscription: 'subscription', Service: 'service', GuardCondition: 'gua
 
 RCLError = rclpy_implementation.RCLError
 
-#: Serves a request, given the function that sends the answer, now or later, in the loop's thread.
+#: Serves a request; calls the given function with the answer, now or later, in the loop's thread.
 Serve = Callable[[Any, Callable[[Any], None]], None]
 
 
@@ -104,7 +104,7 @@ class Sources:
 
 
 class RawSubscription:
-    """A subscription of `WaitLoop.subscribe`, to be read in the loop's thread."""
+    """A subscription made by `WaitLoop.subscribe`, to be read in the loop's thread."""
 
     def __init__(self, subscription: Subscription, wakes: bool) -> None:
         self.subscription = subscription
@@ -146,7 +146,7 @@ class RawSubscription:
         self.interval_ns = (self._newest_ns - before_ns) // len(messages)
         before, self._sequence = self._sequence, numbers[-1]
         if before is not None and self._sequence is not None:
-            # A smaller sequence number is that of another publisher: no loss.
+            # A smaller sequence number comes from another publisher: no message is lost.
             self.n_lost += max(0, self._sequence - before - len(messages))
         return messages, received_ns, numbers
 
@@ -175,7 +175,7 @@ class WaitLoop:
         self, message_type: Any, topic: str, qos: QoSProfile, *, wakes: bool = True
     ) -> RawSubscription:
         """
-        Subscribe in serialized form.
+        Subscribe to a topic; its messages stay serialized.
 
         While samples flow, only messages of the first subscription with `wakes` end a wait.
         """
@@ -197,7 +197,7 @@ class WaitLoop:
         self.node.destroy_subscription(raw.subscription)
 
     def call_soon(self, callback: Callable[[], None]) -> None:
-        """Call back in the loop's thread, one callback per wake-up; callable from any thread."""
+        """Queue a call in the loop's thread, one per wake-up; callable from any thread."""
         self._soon.append(callback)
         with suppress(InvalidHandle):
             self._guard.trigger()
@@ -292,7 +292,7 @@ class WaitLoop:
         callback: Callable[[], bool | None],
         fatal: tuple[type[Exception], ...] = (ExternalShutdownException,),
     ) -> bool | None:
-        """Call back; log a failure (at most every `_LOG_PERIOD_NS`) and go on with the samples."""
+        """Call a function; log an exception, at most every `_LOG_PERIOD_NS`, and continue."""
         try:
             return callback()
         except fatal:
@@ -311,7 +311,7 @@ class WaitLoop:
 
 
 class _WaitSet:
-    """A wait set, filled again for each wait."""
+    """A wait set of rclpy, filled again for each wait."""
 
     def __init__(self, context: rclpy.context.Context, entities: Sequence[Any]) -> None:
         types = [type(entity) for entity in entities]

@@ -93,13 +93,13 @@ class DetectorSettings:
     ] = 60.0
     closes: Annotated[
         Closes,
-        'Sensors that must settle before the dynamic state ends: the leading one alone (`case`, '
-        'as in the paper), or the leading one and the board (`board`).',
+        'Sensors that must settle before the dynamic state ends: the leading sensor alone '
+        '(`case`, as in the paper), or leading sensor and board (`board`).',
     ] = 'board'
-    case: Annotated[ThermometerSettings, 'The two sensors.'] = field(
+    case: Annotated[ThermometerSettings, 'The case thermometer.'] = field(
         default_factory=ThermometerSettings
     )
-    board: Annotated[ThermometerSettings, 'The two sensors.'] = field(
+    board: Annotated[ThermometerSettings, 'The board thermometer.'] = field(
         default_factory=ThermometerSettings
     )
 

@@ -77,7 +77,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class AxisReference:
-    """The constants of one axis at the reference temperature."""
+    """Scale factor and bias of one axis at the reference temperature."""
 
     scale_factor: Annotated[float, 'K: input units per m/s^2 at the reference temperature.']
     bias: Annotated[float, 'dNs(0): zero offset at the reference temperature, in input units.']
@@ -93,7 +93,7 @@ class AxisReference:
 
 @dataclass(frozen=True)
 class Axes:
-    """The constants of the three axes at the reference temperature."""
+    """Scale factor and bias of the three axes at the reference temperature."""
 
     x: AxisReference
     y: AxisReference
@@ -109,11 +109,11 @@ class AxisSet:
 
     bias_function: Annotated[TemperatureFunction, 'Fs(t), input units; Fs(0) = 0.']
     scale_function: Annotated[TemperatureFunction, 'Fc(t), dimensionless; Fc(0) = 1.']
-    delta: Annotated[float, 'Bias of this regime less axes.bias, input units.'] = 0.0
+    delta: Annotated[float, 'Bias of this regime less `axes.bias`, at T_ref, input units.'] = 0.0
     residual_sd_m_s2: Annotated[
         float,
         QUANTITIES['deviation'],
-        'Standard deviation of the residual, a slowly varying error.',
+        'Standard deviation of the slowly varying error that the correction leaves.',
     ] = 0.0
 
     def __post_init__(self) -> None:
@@ -123,11 +123,11 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Lack of fit of a set at a board temperature: a slow error in addition to the posterior."""
+    """Slow error of a regime's curves at a board temperature, in addition to the posterior."""
 
     temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
     sd_m_s2: Annotated[
-        tuple[_Error, _Error, _Error], 'Standard deviation of the lack of fit of each axis.'
+        tuple[_Error, _Error, _Error], 'Standard deviation of the slow error of each axis.'
     ]
 
 
@@ -138,15 +138,15 @@ class RegimeSet:
     tangents for a quarter of the span and are constant beyond; the covariance increases.
     """
 
-    temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Board temperature [degC].']
-    rate_range_k_min: Annotated[tuple[_RateEdge, _RateEdge], 'dT_board/dt [K/min].']
+    temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated T_board [degC].']
+    rate_range_k_min: Annotated[tuple[_RateEdge, _RateEdge], 'Calibrated dT_board/dt [K/min].']
     x: AxisSet
     y: AxisSet
     z: AxisSet
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
-        'Error of left-out data in excess of the posterior: variance linear between the '
-        'temperatures, constant outside.',
+        'Error on data left out of the fit, in excess of the posterior; its variance is linear '
+        'between the temperatures of the entries, and constant outside of them.',
     ] = ()
 
     def __post_init__(self) -> None:
@@ -170,7 +170,7 @@ class RegimeSet:
 
 @dataclass(frozen=True)
 class ResponseTerm(Column):
-    """A column of the thermal response with its weights on the three axes."""
+    """A column (regressor) of the thermal response, with its weights on the three axes."""
 
     bias: Annotated[Vector, 'Weights on the bias, input units per unit of the column.'] = field(
         kw_only=True
@@ -189,57 +189,55 @@ class Calibration:
     reference_temperature_c: Annotated[Celsius, 'Reference temperature T_ref; the paper uses 20.']
     gravity_m_s2: Annotated[float, QUANTITIES['gravity'], 'Local gravity used by the fit.']
     axes: Axes
-    static: Annotated[RegimeSet, 'The set of the static regime, S = 0.']
-    dynamic: Annotated[RegimeSet, 'The set of the dynamic regime, S = 1.']
+    static: Annotated[RegimeSet, 'Curves of the static regime, S = 0.']
+    dynamic: Annotated[RegimeSet, 'Curves of the dynamic regime, S = 1.']
     noise_density_m_s2_sqrt_hz: Annotated[
         tuple[_Density, _Density, _Density],
-        'White noise of each axis; variance of a sample = density^2 / cycle, plus rounding.',
+        'White noise of each axis; variance of a sample: density^2 / cycle_time_s + rounding.',
     ]
     slow_noise_m_s2_sqrt_h: Annotated[
         tuple[_Slow, _Slow, _Slow],
-        'Slow noise of each axis: how far the bias moves over short times, per root hour.',
+        'Slow noise of each axis: random walk of the bias over short times, per root hour.',
     ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
         tuple[Vector, Vector, Vector],
-        'Matrix M, from sensitivity axes to the frame: lower triangular, unit diagonal.',
+        'Matrix M, from sensitivity axes to output frame: lower triangular, unit diagonal.',
     ] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     misalignment_sd: Annotated[
         tuple[_Tilt, _Tilt, _Tilt],
         'Standard deviations of M[1][0], M[2][0], M[2][1], used if `posterior` is null.',
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
-        tuple[str, ...], 'Thermometers beside the board; the first one leads in a ramp.'
+        tuple[str, ...], 'Thermometers other than the board; the first leads in a ramp.'
     ] = ('case',)
     response: Annotated[
-        tuple[ResponseTerm, ...], QUANTITIES['columns'], 'Thermal response, common to both sets.'
+        tuple[ResponseTerm, ...], QUANTITIES['columns'], 'Columns of the thermal response.'
     ] = ()
     board_lag_s: Annotated[
         float,
         QUANTITIES['time constant'],
-        'Lag of T_board behind T_case; while the case is lost, the gradient is that at rest plus '
-        'lag * dT_board/dt.',
+        'Lag of T_board behind T_case. While the case thermometer is lost, T_case - T_board is '
+        'estimated as its value at rest plus board_lag_s * dT_board/dt.',
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'T_case - T_board - lag * dT_board/dt in the bags, first sensor; null: unknown. A value '
-        'far outside is claimed as an error of T_board: a thermometer may be loose.',
+        'Range of T_s - T_board - board_lag_s * dT_board/dt in the bags, s: first of `sensors`; '
+        'null: unknown. A value far outside (loose thermometer) adds to the sd of T_board.',
     ] = None
     soak_gradient_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'T_case - T_board in a soak, by which the unit heats itself, and its sd, first sensor; '
-        'null: unknown, 0 is assumed. For certificates and exported files.',
+        'T_s - T_board in a soak, by self-heating, and its sd, s: first of `sensors`; null: '
+        'unknown, 0 is assumed. Used in certificates and exported files.',
     ] = None
     detector: Annotated[
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
     ] = field(default_factory=DetectorSettings)
     provenance: Provenance = field(default_factory=Provenance)
     evidence: Annotated[tuple[GroupEvidence, ...], 'Contribution of each group of columns.'] = ()
-    posterior: Annotated[
-        Posterior | None, 'Covariance of all parameters; null where it is unknown.'
-    ] = None
+    posterior: Annotated[Posterior | None, 'Covariance of all parameters; null: unknown.'] = None
     nonlinearity: Annotated[
         Nonlinearity | None,
-        'Nonlinearity of the axes over specific force; null: only 1 g was seen.',
+        'Nonlinearity of the axes over specific force; null: the bags were at 1 g only.',
     ] = None
     gyroscope: Annotated[
         Gyroscope | None, "Bias of the unit's gyroscope; null: the angular rate is not corrected."
@@ -281,7 +279,7 @@ class Calibration:
                 )
 
     def _check_gyroscope(self) -> None:
-        """Apply the rules of an accelerometer's triad to the gyroscope."""
+        """Apply the rules for the three accelerometers to the gyroscope."""
         try:
             rate_triad(self)
         except ValueError as error:
@@ -301,7 +299,7 @@ class Calibration:
 
     @property
     def needs_temperature(self) -> bool:
-        """Whether the correction depends on temperature; if not, it is constant."""
+        """Whether the correction depends on temperature; otherwise the correction is constant."""
         weights: list[float] = []
         for axis in (axis for part in self.regime_sets() for axis in part.axes()):
             weights += (axis.delta, *axis.bias_function.free_coefficients)
@@ -313,7 +311,7 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether the unit was fitted with a case thermometer, or has columns computed from it."""
+        """Whether the fit used a case thermometer, or a column depends on one of `sensors`."""
         columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
         return self.detector.case != ThermometerSettings() or any(
             column.is_of_sensor for column in columns
@@ -344,7 +342,7 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
 
 
 def rate_triad(calibration: Calibration) -> Calibration:
-    """Return the gyroscope of a calibration as a triad; raises ValueError without a gyroscope."""
+    """Return the gyroscope of a calibration as a triad of scale 1; ValueError if it has none."""
     gyroscope = calibration.gyroscope
     if gyroscope is None:
         raise ValueError('`calibration` must have a gyroscope')
@@ -384,7 +382,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
 
 
 def gyroscope_of(triad: Calibration) -> Gyroscope:
-    """Make a gyroscope from a triad whose scale is 1."""
+    """Return the `Gyroscope` of a triad of scale 1, as `rate_triad` returns it."""
     x, y, z = (axis.bias for axis in triad.axes)
     static, dynamic = (
         RateSet(*(RateCurve(axis.bias_function, axis.delta) for axis in regime_set.axes()))

@@ -18,9 +18,8 @@ from ..plain_yaml import PlainYamlError, is_plain_text, load_plain_yaml
 from .calibration import FORMAT_VERSION, Calibration
 from .schema import SchemaError, build, fields_of, plain
 
-#: Largest calibration file [bytes]. A calibration with all columns of the bank except bends, and a
-#: posterior of full rank, takes 3.3 MB with one thermometer beside the board, and 6 MB with two
-#: thermometers.
+#: Largest calibration file [bytes]. A calibration with all columns of `columns.bank` but `bend`,
+#: and a posterior of full rank, takes 3.3 MB with one thermometer beside the board, 6 MB with two.
 SIZE_LIMIT = 1 << 23
 
 #: First line of a written file. A file with this first line is complete only if its last line is
@@ -136,7 +135,7 @@ _BASE: type[yaml.SafeDumper] = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
 class _Dumper(_BASE):  # type: ignore[valid-type, misc]
-    """Writes numbers so that this reader and any YAML 1.1 reader get the same float."""
+    """Writes YAML without aliases; `_represent_str` quotes texts that look like other types."""
 
     def ignore_aliases(self, _data: Any) -> bool:
         return True

@@ -4,21 +4,18 @@
 Owns the columns of the thermal response: the regressors of bias and scale.
 
 A column is ``phi = u t^power (1 | 1 - w | w)``, with u the value of its kind (`unit.terms`), t the
-board temperature from the reference, and w the weight of the dynamic regime. u is held at the
-edges of the column's range, and t at the edges of the calibrated temperatures. Beyond the
-calibrated temperatures the curves continue along their tangents, but the powers of t are
-constant: no recording determines how a coefficient that changes with temperature continues beyond
-the calibrated temperatures.
+board temperature less the reference, and w the weight of the dynamic regime. u is limited to the
+column's range, and t to the calibrated temperatures. Beyond the calibrated temperatures the curves
+continue along their tangents, but the powers of t are constant: no recording determines how a
+coefficient that changes with temperature continues there.
 
-Each group of the bank has the columns of the kind with the same name, with these exceptions. Group
-*product* has the kind board, and group *gradient_x_temperature* the kinds gradient and
-gradient_lag, times a power of temperature, for coefficients that change with temperature. Group
-*square* also has the kind cube, and group *gradient_even* the kinds size and square. Group *part*
-has the kinds board, square and cube, whose sum with a curve over the board temperature is a curve
-over a part's temperature. Group *gradient_even_about_rest* has the columns of *gradient_even* as
-functions of the gradient less its value at rest.
-
-Tracker, fit, correction, covariance and calibration file use this table of columns.
+The function `bank` makes the columns in groups. A group has the columns of the kind with the same
+name, with these exceptions. Group *product* has the kind board, and group *gradient_x_temperature*
+the kinds gradient and gradient_lag, times a power of temperature, for coefficients that change
+with temperature. Group *square* also has the kind cube, and group *gradient_even* the kinds size
+and square. Group *part* has the kinds board, square and cube, whose sum with a curve over the
+board temperature is a curve over a part's temperature. Group *gradient_even_about_rest* has the
+columns of *gradient_even* as functions of the gradient less its value at rest.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -71,7 +68,7 @@ class Part(NamedTuple):
 
     tau_s, second_tau_s: time constants of the two stages [s]; the second is 0 for a single stage
     sensor_share: the part lags the board temperature plus this share of the sensor's gradient
-    lead_s: time by which the temperature that the part lags leads the board thermometer [s]
+    lead_s: lag of the board thermometer behind the temperature that drives the part [s]
     """
 
     tau_s: float
@@ -95,11 +92,11 @@ class Column:
         '; '.join(term.formula for term in TERMS.values())
         + ', where g_s = T_s - T_board and q_s = g_s - rest_k.',
     ]
-    sensor: Annotated[str, 'The thermometer s of the gradient g_s.'] = 'case'
+    sensor: Annotated[str, 'Thermometer s of the gradient g_s = T_s - T_board.'] = 'case'
     tau_s: Annotated[
         float,
         QUANTITIES['lag'],
-        'Time constant of the lag (board, gradient_lag, square, cube; play, bend: 0 = none).',
+        'Time constant of the lag; 0 = no lag (kinds square, play and bend).',
     ] = 0.0
     second_tau_s: Annotated[
         float,
@@ -109,12 +106,12 @@ class Column:
     sensor_share: Annotated[
         float,
         QUANTITIES['share'],
-        'The lag is that of T_board + sensor_share * g_s (board, square, cube, play, bend).',
+        'The part lags T_board + sensor_share * g_s (board, square, cube, play, bend).',
     ] = 0.0
     lead_s: Annotated[
         float,
         QUANTITIES['lag'],
-        'Time by which the temperature that the part lags leads the board thermometer, if '
+        'Lag of the board thermometer behind the temperature that drives the part, if '
         '`sensor_share` is 0; 0 = none.',
     ] = 0.0
     width_k: Annotated[
@@ -128,16 +125,16 @@ class Column:
     knee_k: Annotated[
         float,
         QUANTITIES['gradient'],
-        'Temperature above the reference at which the slope of bend changes.',
+        'Temperature less T_ref at which the slope of a bend changes.',
     ] = 0.0
-    power: Annotated[int, QUANTITIES['power'], 'The value is multiplied by t to this power.'] = 0
+    power: Annotated[int, QUANTITIES['power'], 'Exponent of the factor T_board - T_ref.'] = 0
     during: Annotated[
         Literal['always', 'static', 'dynamic'],
-        'Factor of the value: 1 (always), 1 - w (static) or w (dynamic), w = dynamic weight.',
+        'Factor of the value: 1 (always), 1 - w (static), w (dynamic); w: dynamic weight.',
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],
-        'Range of the value before t and w multiply it; the value is limited to the range.',
+        'Range to which the value is limited, before the factors by `power` and `during`.',
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -217,8 +214,8 @@ def bank(
     columns += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
     even += _family('gradient_even', ['size', 'square'], sensors, (0, 1, 2))
-    # A heat pump's load is even in the heat flow; the effect of a temperature change is even about
-    # the gradient at rest.
+    # The load of a heat pump is an even function of the heat flow; the effect of a temperature
+    # change is an even function of the gradient less its value at rest.
     rest = at_rest or {}
     columns += even + [
         replace(column, group='gradient_even_about_rest', rest_k=rest[column.sensor])
@@ -257,7 +254,7 @@ def _family(
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """Return the memory a tracker needs for columns; raises ValueError if a sensor is missing."""
+    """Return the lags, plays and rates of columns; ValueError if `sensors` lacks a sensor."""
     sources: set[Quantity] = set()
     for column in columns:
         sources.add(column.source)

@@ -67,7 +67,7 @@ class Correction:
     """
     Static and dynamic set of a calibration, blended by the dynamic weight, and thermal response.
 
-    memory: contents of the thermal memory; by default those that `memory_of_unit` returns
+    memory: lags, plays and rates of the states; by default those of `memory_of_unit`
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: elements yx, zx, zy of the misalignment matrix M
@@ -110,7 +110,7 @@ class Correction:
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
-        #: Number of rows of the slow part of the error variance.
+        #: Number of rows of the slowly varying error variance of `SlowUncertainty.at`.
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
@@ -198,7 +198,7 @@ class Correction:
         Evaluate the correction of segments, linear in time between the thermal states at both
         ends.
 
-        `slow` is the slow part of the error's covariance, shape (n_slow, n), see
+        `slow` is the slowly varying error covariance, shape (n_slow, n), see
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
         segment (1 s), scale and its change, then the coefficients of the covariance with the noise
         of a message, see `covariance.covariance_at`. With a nonlinearity `slow` has 15 more rows
@@ -264,7 +264,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Without lags, a rate beyond its range adds variance; lags add variance at any rate.
+            # Without lags the excess of a rate adds variance; with lags, the excess of the lags.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])

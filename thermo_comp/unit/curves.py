@@ -96,7 +96,7 @@ class Curves:
     @cached_property
     def _basis_slopes(self) -> list[list[list[Floats]]]:
         """
-        Derivatives of each function's slope, at both ends, by the function's free coefficients.
+        Derivatives of each function's slope, at both ends of its range, by free coefficients.
         """
         rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [
@@ -167,7 +167,7 @@ class Curves:
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
         Differentiate values beyond the ranges by the free coefficients of a function, (n_free, n).
-        Beyond the range of a set, values are its tangent plus the constant difference of the sets.
+        Beyond the range of a set, its values are a tangent plus the constant difference of sets.
         """
         function = self._functions.rows[regime][place]
         own_range, other_range = (

@@ -113,8 +113,8 @@ class Polynomial(_Family):
 @dataclass(frozen=True)
 class CubicSpline(_Family):
     """
-    Natural cubic spline through values at rising knots [K from the reference], one of them 0,
-    where the value is 0 (bias) or 1 (scale). Beyond the outer knots the spline keeps their values.
+    Natural cubic spline through values at rising knots [K from the reference]. One knot is 0, with
+    the value 0 (bias) or 1 (scale). Beyond the outer knots the spline is constant.
     """
 
     knots_k: Annotated[tuple[float, ...], QUANTITIES['knots']]
@@ -180,8 +180,8 @@ class CubicSpline(_Family):
 class Exponential(_Family):
     """
     ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``, whose value at the
-    reference temperature is 0 (bias) or 1 (scale). An e-fold [K], of any sign, is the change that
-    multiplies a term by e.
+    reference temperature is 0 (bias) or 1 (scale). An e-fold [K], of any sign, is the change of
+    temperature that multiplies a term by e.
     """
 
     constant: float

@@ -24,7 +24,7 @@ from .posterior import ParameterLayout
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of a relative scale function, also when every term has its largest value.
+#: Limits of the relative scale, also if the term of every column has its largest value.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale: samples in an offset code have a bias of half their range.
 FULL_SCALES = 2.0
@@ -56,8 +56,8 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
         effect = size * max(map(abs, term.bias))
         if not effect <= WORST * most:
             raise ValueError(
-                f'`response[{k}].bias` must make a bias within {WORST * most:g} of its column, '
-                f'makes {effect:g}'
+                f'`response[{k}].bias` must keep the largest bias by the column within '
+                f'{WORST * most:g}, got {effect:g}'
             )
     for regime, part, ends in zip(('static', 'dynamic'), sets, edges, strict=True):
         at_work = [term.during in ('always', regime) for term in response]

@@ -47,7 +47,7 @@ def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floa
 
 
 def statistics_by_regime(residual: Floats, is_dynamic: Bools) -> dict[str, ResidualStatistics]:
-    """Summarise residuals over the static sections, over the dynamic sections, and over both."""
+    """Summarise residuals over the static sections, the dynamic sections, and all sections."""
     return {
         'static': residual_statistics(residual[~is_dynamic]),
         'dynamic': residual_statistics(residual[is_dynamic]),

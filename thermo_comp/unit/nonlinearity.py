@@ -51,7 +51,7 @@ Real = TypeVar('Real', float, Floats)
 class NonlinearTerm:
     """One term of the nonlinearity; `coefficient` and `per_kelvin` are for x, y, z."""
 
-    kind: Annotated[Kind, 'K2 f^2, Kq abs(f) f or K3 f^3.']
+    kind: Annotated[Kind, 'square: K2 f^2; odd_square: Kq abs(f) f; cube: K3 f^3.']
     coefficient: Annotated[
         Vector, 'Coefficient at the reference temperature [g/g^2; K3 in g/g^3].'
     ]
@@ -68,7 +68,7 @@ class NonlinearTerm:
     left_out_gain: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Log ratio of left-out mean squares without and with the term.',
+        'Log of the mean-square error on data left out, without / with the term.',
     ] = 0.0
 
 

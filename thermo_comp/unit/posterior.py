@@ -36,7 +36,7 @@ class Posterior:
         str, 'base64 of little-endian float32: one row of `rank` numbers per parameter.'
     ]
     rest: Annotated[
-        str, "base64 of little-endian float32: one variance per parameter, added to the factor's."
+        str, 'base64 of little-endian float32: one variance per parameter, of diag(rest).'
     ]
 
     def __post_init__(self) -> None:
@@ -85,7 +85,7 @@ class Posterior:
 class Block(NamedTuple):
     """
     Indices of the parameters of an axis' bias or scale in the posterior. `static`, `dynamic`:
-    index of the level of the set, which its function's coefficients follow; `response`: index of
+    index of the set's level; the coefficients of the set's function follow. `response`: index of
     the first weight of the columns; `end`: index after the last weight of the columns.
     """
 

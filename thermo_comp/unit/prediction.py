@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns predictions for a thermal state: the slow part of the error covariance (by the parameters, and
+Owns predictions for a thermal state: the slowly varying error covariance (by the parameters, and
 by lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
@@ -43,7 +43,7 @@ class SlowUncertainty:
             sum(w * tau for (of, tau), w in lag.first_order_weights.items() if of == BOARD_INPUT)
             for lag in lags
         ])  # fmt: skip
-        #: By axis the rows of the posterior's factor, and the added variances: of bias, scale and
+        #: For each axis, rows of the posterior's factor and added variances: of bias, scale and
         #: nonlinear terms.
         self._blocks: list[list[tuple[Floats, Floats]]] = []
         #: Rows of the posterior's factor, and added variances, of the misalignment.
@@ -105,8 +105,8 @@ class SlowUncertainty:
         of_misalignment, var_misalignment = self._misalignment
         n_start, (n, rank) = len(of_start), (states.shape[1], of_misalignment.shape[1])
         errors = np.zeros((9, n_start + rank, n))
-        # A larger element of the misalignment increases the force, a larger bias or scale factor
-        # decreases it.
+        # A larger element of the misalignment increases the force; a larger bias or scale factor
+        # decreases the force.
         errors[6:, n_start:] = -of_misalignment[:, :, np.newaxis]
         added = np.zeros((3, 3, n))
         beyond: list[Floats] = []

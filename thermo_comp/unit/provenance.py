@@ -19,14 +19,14 @@ class GroupEvidence:
 
     group: Annotated[str, 'Name of the group, as in the key `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
-    explains_m_s2: Annotated[_Error, "RMS of the group's correction."]
+    explains_m_s2: Annotated[_Error, "RMS of the group's correction in the fitted data."]
     effective_parameters: Annotated[
         float, QUANTITIES['number'], 'Effective number of weights determined by the data.'
     ]
     log_evidence_change: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Loss of log evidence without the group; in a fit with a prior, with its values.',
+        'Loss of log evidence without the group or, with a prior, at the prior mean.',
     ]
     prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
 

@@ -29,7 +29,7 @@ class RateCurve:
     """The curve of the bias of one axis in one regime."""
 
     bias_function: Annotated[TemperatureFunction, 'Fs(t) [rad/s]; Fs(0) = 0.']
-    delta: Annotated[float, 'Bias of this regime less bias_rad_s [rad/s].'] = 0.0
+    delta: Annotated[float, 'Bias of this regime less `bias_rad_s`, at T_ref [rad/s].'] = 0.0
 
     def __post_init__(self) -> None:
         check_reference('bias_function', self.bias_function, 0.0)
@@ -50,7 +50,7 @@ class RateSet:
 
 @dataclass(frozen=True)
 class RateTerm(Column):
-    """A column of the thermal response with its weights on the three axes."""
+    """A column (regressor) of the thermal response, with its weights on the three axes."""
 
     bias: Annotated[Vector, 'Weights on the bias, rad/s per unit of the column.'] = field(
         kw_only=True
@@ -75,14 +75,14 @@ class Gyroscope:
     ]
     slow_noise_rad_s_sqrt_h: Annotated[
         tuple[_Slow, _Slow, _Slow],
-        'Slow noise: how far the bias moves over short times, per root hour.',
+        'Slow noise: random walk of the bias over short times, per root hour.',
     ] = NIL
     residual_sd_rad_s: Annotated[
         tuple[_Deviation, _Deviation, _Deviation],
-        'Sd of the residual, a slowly varying error: turn-on bias.',
+        'Sd of the slowly varying error that the correction leaves, as by turn-ons.',
     ] = NIL
     response: Annotated[
-        tuple[RateTerm, ...], QUANTITIES['columns'], 'The thermal response, common to both sets.'
+        tuple[RateTerm, ...], QUANTITIES['columns'], 'Columns of the thermal response.'
     ] = ()
     posterior: Annotated[Posterior | None, 'Covariance of all parameters; null if unknown.'] = None
 

@@ -100,7 +100,7 @@ def _lag_of_part(column: Column) -> lags.Lag:
 
 
 class Gradient(Term):
-    """Effect of a heat flow."""
+    """The gradient g_s: effect of a heat flow between thermometer s and board."""
 
     kind, formula = 'gradient', 'g_s'
     groups: ClassVar[_Pairs] = (('gradient', 'heat flow (case − board)'),)
@@ -111,7 +111,7 @@ class Gradient(Term):
 
 
 class Rate(Term):
-    """Effect of a heat flow, estimated from one thermometer."""
+    """The rate of the board temperature: effect of a heat flow, for a single thermometer."""
 
     kind, formula = 'rate', 'dT_board/dt [K/s]'
     groups = (('rate', 'rate of the board'),)
@@ -122,9 +122,9 @@ class Rate(Term):
 
 
 class Board(Term):
-    """Effect of parts that lag the board."""
+    """The lag of a part behind the board: effect of the part's temperature."""
 
-    kind, formula = 'board', 'T - lagged T'
+    kind, formula = 'board', 'T_board - lagged T_board'
     positive: ClassVar[_Names] = ('tau_s',)
     groups: ClassVar[_Pairs] = (
         ('board', 'parts that lag the board'),
@@ -139,15 +139,15 @@ class Board(Term):
 
 
 class GradientLag(Term):
-    """Effect of parts between the thermometers."""
+    """A lagged gradient: effect of parts between the thermometers."""
 
     kind, formula, positive = 'gradient_lag', 'lagged g_s', ('tau_s',)
     groups = (
         ('gradient_lag', 'parts between case and board'),
         # The columns of group `gradient_x_temperature` give coefficients that change with
         # temperature.
-        ('product', 'lags, changing with temperature'),
-        ('gradient_x_temperature', 'heat flow, changing with temperature'),
+        ('product', 'lags, with effects that change with temperature'),
+        ('gradient_x_temperature', 'heat flow, with an effect that changes with temperature'),
     )
 
     def source(self, column: Column) -> Quantity:
@@ -156,9 +156,9 @@ class GradientLag(Term):
 
 
 class Square(Term):
-    """Curves of parts that lag the board; without a lag, losses quadratic in a heat flow."""
+    """Curvature over a part's temperature; without a lag, losses quadratic in a heat flow."""
 
-    kind, formula = 'square', '(T - lagged T)^2, or q_s^2 without lag'
+    kind, formula = 'square', '(T_board - lagged T_board)^2, or q_s^2 without lag'
     groups = (('square', 'curves of parts that lag'),)
     order, form, centre_key = 2, Form(lambda x: x * x, lambda x: 2.0 * x), 'rest_k'
 
@@ -168,21 +168,21 @@ class Square(Term):
 
 
 class Cube(Board):
-    """Curves of parts that lag the board, and a heat flow that is not linear."""
+    """Cubic term of a curve over the temperature of a part that lags the board."""
 
-    kind, formula, groups = 'cube', '(T - lagged T)^3', ()
+    kind, formula, groups = 'cube', '(T_board - lagged T_board)^3', ()
     order, form, centre_key = 3, Form(lambda x: x * x * x, lambda x: 3.0 * x * x), 'rest_k'
 
 
 class Size(Gradient):
-    """Effect of a heat load, such as a heat pump."""
+    """Magnitude of a gradient: effect of a heat load, such as that of a heat pump."""
 
     kind, formula, groups = 'size', 'abs(q_s)', ()
     form, centre_key = Form(np.abs, np.sign), 'rest_k'
 
 
 class GradientEven(Gradient):
-    """Effect of a heat load that saturates."""
+    """Even function of a gradient, limited to 0..1: effect of a heat load that saturates."""
 
     kind, formula = 'gradient_even', 'tanh((q_s / width)^2)'
     groups = (
@@ -197,9 +197,9 @@ class GradientEven(Gradient):
 
 
 class Play(Term):
-    """Rate-independent hysteresis."""
+    """A play operator: rate-independent hysteresis over temperature."""
 
-    kind, formula, positive, has_scale = 'play', 'play of t minus t', ('width_k',), False
+    kind, formula, positive, has_scale = 'play', 'play(t) - t', ('width_k',), False
     groups = (('play', 'hysteresis'),)
 
     def source(self, column: Column) -> Quantity:
@@ -211,7 +211,7 @@ class Play(Term):
 class Bend(Board):
     """A curve whose slope changes at one temperature of a part."""
 
-    kind, formula, positive = 'bend', 'max(t - knee_k, 0), of t lagged', ()
+    kind, formula, positive = 'bend', 'max(lagged t - knee_k, 0)', ()
     groups = (('bend', 'change of slope'),)
     form = Form(lambda x: np.maximum(x, 0.0), lambda x: (x > 0.0).astype(np.float64))
     centre_key, is_temperature, has_scale = 'knee_k', True, False

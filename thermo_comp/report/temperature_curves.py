@@ -27,7 +27,7 @@ class Program(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The name of the program; for a ramp also the rate."""
+        """The name of the program and, for a ramp, the rate."""
         return f'{self.name} at {abs(self.rate_k_min):g} K/min' if self.rate_k_min else self.name
 
 
@@ -46,7 +46,7 @@ class Curve(NamedTuple):
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """List a soak and, if ramps differ from a soak, ramps at half the fastest calibrated rate."""
+    """Return a soak and, if ramps differ from it, ramps at half the fastest calibrated rate."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:
@@ -84,11 +84,11 @@ def slopes(soak: Curve) -> Floats:
 
 
 def table_temperatures(lowest: float, highest: float) -> Floats:
-    """Choose the temperatures of a table: both ends of a range, and round numbers between them."""
+    """Return the temperatures of a table: both ends of a range, and round numbers in between."""
     span = highest - lowest
     step = next((k for k in _STEPS_K if span <= k * (_MOST_TEMPERATURES - 2)), _STEPS_K[-1])
     within = step * np.arange(math.ceil(lowest / step), math.floor(highest / step) + 1)
-    # Skip round temperatures within a quarter of a step from an end of the range: their rows would
+    # Skip round temperatures within a quarter of a step from an end of the range: these rows would
     # repeat the row of the end.
     kept = within[(within - lowest > 0.25 * step) & (highest - within > 0.25 * step)]
     return np.array([lowest, *kept, highest])
