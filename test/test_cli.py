@@ -208,7 +208,7 @@ class TestTopics:
         profile = named.with_name('lab.yaml')
         profile.write_text('board: [1]\n')
         refused = cli('info', named, '--topics', profile, code=1).stderr
-        assert f'{profile}: expected lines of INPUT: TOPIC' in refused
+        assert f'{profile}: expected lines INPUT: TOPIC' in refused
         assert 'cannot be read' in cli('info', named, '--topics', named, code=1).stderr
 
 

@@ -31,7 +31,7 @@ def test_a_degenerate_input_ends_with_a_sentence_in_bounded_memory(name, command
     [
         ('zeros by turns', '50 % of its samples are exactly zero, between others: two sources'),
         ('no acceleration in it', '(linear_acceleration_covariance[0] = -1): another topic'),
-        ('gravity taken off', 'gravity is subtracted (a linear or free acceleration)'),
+        ('gravity taken off', 'gravity is subtracted (linear or free acceleration)'),
         ('samples in g', 'its samples are in g, make them m/s^2 with thermo_comp convert'),
         ('stamps all zero', 'all its samples are stamped 0 s: the driver does not stamp them'),
         ('worn on a wrist', 'as if worn or driven: the unit must rest in each position'),

@@ -156,7 +156,7 @@ class Acquisition:
 
     def _cells(self) -> Cells:
         """Return the cells of the position."""
-        cells = self._accumulator.finish()
+        cells = self._accumulator.cells()
         begin_s = (self._begin_ns - cells.start_ns) * 1e-9
         return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 

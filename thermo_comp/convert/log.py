@@ -293,7 +293,7 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     for first in range(0, len(accel), _RUN_ROWS):
         run = slice(first, first + _RUN_ROWS)
         reduced.add(stamp_ns[run], accel[run])
-    cells = reduced.finish()
+    cells = reduced.cells()
     usual = float(np.median(cells.count)) if len(cells.count) else 0.0
     full = cells.count >= max(_MIN_SAMPLES, 0.5 * usual)
     if not full.any():

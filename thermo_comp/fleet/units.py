@@ -65,7 +65,7 @@ class Storage:
         """List all files below the folder except hidden ones, sorted by name."""
         try:
             if self._is_local:
-                listing = {path: self._fs.info(path) for path in _walk(self._root)}
+                listing = {path: self._fs.info(path) for path in _scan(self._root)}
             else:
                 listing = self._fs.find(self._root, detail=True)
             if not listing and not self._fs.isdir(self._root):
@@ -97,7 +97,7 @@ class Storage:
             yield Path(scratch, name)
 
 
-def _walk(root: str) -> Iterator[str]:
+def _scan(root: str) -> Iterator[str]:
     """Yield the files of a local tree; links are followed, unlike by fsspec."""
     for folder, folders, names in os.walk(root, followlinks=True):
         here = Path(folder).resolve()
