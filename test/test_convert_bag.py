@@ -10,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from thermo_comp.convert.bag import bag_log, find_topics
-from thermo_comp.convert.log import contradiction, find_stillness, inferred_unit, write_log
+from thermo_comp.convert.log import contradiction, find_stillness, infer_unit, write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
 
@@ -164,8 +164,8 @@ def test_convert_takes_a_bag(tmp_path, rng, cli):
     ],
 )
 def test_the_magnitude_at_rest_tells_the_unit(magnitude, unit):
-    believed, reason = inferred_unit(magnitude)
-    assert believed == unit
+    inferred, reason = infer_unit(magnitude)
+    assert inferred == unit
     assert f'{magnitude:.4g}' in reason
 
 

@@ -428,7 +428,7 @@ def test_unidentified_columns_are_refused(tmp_path, rng):
         # WHY: decimal commas divided cells; the message was `its headings name no accelerometer`.
         (
             't;ax;ay;az\n' + '0,01;0,0;0,1;9,8\n' * 100,
-            'has decimal commas, as in 0,01: use points',
+            'has decimal commas, it begins with 0,01: write decimal points',
         ),
         ('0 0 0 9.8 20\n' * 100, '5 columns without headings cannot be identified'),
     ):

@@ -71,7 +71,7 @@ class CauseCounter:
                 )
         if norm < _WITHOUT_GRAVITY * STANDARD_GRAVITY and sd < still_sd * STANDARD_GRAVITY:
             return (
-                f'samples at rest have the norm {norm:.2g} m/s^2: gravity is subtracted (linear or '
-                'free acceleration), but the fit needs gravity: use another topic of the driver'
+                f'samples at rest have the norm {norm:.2g} m/s^2: gravity is subtracted (linear '
+                'or free acceleration), but the fit needs gravity: use another topic of the driver'
             )
         return ''
