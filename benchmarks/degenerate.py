@@ -153,12 +153,12 @@ def main() -> int:
             shutil.rmtree(out)
         print(row, flush=True)
         shutil.rmtree(folder)
-    bad = [one for one in runs if one.is_bad]
-    for one in bad:
-        print(f'{one.command} on {one.input}: {one.code}: {one.said[:300]}')
+    bad = [result for result in runs if result.is_bad]
+    for result in bad:
+        print(f'{result.command} on {result.input}: {result.code}: {result.said[:300]}')
     print(f'{len(runs)} runs, {len(bad)} break a promise')
     if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(one) for one in runs], indent=1))
+        arguments.json.write_text(json.dumps([asdict(result) for result in runs], indent=1))
     return 1 if bad else 0
 
 

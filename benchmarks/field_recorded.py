@@ -104,7 +104,7 @@ def judge_recordings(folder: Path) -> None:
                 rests_of(part(whole, *both), calibration, int(both[0] * 1e9))
                 for both in pairwise(edges[1:])
             ]
-            parts = [one for one in parts if one]
+            parts = [rests for rests in parts if rests]
             old, new, n_written = [], [], 0
             for k in range(3, len(parts)):
                 known = [rest for some in parts[:k] for rest in some]

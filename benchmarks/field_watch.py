@@ -64,7 +64,7 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
         result = watch(series, LABORATORY, TOLERANCE)
         updated = update(series, LABORATORY, ahead=0.0).calibration
         rests = probes(kind, history.states[-1], seed)[0]
-        before, after = (series_of(rests, one) for one in (LABORATORY, updated))
+        before, after = (series_of(rests, known) for known in (LABORATORY, updated))
         for name, probe, printed in (
             ('forecast', before, result.forecast),
             ('interval', after, result.interval),

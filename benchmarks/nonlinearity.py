@@ -154,19 +154,19 @@ def mountings(rng: np.random.Generator) -> Floats:
 def fitted(runs: list[Run], **options: float) -> Calibration:
     """Fit the runs of one unit."""
     sources = [
-        FitSource(f'run{k}', lambda one=one: [one.block], force=one.stated)
-        for k, one in enumerate(runs)
+        FitSource(f'run{k}', lambda record=record: [record.block], force=record.stated)
+        for k, record in enumerate(runs)
     ]
     wanted = FitOptions(gravity=G, input='m/s^2', full_scale=12.0 * G, **options)
     return fit(sources, wanted).calibration
 
 
-def residual_ug(calibration: Calibration, one: Run, level: float) -> float:
+def residual_ug(calibration: Calibration, record: Run, level: float) -> float:
     """Return the RMS vector error of 60 s means at one |f| [ug]."""
     compensator = Compensator(calibration, UNCHECKED)
-    corrected = process_block(compensator, one.block)
-    error = corrected.specific_force - one.force[corrected.index]
-    at = one.levels[corrected.index] == level
+    corrected = process_block(compensator, record.block)
+    error = corrected.specific_force - record.force[corrected.index]
+    at = record.levels[corrected.index] == level
     edges = np.flatnonzero(np.diff(np.r_[0, at, 0]))
     means = [
         error[a + k : a + k + 60].mean(axis=0)
@@ -194,16 +194,18 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])
             for used in (calibration, without)
         ]
-        bias = sd[[one.static for one in layout.bias]] / [a.scale_factor for a in calibration.axes]
+        bias = sd[[curve.static for curve in layout.bias]] / [
+            a.scale_factor for a in calibration.axes
+        ]
         scale = sd[[block.static for block in layout.scale]]
         result['moved'] = (values[0] - values[1]) / np.column_stack((bias, scale))
         return result
-    for k, one in enumerate(nonlinearity.terms):
-        true = {'square': unit.k2, 'cube': unit.k3}.get(one.kind, np.zeros(3))
-        result[one.kind] = (np.array(one.coefficient) - true) / np.abs(true)
-        result[f'{one.kind} ratio'] = (np.array(one.coefficient) - true) / of_terms[:, 0, k]
-        slope = np.array(one.per_kelvin) - unit.share * true
-        result[f'{one.kind} slope ratio'] = slope / of_terms[:, 1, k]
+    for k, term in enumerate(nonlinearity.terms):
+        true = {'square': unit.k2, 'cube': unit.k3}.get(term.kind, np.zeros(3))
+        result[term.kind] = (np.array(term.coefficient) - true) / np.abs(true)
+        result[f'{term.kind} ratio'] = (np.array(term.coefficient) - true) / of_terms[:, 0, k]
+        slope = np.array(term.per_kelvin) - unit.share * true
+        result[f'{term.kind} slope ratio'] = slope / of_terms[:, 1, k]
     # The new mounting is nearly along an axis, where the nonlinear terms are largest.
     direction = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
     new = run(unit, direction / np.linalg.norm(direction), rng, (5.0,))
@@ -232,8 +234,12 @@ def main() -> int:
             f'{name:58} {value:9.3g}   goal {low:g} .. {high:g}   {"met" if is_met else "MISSED"}'
         )
 
-    for seed, one in enumerate(results):
-        print(seed, *one['kinds'], f'before {one["before"][0]:.0f} after {one["after"][0]:.2f} ug')
+    for seed, result in enumerate(results):
+        print(
+            seed,
+            *result['kinds'],
+            f'before {result["before"][0]:.0f} after {result["after"][0]:.2f} ug',
+        )
     for kind in ('square', 'cube'):
         has = [unit for unit in results if kind in unit]
         say(f'{kind}: share of units that have it', len(has) / len(results), 1.0, 1.0)
@@ -245,12 +251,13 @@ def main() -> int:
             say(f'{name}: RMS error / claim', float(np.sqrt(np.mean(ratio**2))), 0.7, 1.4)
     say(
         'all terms are square and cube',
-        float(all(len(one['kinds']) == 2 for one in results)),
+        float(all(len(result['kinds']) == 2 for result in results)),
         1,
         1,
     )
     rms = {
-        k: float(np.sqrt(np.mean([one[k] ** 2 for one in results]))) for k in ('before', 'after')
+        k: float(np.sqrt(np.mean([result[k] ** 2 for result in results])))
+        for k in ('before', 'after')
     }
     say('5 g in a new mounting without the terms, RMS [ug]', rms['before'], 200.0, 700.0)
     say('5 g in a new mounting, RMS [ug]', rms['after'], 0.0, 3.0)

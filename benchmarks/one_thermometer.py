@@ -78,10 +78,10 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             bags, held = bags_of(unit, folder)
-            ones = folder / 'one'
-            ones.mkdir()
-            alone = [without_case(bag, ones / f'{bag.stem}.mcap') for bag in bags]
-            held_alone = [without_case(bag, ones / f'held_{bag.stem}.mcap') for bag in held]
+            board_only = folder / 'one'
+            board_only.mkdir()
+            alone = [without_case(bag, board_only / f'{bag.stem}.mcap') for bag in bags]
+            held_alone = [without_case(bag, board_only / f'held_{bag.stem}.mcap') for bag in held]
             two = left(bags, held, folder / 'two.yaml', *UNITS[unit])
             board = left(alone, held_alone, folder / 'one.yaml', *UNITS[unit])
             values = (two['raw_rms'], two['rms'], board['rms'])

@@ -127,15 +127,16 @@ def cost() -> dict[str, float]:
     value = np.float64(2.0)
     for _ in range(3):
         own = settings(scene)
-        one, other, detector = Thermometer(own.case), Thermometer(own.board), RegimeDetector(own)
+        case_sensor, board_sensor = Thermometer(own.case), Thermometer(own.board)
+        detector = RegimeDetector(own)
         begin = time.process_time()
         for k, reading in enumerate(board):
-            other.update(k * 10**9, reading)
+            board_sensor.update(k * 10**9, reading)
         keep('thermometer', begin, len(board))
         begin = time.process_time()
         for k, reading in enumerate(case):
-            one.update(k * 10**9, reading)
-            detector.update(k * 10**9, one, other)
+            case_sensor.update(k * 10**9, reading)
+            detector.update(k * 10**9, case_sensor, board_sensor)
         keep('thermometer + detector', begin, len(case))
         begin = time.process_time()
         for _ in range(100_000):

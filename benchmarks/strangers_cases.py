@@ -220,10 +220,10 @@ def sessions(number: int) -> Iterator[Study]:
     )  # fmt: skip
     shifts = 300.0 * rng.standard_normal((4, 3))
     held = one_test(positions(unit, WARM_HELD, spread(4, rng), rng, shifts, rate_hz=rate_hz))
-    one, two = (rests_of(bag, hold_s) for bag in bags)
+    first, second = (rests_of(bag, hold_s) for bag in bags)
     options = {'full_scale': 32767.0}
-    yield Study('one', bags[:1], held, options, baseline_bags=one)
-    yield Study('two', bags, held, options, baseline_bags=one + two)
+    yield Study('one', bags[:1], held, options, baseline_bags=first)
+    yield Study('two', bags, held, options, baseline_bags=first + second)
     yield Study('update', bags[1:], held, options, prior_of='one')
 
 

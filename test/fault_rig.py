@@ -56,7 +56,7 @@ Inject = Callable[[list[Event]], list[Event]]
 
 
 def unit(**changes):
-    def one(dynamic):
+    def set_in(dynamic):
         return axis_set(
             (0.0, BIAS_SLOPE, BIAS_CURVE),
             (1.0, SCALE_SLOPE),
@@ -68,8 +68,8 @@ def unit(**changes):
     values = {
         'unit': Unit('F-1', 'counts', FULL_SCALE, 1.0 / RATE_HZ),
         'axes': Axes(*[AxisReference(K, bias) for bias in BIAS]),
-        'static': regime_set(*[one(False)] * 3, **ranges),
-        'dynamic': regime_set(*[one(True)] * 3, **ranges),
+        'static': regime_set(*[set_in(False)] * 3, **ranges),
+        'dynamic': regime_set(*[set_in(True)] * 3, **ranges),
         'noise_density_m_s2_sqrt_hz': (NOISE_SD / math.sqrt(RATE_HZ),) * 3,
         'response': (
             term('gradient', (BY_GRADIENT,) * 3, during='dynamic', range=(-6.0, 6.0)),

@@ -143,7 +143,9 @@ def test_a_clock_that_goes_back_begins_a_position(stream):
     for start_ns in (START_NS, 10**15):
         begins = [begin for block in stream.blocks(0.5, start_ns) for begin in test.add(block)]
     assert begins == [10**15]
-    assert [one.still_s for one in test.account().positions] == pytest.approx([40.0] * 2, abs=1.0)
+    assert [pose.still_s for pose in test.account().positions] == pytest.approx(
+        [40.0] * 2, abs=1.0
+    )
 
 
 def test_a_dead_sensor_has_no_direction():

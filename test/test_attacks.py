@@ -149,10 +149,10 @@ def test_links_exchanged_in_the_folder_never_lead_out_of_it(tmp_path):
 
     def swap():
         while not is_over.is_set():
-            for one, other in ((door, folder / 'real'), (link, door)):
-                one.rename(other)
-            for one, other in ((door, link), (folder / 'real', door)):
-                one.rename(other)
+            for source, target in ((door, folder / 'real'), (link, door)):
+                source.rename(target)
+            for source, target in ((door, link), (folder / 'real', door)):
+                source.rename(target)
 
     thread = threading.Thread(target=swap)
     thread.start()

@@ -81,8 +81,8 @@ BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
 
 
 def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span():
-    one, two = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
-    unit = calibration(static=regime_set(one), dynamic=regime_set(two))
+    static, dynamic = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
+    unit = calibration(static=regime_set(static), dynamic=regime_set(dynamic))
     for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
         at_edge, *outside = np.moveaxis(
             curves_at(unit, edge + sign * np.array([0.0, 1e-9, 3.0, 7.5, 7.5 + 1e-9, 300.0])), 2, 0
@@ -119,11 +119,11 @@ def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
     # range, 0 to 30 degC, ends before the static range at the top and after it at the bottom.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
-    one = AxisSet(spline, Polynomial((1.0, 1e-4)))
+    splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
     two = AxisSet(exponential, Polynomial((1.0, 1e-4, 1e-6)))
     unit = calibration(
-        static=regime_set(one, two, axis_set(BENT)),
-        dynamic=regime_set(two, one, axis_set(WAVY), temperature_range_c=(0.0, 30.0)),
+        static=regime_set(splined, two, axis_set(BENT)),
+        dynamic=regime_set(two, splined, axis_set(WAVY), temperature_range_c=(0.0, 30.0)),
     )
     layout = parameter_layout(unit)
     change = 1e-3 * rng.standard_normal(layout.n_parameters)

@@ -40,7 +40,7 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
     assert is_alike(speed.sub('', printed), speed.sub('', shown()['demo'][1])), printed
     lines = speed.sub('', printed).splitlines()
     shown_lines = [speed.sub('', line) for line in shown_of_demo()]
-    assert [one for one in shown_lines if not any(is_alike(line, one) for line in lines)] == []
+    assert [row for row in shown_lines if not any(is_alike(line, row) for line in lines)] == []
     out = tmp_path / 'out'
     topics = inspect_recording(out / 'out.mcap').topics
     (imu,) = (count for name, (_, count) in topics.items() if name.endswith('imu/data_raw'))

@@ -150,7 +150,9 @@ def test_record_writes_fields_of_messages_as_temperatures(peer):
         for news in live.blocks(wait):
             for role, own in news[0].raw.items() if news else ():
                 outputs.setdefault(role, []).extend(own)
-    case, board = (deserialize_message(outputs[one][0], Temperature) for one in ('case', 'board'))
+    case, board = (
+        deserialize_message(outputs[role][0], Temperature) for role in ('case', 'board')
+    )
     # A reading without a stamp gets the stamp of the previous sample.
     assert (case.temperature, case.header.stamp.sec) == (23.0, START_NS // SECOND_NS)
     assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)

@@ -77,8 +77,10 @@ def numbers(text, separator):
 
 def bias_at(calibration, axis, celsius):
     reference = (calibration.axes.x, calibration.axes.y, calibration.axes.z)[axis]
-    one = calibration.static.axes()[axis]
-    return reference.bias + one.bias_function.value(celsius - calibration.reference_temperature_c)
+    curves = calibration.static.axes()[axis]
+    return reference.bias + curves.bias_function.value(
+        celsius - calibration.reference_temperature_c
+    )
 
 
 def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):

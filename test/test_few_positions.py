@@ -333,7 +333,7 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     # WHY: with positions cut into several rests, the fitted mounting sd was 1/20 of the true sd.
     whole, cut = tumbled(9), fit([turned(rng, np.repeat(positions(9, 3), 5, axis=0))], OPTIONS)
-    sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, cut))
+    sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, cut))
     # Nine norms do not determine the mounting sd, which stays at its prior in both fits.
     assert sd_cut == pytest.approx(sd, rel=0.1)
     assert 'mountings' in names_of(cut)
@@ -355,11 +355,11 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
-    n_turn_ons = [one.fit.windows.data.n_turn_ons for one in (whole, parts, others)]
+    n_turn_ons = [done.fit.windows.data.n_turn_ons for done in (whole, parts, others)]
     assert n_turn_ons == [1, 1, 2]
-    n_mountings = [len(one.fit.selected.score.norms.square) for one in (whole, parts, others)]
+    n_mountings = [len(done.fit.selected.score.norms.square) for done in (whole, parts, others)]
     assert n_mountings == [9, 9, 10]
-    sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, parts))
+    sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, parts))
     assert sd_cut == pytest.approx(sd, rel=0.1)
 
 

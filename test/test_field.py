@@ -300,7 +300,7 @@ def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
     # alone.
     unit = known()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
-    image = {one.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for one, _ in logged}
+    image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
     last = logged[-1][0].start_ns
     expected = None
     for number, wrong in enumerate(({}, image, {last: 30 * 10**9})):

@@ -70,11 +70,11 @@ def test_a_thermometer_on_two_topics_counts_once():
             readings = dict.fromkeys(copies, (time_s[::5], board[::5]))
             collected.append(tc.Columns(time_s, force, readings, name=f'rest{k}'))
         bags.append(collected)
-    one, two = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
-    assert one.static == two.static
-    assert one.axes == two.axes
-    assert any('temperature/case repeats' in note for note in two.provenance.notes)
-    assert not any('repeats' in note for note in one.provenance.notes)
+    first, second = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
+    assert first.static == second.static
+    assert first.axes == second.axes
+    assert any('temperature/case repeats' in note for note in second.provenance.notes)
+    assert not any('repeats' in note for note in first.provenance.notes)
 
 
 def columns_of(slopes, shift=0.0):

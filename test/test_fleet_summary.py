@@ -64,7 +64,9 @@ class TestOutliers:
         rows = fleet_of(60, rng)
         for i in range(5):
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
-        assert {one.serial for one in summarise(rows).outliers} == {f'S{i:03d}' for i in range(5)}
+        assert {unit.serial for unit in summarise(rows).outliers} == {
+            f'S{i:03d}' for i in range(5)
+        }
 
     @pytest.mark.parametrize('n', [10, pytest.param(40, marks=pytest.mark.slow)])
     def test_fleets_without_outliers_have_a_false_alarm_in_one_of_twenty(self, n, rng):
@@ -94,7 +96,7 @@ NOISE_X = 'noise_x_ug_sqrt_hz'
 
 
 def spread_of(name, rows):
-    return next(one for one in summarise(rows).spreads if one.quantity.name.startswith(name))
+    return next(each for each in summarise(rows).spreads if each.quantity.name.startswith(name))
 
 
 class TestUndetermined:
@@ -181,7 +183,9 @@ class TestDrift:
         assert before == first
         later = fleet_of(3, rng, day=90.0, like=first)
         drifts = summarise(later, before).drifts
-        assert sorted(one.earlier for one in drifts) == [f'earlier /u00{i}@0' for i in range(3)]
+        assert sorted(drift.earlier for drift in drifts) == [
+            f'earlier /u00{i}@0' for i in range(3)
+        ]
         # The same calibrations in a second table are not a drift.
         assert summarise(first, before).drifts == ()
 

@@ -39,7 +39,7 @@ def words_of(ups, rng, seconds=20.0):
 
 def constants(result):
     triad = result.calibration.axes
-    return np.array([axis.bias for axis in triad]), np.array([one.scale_factor for one in triad])
+    return np.array([axis.bias for axis in triad]), np.array([axis.scale_factor for axis in triad])
 
 
 @pytest.fixture(scope='module')

@@ -25,7 +25,7 @@ def allowed():
     for group in profile:
         ((what, verdict),) = group.attrib.items()
         assert verdict == 'ALLOW'
-        names = [(one.text or '').replace('~', f'/{NODE}') for one in group]
+        names = [(entry.text or '').replace('~', f'/{NODE}') for entry in group]
         collected[what] = {name if name.startswith('/') else f'/{name}' for name in names}
     return collected
 

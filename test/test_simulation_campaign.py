@@ -125,8 +125,8 @@ def test_a_switched_load_heats_its_part():
     loaded = replace(unit, load=load)
     program = parse_cyclogram('20 16h')
     on, off = (
-        simulate(one, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
-        for one in (loaded, unit)
+        simulate(model, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
+        for model in (loaded, unit)
     )
     warmer = of_part(on, 'board') - of_part(off, 'board')
     np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)

@@ -70,7 +70,7 @@ def test_a_good_recording_has_no_findings(tmp_path):
 )  # fmt: skip
 def test_faults_of_a_recording_are_named(tmp_path, temperature, options, text):
     findings = survey(tmp_path / 'bag', temperature, **options).findings
-    assert [one for one in text if not any(one in found for found in findings)] == []
+    assert [part for part in text if not any(part in found for found in findings)] == []
 
 
 @pytest.mark.parametrize(

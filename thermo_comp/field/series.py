@@ -323,7 +323,7 @@ def _uncertainty(
     calibration claims, (n,), and the sd of the lack of fit of each axis, (n, 3).
     """
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))
-    bare, full = (SlowUncertainty(one, correction) for one in (without, calibration))
+    bare, full = (SlowUncertainty(tried, correction) for tried in (without, calibration))
     slow = _variance_along(correction, states, np.zeros_like(shares), bare, u, x)
     claim = _variance_along(correction, states, shares, full, u, x)
     of_one_sample = (v**2 * np.array(correction.noise)).sum(axis=1)
