@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/beyond_1g.md: nonlinear terms from centrifuge runs, against their truth.
+Owns the figures of docs/beyond_1g.md: fitted nonlinear terms from centrifuge runs against truth.
 
 Run ``python benchmarks/nonlinearity.py``, or with fewer units: ``--units 4``. The runs come from
 a generator in this file, not from `thermo_comp.simulation`. A test has 12 mountings, each in three
@@ -33,9 +33,9 @@ from thermo_comp.unit.calibration import Calibration, parameter_layout
 G = 9.80665
 MICRO = 1e-6 * G
 LEVELS_G = (2.0, 4.0, 7.0, 10.0)
-#: Temperatures of the soaks [degC], length of each and of the ramps between them [s].
+#: Temperatures of the soaks [degC], duration of a soak and of a ramp between soaks [s].
 SOAKS_C, SOAK_S, RAMP_S = (20.0, 35.0, 5.0), 2700.0, 900.0
-#: Time for settling before a centrifuge run in a soak, length of each level, of a spin-up [s].
+#: Times in a soak [s]: settling before the centrifuge runs, each level of |f|, each spin-up.
 SETTLE_S, LEVEL_S, SPIN_UP_S = 1500.0, 240.0, 30.0
 FORCE_SD = 1e-6
 NOISE = 5.0 * MICRO
@@ -45,7 +45,7 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 @dataclass(frozen=True)
 class Unit:
-    """True constants of a unit for x, y, z; K2 [g/g^2], K3 [g/g^3] change by a `share` per K."""
+    """True constants of a unit; K2 [g/g^2] and K3 [g/g^3] change by the factor `share` per K."""
 
     scale: Floats
     scale_slope: Floats
@@ -82,7 +82,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Run:
-    """A run: its samples and readings, the true force, and the stated |f|."""
+    """A centrifuge run: samples and readings, true force, and stated |f|."""
 
     block: Block
     force: Floats
@@ -93,7 +93,7 @@ class Run:
 def run(
     unit: Unit, inward: Floats, rng: np.random.Generator, levels: tuple[float, ...] = LEVELS_G
 ) -> Run:
-    """Simulate a centrifuge run of one mounting: in each soak 1 g, then the levels of |f|."""
+    """Simulate a centrifuge run of a mounting: in each soak 1 g, then the levels of |f|."""
     knots, air = [0.0], [SOAKS_C[0]]
     for last, target in zip((SOAKS_C[0], *SOAKS_C), (*SOAKS_C, SOAKS_C[-1]), strict=False):
         if target != last:
@@ -162,7 +162,7 @@ def fitted(runs: list[Run], **options: float) -> Calibration:
 
 
 def residual_ug(calibration: Calibration, record: Run, level: float) -> float:
-    """Return the RMS vector error of 60 s means at one |f| [ug]."""
+    """Return the RMS vector error of means over 60 s at a level of |f| [ug]."""
     compensator = Compensator(calibration, UNCHECKED)
     corrected = process_block(compensator, record.block)
     error = corrected.specific_force - record.force[corrected.index]
@@ -177,7 +177,7 @@ def residual_ug(calibration: Calibration, record: Run, level: float) -> float:
 
 
 def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
-    """Fit a unit; return errors and claimed sd of its terms, and the residual at 5 g."""
+    """Fit a unit; return errors and error / claimed sd of its terms, and the residual at 5 g."""
     rng = np.random.default_rng(seed)
     unit = Unit.drawn(rng, k2, k3)
     runs = [run(unit, inward, rng) for inward in mountings(rng)]
@@ -188,7 +188,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
     result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # Repeat the fit with K2 and K3 pinned to 0: do nonlinear terms change bias and scale?
+        # Repeat the fit with K2 and K3 fixed at 0, to see whether bias and scale change.
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])
