@@ -77,8 +77,8 @@ def demo(folder: Path, output: Path) -> bool:
     result = evaluate([held_out], judged, gravity=STANDARD_GRAVITY)
     out.line()
     print_sections(out, result.judgements)
-    out.line('one set: one cubic for both regimes; two sets: a cubic for each regime, as in the')
-    out.line('paper; node: two sets and the thermal response that the fit selects')
+    out.line('one set: a cubic for both regimes; two sets: a cubic for each regime, as in')
+    out.line("Golovach's paper; node: two sets and the thermal response that the fit selects")
     page, figures = output / 'report.html', output / 'figures'
     with out.progress('drawing', total=None):
         evidence = evidence_of_bags(result.bags, models['node'], gravity=STANDARD_GRAVITY)
