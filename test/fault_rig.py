@@ -109,7 +109,7 @@ class Truth:
 
 
 def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
-    """Compute temperatures: case lags air, board lags case; memory is board minus its lag [K]."""
+    """Compute temperatures: case lags air, board lags case; memory is board less its lag [K]."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])
@@ -129,7 +129,7 @@ def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
 
 
 def counts_of(force, case, board, memory):
-    """Return the counts of the converter for a specific force (paper, equations 6 to 9)."""
+    """Return the counts for a specific force (equations 6 to 9 of Golovach's paper)."""
     t = board - 20.0
     drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
     drift += BY_GRADIENT * (case - board) + BY_MEMORY * memory

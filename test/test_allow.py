@@ -121,7 +121,7 @@ def in_whole_degrees(rest):
     ],
 )
 def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text):
-    # WHY: temperatures of another clock or in mK, or a dead axis, ended in a traceback.
+    # WHY: temperatures of another clock or in mK, or a dead axis, ended the fit with a traceback.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 
@@ -172,7 +172,7 @@ def test_an_axis_that_is_dead_in_one_position_is_named(rng):
         fit(sources_of(rests), FORCE)
     for rest in rests:
         rest.accel[:, 2] = rest.level[2]
-    # WHY: an axis that was stuck in all positions, at a number of each, ended in a traceback.
+    # WHY: an axis that repeated one number in each position ended the fit with a traceback.
     with pytest.raises(
         FitError, match=r'^bag0: z reads \S+ to the bit for 0\.\d+ h; bag1: z .*dead'
     ):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks on the node's surroundings: clocks, rates, many clients, links, full disks, logs."""
+"""The node withstands attacks by clocks, rates, many clients, links, full disks and logs."""
 
 import itertools
 import random

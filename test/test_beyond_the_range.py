@@ -97,7 +97,7 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span(
             np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
+def test_beyond_the_narrower_range_of_a_set_it_follows_the_other_set_and_then_a_tangent():
     # The static set has a range of 5 to 35 degC, the dynamic set of 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
@@ -182,8 +182,8 @@ def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
 
 
 def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
-    # WHY: a temperature difference of 10 K, after bags with 0.1 K, exceeds the range 100 times,
-    # and its square 10000 times. For 10 K the claimed sd was 0.1 g, that of 10000 half ranges.
+    # WHY: a temperature difference of 10 K, after bags with up to 0.1 K, is 100 times the range,
+    # the square of the difference 10000 times. The claimed sd was 0.1 g, for 10000 half ranges.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(Layout(correction.memory).width)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: help with examples, tables that fit and pipe, valid JSON, quick starts."""
+"""The command line prints help, plain tables and valid JSON, and takes topics by name."""
 
 import json
 import os

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration works as described: over real DDS, without loss, equal to the offline run."""
+"""The demonstration plays a bag over DDS without loss, and the output equals the offline run."""
 
 import re
 import sys

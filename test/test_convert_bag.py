@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of other programs: topics of any name, ROS 1 and 2, units recognised at rest."""
+"""Bags of other programs are converted: topics of any name, ROS 1 and 2, units by gravity."""
 
 import numpy as np
 import pytest
@@ -163,7 +163,7 @@ def test_convert_takes_a_bag(tmp_path, rng, cli):
         (32.2, 'unknown'),  # gravity in ft/s^2
     ],
 )
-def test_the_magnitude_at_rest_tells_the_unit(magnitude, unit):
+def test_the_unit_follows_from_the_magnitude_at_rest(magnitude, unit):
     inferred, reason = infer_unit(magnitude)
     assert inferred == unit
     assert f'{magnitude:.4g}' in reason

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other programs: headings, dates, units by physics, 24-bit words."""
+"""Tables of other programs are read by their headings; units follow from gravity and rates."""
 
 from datetime import datetime, timedelta, timezone
 from itertools import takewhile
@@ -223,7 +223,7 @@ def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, rea
 
 
 def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
-    # WHY: if the last cell of most rows was blank, the headings counted as a cell too many.
+    # WHY: if the last cell of most rows was blank, the row of headings had a cell too many.
     path = slow_table(tmp_path / 'log.csv', 'time', [k / 100 for k in range(N)], last=31.99)
     head, *rows = path.read_text().splitlines()
     rows = [row if k % 100 == 0 else f'{row.rpartition(",")[0]},' for k, row in enumerate(rows)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of numbers: layouts give equal columns; errors name the place of every bad cell."""
+"""Tables of any layout give equal columns; errors name the place of a bad cell."""
 
 import numpy as np
 import pytest

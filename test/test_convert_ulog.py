@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PX4 logs: a file as in ULog's public description gives the data of each sensor."""
+"""PX4 logs, written by the public description of ULog, give the data of each sensor."""
 
 import struct
 

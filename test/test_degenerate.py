@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs that needed gigabytes, hung or lost data; benchmarks/degenerate.py runs all of them."""
+"""Degenerate inputs end with a sentence, in bounded time and memory."""
 
 import degenerate
 import pytest

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Exchange with other tools: formulas of the tools, round trips, losses and refusals."""
+"""Exported and imported calibrations agree with the formulas of the other tools."""
 
 import re
 from dataclasses import replace
@@ -78,9 +78,8 @@ def numbers(text, separator):
 def bias_at(calibration, axis, celsius):
     reference = (calibration.axes.x, calibration.axes.y, calibration.axes.z)[axis]
     curves = calibration.static.axes()[axis]
-    return reference.bias + curves.bias_function.value(
-        celsius - calibration.reference_temperature_c
-    )
+    t = celsius - calibration.reference_temperature_c
+    return reference.bias + curves.bias_function.value(t)
 
 
 def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):

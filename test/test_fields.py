@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A temperature in a message of any type: fields of many messages equal those by rosbags."""
+"""A number in a message of any type is read as rosbags reads it."""
 
 import numpy as np
 import pytest

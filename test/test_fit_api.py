@@ -50,7 +50,7 @@ def test_a_knee_of_the_bias_is_found():
     # Trial knees are 1 K apart: the fit uses the two trial knees around the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
     # A mean slope between the two trial knees instead of the true knee gives an error of at most
-    # 20 ug/K times 0.25 K = 5 ug, in 1 K of the range of 22 K.
+    # 20 ug/K times 0.25 K = 5 ug, within 1 K of the range of 22 K.
     assert left < 1.5
 
 

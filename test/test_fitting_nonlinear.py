@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits of nonlinear terms beyond 1 g: derivatives, choice of terms, radius, stated |f|, runs."""
+"""Fits to forces beyond 1 g estimate nonlinear terms and the radius of a rotation."""
 
 import math
 from dataclasses import replace

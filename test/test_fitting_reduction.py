@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reduction of samples: cells, still intervals, windows, readings; gravity; sensor settings."""
+"""Samples are reduced to cells, still intervals and windows; gravity and sensors are estimated."""
 
 from dataclasses import replace
 

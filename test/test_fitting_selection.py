@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The selected model, its prior sd, noises and claimed sd, for tables with known truth."""
+"""Selected model, prior sd, noises and claimed sd are right for tables with known truth."""
 
 from dataclasses import replace
 

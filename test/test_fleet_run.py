@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet survives bad bags, refusals, dead workers and interruptions."""
+"""A run over a fleet survives bad bags, refusals, dead workers and interruptions."""
 
 import csv
 import json

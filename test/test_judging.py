@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The judge: residuals known by hand, windows of the stated length, each verdict."""
+"""A judgement has the residuals computed by hand, windows of the stated length, each verdict."""
 
 import csv
 import dataclasses

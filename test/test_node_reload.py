@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as a process: its calibration changes through ROS services while samples flow."""
+"""The calibration of a node process changes through ROS services while samples flow."""
 
 import sys
 import threading

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bias of an axis follows its part: fitted lags, kinks and bumps of units with known truth."""
+"""Lags, kinks and bumps of the parts of simulated units are fitted right."""
 
 import json
 from dataclasses import replace
@@ -266,7 +266,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
 
 @pytest.mark.slow
 def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
-    # Heads lag the board, pendulums lag the heads; stress by board - pendulum changes the bias.
+    # Heads lag the board, pendulums the heads; stress by T_board - T_pendulum changes the bias.
     unit = second_simulator.unit_of('products', 2)
     # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
@@ -384,7 +384,7 @@ def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
 
 
 @pytest.mark.slow
-def test_soaks_alone_do_not_tell_lags_or_a_loose_thermometer():
+def test_soaks_alone_show_neither_lags_nor_a_loose_thermometer():
     # Soaks determine no time constant. Soaks do not show the lag of the board either, so the
     # gradient of a ramp does not indicate a fault.
     study = next(soaks(1))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A clock that jumps: the jump is shortened, other stamps stay, an invalid clock is refused."""
+"""A jump of a recording's clock is shortened, other stamps stay, an invalid clock is refused."""
 
 from contextlib import suppress
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag that contains less than it states is reported; opening a bag costs little."""
+"""A bag with fewer messages than it states is reported; bags expand within limits."""
 
 import os
 import sqlite3
@@ -46,7 +46,7 @@ def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
     assert (tmp_path / 'o.mcap').is_file()
 
 
-def test_a_conversion_tells_what_the_bag_lacks(tmp_path, cli):
+def test_a_conversion_reports_messages_that_the_bag_lacks(tmp_path, cli):
     messages = regular_messages(400, accel=IMU_IN)
     for message in messages:
         if message.topic == IMU_IN:  # `convert` requires |f| = g at rest

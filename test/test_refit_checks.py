@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The checks of a chosen model: rests in pieces of an hour, and supports that tilt slowly."""
+"""A fit is repeated with rests in pieces of an hour, which detects supports that tilt slowly."""
 
 import sys
 from dataclasses import replace

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The detector on short runs: early, few false alarms, no missed ramps; long runs are in
+The regime detector detects ramps early, with few false alarms, in short runs; long runs are in
 benchmarks/regime.py.
 
 All runs are seeded. The limits allow for the scatter of medians: the median of 12 delays scatters

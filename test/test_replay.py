@@ -321,12 +321,8 @@ def test_all_topics_copies_every_topic(tmp_path, storage):
             Writer(bag, version=9, storage_plugin=StoragePlugin.SQLITE3) as sqlite,
         ):
             for source in reader_of_all.connections:
-                copied = sqlite.add_connection(
-                    source.topic,
-                    source.msgtype,
-                    msgdef=source.msgdef.data,
-                    rihs01=source.digest or 'RIHS01_0',
-                )
+                content = {'msgdef': source.msgdef.data, 'rihs01': source.digest or 'RIHS01_0'}
+                copied = sqlite.add_connection(source.topic, source.msgtype, **content)
                 for _, stamp, data in reader_of_all.messages(connections=[source]):
                     sqlite.write(copied, stamp, data)
     replay(bag, rich_calibration(), tmp_path / 'out', all_topics=True)

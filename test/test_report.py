@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate: its content is true and complete; the page loads no file, runs no script."""
+"""The certificate is true and complete; its page loads no file and runs no script."""
 
 import re
 import tracemalloc

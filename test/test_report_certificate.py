@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate of a laboratory: its statements, uncertainties and rounding."""
+"""The certificate has the statements of the laboratory, uncertainties and correct rounding."""
 
 import math
 from dataclasses import replace

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rest log: rests gathered on real DDS, and the files of a killed node or on a full disk."""
+"""The node logs rests on DDS; a killed node or a full disk damages the rest log little."""
 
 import json
 import signal
@@ -38,7 +38,7 @@ def rest(number):
     return Rest(stamp, 1000, (1.0, -2.0, 2941.25), (3.0,) * 3, (*state, 0.25, 0.0), (0.5,))
 
 
-def test_a_state_with_rates_survives_the_log_and_one_without_names_none():
+def test_a_rest_with_rates_and_a_rest_without_rates_survive_the_log():
     between = ('board', 600.0, 60.0, 'case', 0.4)
     memory = MemorySpec(('case',), (('board', 60.0), between), ((600.0, 0.8, *between[2:]),),
                         ('case',))  # fmt: skip

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid samples (stuck, zero, at too high a rate) are treated alike in streams and in blocks."""
+"""Invalid samples (stuck, zero, too fast) are treated alike in streams and in blocks."""
 
 import math
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Programs, whole tests in memory and ready-made units, whose converter loses no charge."""
+"""Chamber programs, simulated tests and ready-made units are as described."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -53,7 +53,7 @@ def test_a_perfect_model_leaves_the_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # The bias walk has a mean square of 9 * 7.3 / 2 ug^2 per axis in 7.3 h; the wide limits
+        # The random walk has a mean square of 9 * 7.3 / 2 ug^2 per axis in 7.3 h; the wide limits
         # allow for the scatter of 3 runs.
         assert 4.0 < vector < 20.0
     else:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The generators and the judge of benchmarks/strangers.py against closed forms."""
+"""The units and the scores of benchmarks/strangers.py agree with closed forms."""
 
 from dataclasses import replace
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A survey of a recording lists the data that a fit would lack."""
+"""A survey of a recording lists the data that a fit lacks."""
 
 import numpy as np
 import pytest

@@ -55,7 +55,7 @@ def rms(values):
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     # WHY: a fit with products and squares of a lag, but without the lag, had left-out errors as
-    # small as with the lag. At twice the rates a fit without the lag erred by over 1.7 mg.
+    # small as with the lag. At twice the ramp rates the fit without the lag erred by over 1.7 mg.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
