@@ -151,7 +151,7 @@ def test_likely_mistakes_are_refused_by_name(rng, spoil, name, text):
 
 
 def test_rests_without_noise_advise_the_parameter_of_the_node(rng):
-    # WHY: the node takes equal samples for a stuck converter: it dropped 60 % of those at rest.
+    # WHY: the node, which takes equal samples for a stuck converter, dropped 60 % of the samples.
     rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]
     for rest in rests[:2]:
         # The drift of 40 mg changes the samples by steps of 4 mg.

@@ -85,7 +85,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         before = flow.more()
         assert flow.bias(before - 1) == 1.0
 
-        # A new calibration file is in use when the answer comes; it changes between two samples.
+        # When the answer comes, the new calibration is in use; it was exchanged between samples.
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
 

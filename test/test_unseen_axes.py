@@ -68,7 +68,7 @@ def test_nothing_is_added_where_all_positions_show_the_same_axes(up):
     only_x = np.allclose(up, [1.0, 0.0, 0.0])
     assert unseen_axes.with_unseen_axes(fit, ((), ()), None) == [(), ()]
     assert unseen_axes.judge_unseen_axes(fit, None) == []
-    # A prior knows all axes in its range, also those that no position shows.
+    # A prior determines all axes within its temperature range, also axes that no position shows.
     (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), prior_of(0.0, 40.0))
     assert bool(lack) == only_x
 

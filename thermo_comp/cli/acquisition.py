@@ -30,8 +30,8 @@ _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 _LOOKED_BACK = 200
 # Sd of the mean force in a position by hysteresis, mounting and drift, however long the rest [g].
 _FLOOR_SD = 2e-5
-# A rest is 'restless' if its noise is above this multiple of the median over all rests; it is no
-# rest, but a unit held by hand, above the second multiple of the noise of the rests before.
+# A rest is 'restless' if its noise exceeds this multiple of the median over all rests. A still
+# interval whose noise exceeds the second multiple of that of earlier rests is a unit held by hand.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9

@@ -288,7 +288,7 @@ def _print_groups(out: Output, calibration: 'Calibration', has_prior: bool) -> N
         )
     white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
     walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
-    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
+    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), random walk {walk} ug/sqrt(h)')
 
 
 def _print_residuals(out: Output, result: 'FitResult', n_positions: int) -> None:
@@ -321,7 +321,7 @@ def _print_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> No
     )
     out.line(
         f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
-        f'walk {walk} mdeg/s/sqrt(h)'
+        f'random walk {walk} mdeg/s/sqrt(h)'
     )
 
 

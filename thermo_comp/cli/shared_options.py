@@ -4,7 +4,7 @@
 Owns the options that several commands share, and their conversion to arguments of the library.
 
 The default of a command's parameter is an option, or a function that builds the parameter from
-several options; `expanded` turns the latter into their options, for typer.
+several options; `expanded` replaces such a parameter by its options, for typer.
 """
 
 import inspect

@@ -34,7 +34,7 @@ _FORMAT = 3
 _LONGEST_NAME = 100
 # Largest number of units listed on the page; the table has all units.
 _MOST_ROWS = 60
-# Verdicts that contradict a fit to its own bags: more data of this kind do not change them.
+# Verdicts on the bags of a fit that contradict the fit: more data would not change these verdicts.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )

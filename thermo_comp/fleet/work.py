@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Start workers that ignore Ctrl-C, which a terminal sends to them, too; raise it later."""
+    """Let workers that start in the context ignore Ctrl-C; afterwards raise KeyboardInterrupt."""
     heard: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

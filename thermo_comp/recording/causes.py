@@ -37,7 +37,7 @@ class CauseCounter:
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
     def cause(self, cells: Cells, still_sd: float) -> str:
-        """Describe the fault of the samples; '' if an accelerometer at rest may have sent them."""
+        """Describe why the samples cannot be those of an accelerometer at rest; '' if they can."""
         if self._n_absent > _FAULT_SHARE * self._n:
             return (
                 'its messages say that they hold no acceleration '

@@ -86,8 +86,8 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the first sample of the part that is read [s]; set
-        #: when the latter is read.
+        #: Time from the bag's first sample to the first sample of the selected part [s]; 0 until
+        #: this sample has been read.
         self.since_s = 0.0
         self.apart = ''  # warning about a clock that does not run or a second clock, if found
 

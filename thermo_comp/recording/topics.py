@@ -45,7 +45,7 @@ Present = Mapping[str, tuple[str, int]]
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Part of a bag: times since its first sample or, from 1e8 on, stamps [s]; without `end`."""
+    """Part of a bag from `begin` to before `end`: times since the first sample, or stamps [s]."""
 
     begin: float | None = None
     end: float | None = None
@@ -179,7 +179,7 @@ def shown(name: str) -> str:
 
 
 def choice_note(name: str, key: str, wanted: str, among: str = 'only') -> str:
-    """Note that a topic was chosen for an input by its type; '' if it has the wanted name."""
+    """Note that a topic was chosen for an input by its type; '' if its name is the wanted name."""
     kind = _TYPES[key].rpartition('/')[2]
     is_named = is_called(name, split_field(wanted)[0])
     return '' if is_named else f'{shown(name)}, its {among} {kind}, is taken for {key}'
