@@ -329,7 +329,7 @@ def read_parquet(
             parquet = pq.ParquetFile(file)
             if parquet.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
                 raise RecordingError(
-                    f'too small for its {parquet.metadata.num_rows} rows', path=path
+                    f'the file is too small for {parquet.metadata.num_rows} rows', path=path
                 )
             headings = list(parquet.schema_arrow.names)
             wanted = range(len(headings)) if columns is None else columns

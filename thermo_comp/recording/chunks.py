@@ -117,7 +117,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
     try:
         if span.kind == 'chunk' and max(span.size, n_bytes) > MAX_CHUNK_BYTES:
             raise DamagedError(
-                f'{n_bytes} bytes declare a content of {span.size}, limit {MAX_CHUNK_BYTES}'
+                f'{n_bytes} bytes declare a content of {span.size} bytes, limit {MAX_CHUNK_BYTES}'
             )
         record = read_at(span.position, min(n_bytes, MAX_CHUNK_BYTES))
         data = np.frombuffer(record, np.uint8)

@@ -269,7 +269,7 @@ def _described(path: Path) -> _Description:
             if files:
                 if len({re.sub(r'_[0-9]+$', '', file.stem) for file in files}) > 1:
                     raise RecordingError(
-                        f'a folder of {len(files)} bags, not a bag: give *{suffix} in it', path
+                        f'a folder of several bags: give its {len(files)} *{suffix} files', path
                     )
                 note = 'metadata.yaml is missing, the recording was not finished'
                 return _Description(suffix[1:], tuple(sorted(files, key=_place_of)), note=note)
