@@ -125,7 +125,7 @@ def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
 def run_matrix(
     pool: Pool, is_quick: bool, seed: int, rates: Sequence[float], n_ramps: int | None
 ) -> Matrix:
-    """Run the detector over all scenes."""
+    """Run the detector of the dynamic regime over all simulated scenes."""
     ramps = (0.1, 0.5, 3.0) if is_quick else (0.1, 0.2, 0.5, 1.0, 3.0)
     lags = (180.0, 900.0) if is_quick else (180.0, 900.0, 1200.0)
     jobs: list[Job] = [
@@ -187,7 +187,7 @@ Tables = Iterator[tuple[str, Rows]]
 def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
     """Measure the onset delays for ramps of 0.5 K/min behind a lag of 15 min."""
     rows = onset_table(pool, arguments.quick, arguments.seed)
-    yield 'Onset of 0.5 K/min behind 15 min at 1 Hz', rows
+    yield 'Onset of a ramp of 0.5 K/min behind a lag of 15 min, 1 Hz', rows
 
 
 def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
@@ -197,7 +197,7 @@ def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Run the detector over all scenes."""
+    """Yield the tables of the detector's errors over all simulated scenes."""
     rates = arguments.rates or ((1.0, 0.1) if arguments.quick else tuple(RAMPS))
     matrix = run_matrix(pool, arguments.quick, arguments.seed, rates, arguments.ramps)
     yield 'Ramps by rate of the readings', rate_table(matrix)

@@ -122,7 +122,7 @@ def _compared(with_log: Floats, without: Floats, unit: str) -> str:
 
 
 def main() -> None:
-    """Measure the node at each sample rate."""
+    """Measure the node with and without the rest log at each sample rate."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--rates', type=int, nargs='+', default=(400, 1000, 10000))
     parser.add_argument('--seconds', type=int, default=60)

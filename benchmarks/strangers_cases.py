@@ -269,7 +269,7 @@ def bump(number: int) -> Iterator[Study]:
 
 
 def carry(number: int) -> Iterator[Study]:
-    """Change the bias by 50 to 150 ug after half of the bags, as by carrying the unit."""
+    """Change the bias by 50 to 150 ug after half of the bags, as carrying a unit can do."""
     rng = rng_of('carry', number)
     unit = navigation(rng)
     step = signed(rng, 50, 150)

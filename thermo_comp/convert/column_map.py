@@ -247,7 +247,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
-        # The times of samples need not be true here: a second between samples finds the rests.
+        # Rests are found without the true times: one second between samples is assumed.
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
         unit, reason = infer_unit(still.magnitude)
         if unit == 'unknown':

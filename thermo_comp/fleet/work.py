@@ -244,7 +244,7 @@ def run(
 
 
 def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
-    """Return a task's outcome, or that of a failed task, which a later run repeats."""
+    """Return a task's outcome; if the task failed, an outcome that a later run replaces."""
     from distributed import KilledWorker
 
     if future.status == 'finished':
