@@ -6,10 +6,10 @@ Owns the accuracy figures of docs/accuracy.md: the fit against the simulator's t
 Run ``python benchmarks/accuracy.py`` for everything, or a part with fewer units:
 ``python benchmarks/accuracy.py kinds --kinds own-lags,paper --seeds 1``.
 
-Every fit uses a whole test in unknown attitudes. With the result of the fit the compensator
-corrects the plan 'held-out' (other ramps, other soaks, other attitudes). Errors are differences of
-60 s means from the simulated truth, in micro-g. The floor is the error of the true model with the
-same noise.
+Every fit uses a whole thermal test in unknown attitudes. With the fitted calibration the
+compensator corrects the plan 'held-out' (other ramps, soaks and attitudes). Errors are differences
+of means over 60 s from the simulated truth [ug]. The floor is the error of a correction by the
+true thermal model: noise alone.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ N_SIBLINGS = 10  # number of siblings that make the prior
 @dataclass(frozen=True)
 class Goal:
     """
-    Limits for the worst unit: RMS of |f| - g and of the error vector [ug], or relative to the
-    floor.
+    Limits for the worst unit: RMS of |f| - g and of the error vector, in ug, or as multiples of
+    the floor if `is_relative`.
     """
 
     norm: float
@@ -76,7 +76,7 @@ PLAN_GOALS = {
 
 
 def block(record: SimulatedRun) -> Block:
-    """Return one record as a block."""
+    """Return a simulated run as a block."""
     stamps, counts = record.accel_stamp_ns, record.counts.astype(np.float64)
     readings = {
         'board': (record.board_stamp_ns, record.board),
@@ -92,12 +92,12 @@ def block(record: SimulatedRun) -> Block:
 @dataclass(frozen=True)
 class Corrected:
     """
-    Test records corrected with a calibration, and its constants at its reference temperature.
+    Held-out runs corrected with a calibration, and constants of the calibration.
 
     Parameters
     ----------
     specific_force, sd : list of ndarray, shape (w, 3)
-        Means over 60 s of each test record, and their claimed standard deviations, m/s^2.
+        Means over 60 s of each held-out run, and their claimed standard deviations, m/s^2.
     constants, constants_sd : ndarray, shape (2, 3)
         Bias [counts/cycle] and ln K at the reference temperature, and their claimed sd.
     fit_s : float
@@ -116,7 +116,7 @@ class Corrected:
 
 
 def fitted(records: Sequence[SimulatedRun], **options: Any) -> Calibration:
-    """Fit one test."""
+    """Fit the runs of a test."""
     sources = [FitSource('bag', lambda record=record: [block(record)]) for record in records]
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, **options)).calibration
 
@@ -124,7 +124,7 @@ def fitted(records: Sequence[SimulatedRun], **options: Any) -> Calibration:
 def fit_and_correct(
     records: Sequence[SimulatedRun], test_records: Sequence[SimulatedRun], **options: Any
 ) -> Corrected:
-    """Fit one test, and correct another test with the result."""
+    """Fit the runs of a test, and correct held-out runs with the result."""
     began = time.perf_counter()
     calibration = fitted(records, **options)
     took = time.perf_counter() - began
@@ -138,7 +138,7 @@ def fit_and_correct(
         columns = np.column_stack((corrected.specific_force, corrected.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # Means of 60 s average out white noise and rounding, not the other published variance.
+        # In means over 60 s white noise and rounding average out, other errors do not.
         white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))
@@ -198,13 +198,13 @@ def corrected_by_truth(run: SimulatedRun) -> Floats:
 
 
 def floor(tests: Sequence[SimulatedRun]) -> Errors:
-    """Return the errors left by the true thermal model: the noise of the test records alone."""
+    """Return the errors of a correction by the true thermal model: noise alone."""
     forces = [corrected_by_truth(record) for record in tests]
     return errors(forces, [np.ones_like(force) for force in forces], tests)
 
 
 def judged(result: Errors, goal: Goal | None, least: Errors) -> str:
-    """Return RMS of |f| - g and of the error vector as a table cell, marked above the limits."""
+    """Return RMS of |f| - g and of the error vector as a table cell; mark values above limits."""
     cell = f'{result.norm:.2f} / {result.vector:.2f}'
     if goal is None:
         return cell
@@ -246,9 +246,7 @@ def part_kinds(options: argparse.Namespace) -> None:
 
 
 def part_plans(options: argparse.Namespace) -> None:
-    """
-    Print the errors of short chamber tests, without a prior and with the prior of ten siblings.
-    """
+    """Print the errors of short chamber tests, without and with the prior of ten siblings."""
     print('| test | unit | seed | floor | alone | with siblings | error / claimed sd, both |')
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):

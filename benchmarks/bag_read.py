@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the measurement of reading: bag to columns, by this package, rosbags and mcap in one run.
+Owns the measurement of reading a bag into columns, by thermo_comp, rosbags and mcap in one run.
 
 All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap get shorter bags.
 `rosbags` reads and deserializes each message; `mcap` reads each message and does not decode it at
@@ -38,7 +38,7 @@ COMPRESSIONS = ('none', 'lz4', 'zstd')
 
 
 def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
-    """Write n counts messages and their temperatures."""
+    """Write n messages of counts, and temperatures."""
     rng = np.random.default_rng(1)
     block = 1 << 17
     with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes) as bag:
@@ -55,18 +55,18 @@ def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
 
 
 def read_ours_whole(path: Path) -> int:
-    """Read the whole bag into memory."""
+    """Read a whole bag into memory with thermo_comp."""
     return len(read_recording(path).columns)
 
 
 def read_ours_blocks(path: Path) -> int:
-    """Read the bag block by block, as for the compensator."""
+    """Read a bag block by block with thermo_comp, as for the compensator."""
     with open_recording(path) as reader:
         return sum(len(block) for block in reader.blocks())
 
 
 def read_rosbags(path: Path) -> int:
-    """Read and deserialize every message."""
+    """Read and deserialize every message with rosbags."""
     from rosbags.rosbag2 import Reader
     from rosbags.typesys import Stores, get_typestore
 
@@ -80,7 +80,7 @@ def read_rosbags(path: Path) -> int:
 
 
 def read_mcap(path: Path) -> int:
-    """Read every message without decoding it."""
+    """Read every message with mcap, without decoding."""
     from mcap.reader import make_reader
 
     n = 0
@@ -91,7 +91,7 @@ def read_mcap(path: Path) -> int:
 
 
 def timed(read: Callable[[Path], int], path: Path, n: int) -> tuple[float, float]:
-    """Measure wall and CPU time of one reading, per message."""
+    """Return wall and CPU time of reading a bag, per message [s]."""
     wall, cpu = time.perf_counter(), time.process_time()
     content = read(path)
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
@@ -103,7 +103,7 @@ def measure(
     folder: Path, n: int, n_peers: int, repeats: int, chunk_bytes: int
 ) -> Iterator[dict[str, Any]]:
     """
-    Yield the best result of each reader, one row per compression; the readers take turns.
+    Yield a row per compression: the best result of each reader. The readers run in turn.
     """
     for compression in COMPRESSIONS:
         ours, peers = folder / f'{compression}.mcap', folder / f'{compression}_peers.mcap'

@@ -17,7 +17,7 @@ import zstandard
 def damaged(
     make: Callable[[Path], Path], pattern: str, damage: Callable[[Path], object]
 ) -> Callable[[Path], Path]:
-    """Damage the only file of a bag."""
+    """Return a function that makes a bag and damages its only file that matches a pattern."""
 
     def made(folder: Path) -> Path:
         bag = make(folder)
@@ -29,7 +29,7 @@ def damaged(
 
 
 def flip(file: Path, place: float = 0.5) -> None:
-    """Flip one bit of a file."""
+    """Flip a bit of a file."""
     data = bytearray(file.read_bytes())
     data[int(len(data) * place)] ^= 4
     file.write_bytes(data)

@@ -75,7 +75,7 @@ class Run:
 
 
 def _peak_megabytes(pid: int) -> float:
-    """Largest resident size so far [MB]; 0 once the process has ended."""
+    """Return the largest resident size of a process so far [MB]; 0 after the process has ended."""
     try:
         status = Path(f'/proc/{pid}/status').read_text()
     except OSError:
@@ -85,7 +85,7 @@ def _peak_megabytes(pid: int) -> float:
 
 
 def run(name: str, command: str, path: Path, out: Path) -> Run:
-    """Run one command to its end, or until the time limit."""
+    """Run a command to its end, or until the time limit."""
     program = Path(sys.executable).with_name('thermo_comp')
     log = out / 'said.txt'
     began = time.monotonic()
@@ -100,7 +100,7 @@ def run(name: str, command: str, path: Path, out: Path) -> Run:
     pid = 0
     megabytes = 0.0
     while not pid and time.monotonic() - began < LIMIT_S:
-        # The peak memory by wait4 includes the parent's memory at the fork, so read it from /proc.
+        # Read the peak from /proc: the peak of wait4 includes the parent's memory at the fork.
         megabytes = max(megabytes, _peak_megabytes(process.pid))
         pid, status, _ = os.wait4(process.pid, os.WNOHANG)
         time.sleep(0.01)
@@ -153,12 +153,12 @@ def main() -> int:
             shutil.rmtree(out)
         print(row, flush=True)
         shutil.rmtree(folder)
-    bad = [one for one in runs if one.is_bad]
-    for one in bad:
-        print(f'{one.command} on {one.input}: {one.code}: {one.said[:300]}')
+    bad = [result for result in runs if result.is_bad]
+    for result in bad:
+        print(f'{result.command} on {result.input}: {result.code}: {result.said[:300]}')
     print(f'{len(runs)} runs, {len(bad)} break a promise')
     if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(one) for one in runs], indent=1))
+        arguments.json.write_text(json.dumps([asdict(result) for result in runs], indent=1))
     return 1 if bad else 0
 
 

@@ -27,7 +27,7 @@ RATE_HZ, POSITIONS, POSITION_S = 20, 10, 40
 
 @dataclass
 class Columns:
-    """A thermal test in one recording: positions at rest one after the other, during a ramp."""
+    """A thermal test in a single recording: the positions follow each other during a ramp."""
 
     stamp_ns: np.ndarray
     counts: np.ndarray
@@ -53,7 +53,7 @@ def whole() -> Columns:
 
 
 def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = False) -> Path:
-    """Write a bag; with `log` its log times rise, whatever the stamps are."""
+    """Write a bag; with `log` the log times rise, whatever the stamps are."""
     path = folder / name
     rising = START_NS + np.arange(len(columns.stamp_ns)) * (SECOND // RATE_HZ) if log else None
     slow = None if rising is None else rising[:: RATE_HZ // 2][: len(columns.reading_ns)]
@@ -93,8 +93,8 @@ def imu(
     change: Callable[[np.ndarray], np.ndarray], claimed: float = 0.0
 ) -> Callable[[Path], Path]:
     """
-    Write sensor_msgs/Imu with changed samples [m/s^2]; the first element of the covariance is
-    given.
+    Write sensor_msgs/Imu with changed samples [m/s^2]; `covariance` is the first element of
+    linear_acceleration_covariance.
     """
 
     def make(folder: Path) -> Path:
@@ -120,9 +120,7 @@ def _without_gravity(force: np.ndarray) -> np.ndarray:
 
 
 def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
-    """
-    Keep the unit in motion except for a second now and then, like an arm, or a car at crossings.
-    """
+    """Add noise of `sd` [m/s^2], as of an arm or a car, except in pauses of `longest_s` [s]."""
 
     def change(force: np.ndarray) -> np.ndarray:
         rng = np.random.default_rng(9)
@@ -250,8 +248,7 @@ def _samples(columns: Columns, n: int) -> None:
 @dataclass(frozen=True)
 class Input:
     """
-    A degenerate input; `is_lost`: a part of the input cannot be read, so that exit code 0 is
-    wrong.
+    A degenerate input; `is_lost`: data of the input cannot be read, so that exit code 0 is wrong.
     """
 
     make: Callable[[Path], Path]
@@ -278,14 +275,14 @@ INPUTS: dict[str, Input] = {
     'all values 1e308': Input(spoilt(lambda c: _set('counts', c.counts * 0 + 1e308)(c))),
     'a reading of 1e308': Input(spoilt(lambda c: c.board.__setitem__(9, 1e308))),
     'all NaN': Input(spoilt(lambda c: _set('counts', c.counts * np.nan)(c))),
-    'zeros by turns': Input(imu(_by_turns)),
-    'no acceleration in it': Input(imu(np.zeros_like, -1.0)),
-    'gravity taken off': Input(imu(_without_gravity)),
+    'zeros in every second row': Input(imu(_by_turns)),
+    'no acceleration in the messages': Input(imu(np.zeros_like, -1.0)),
+    'gravity subtracted': Input(imu(_without_gravity)),
     'samples in g': Input(imu(lambda force: force / 9.80665)),
     'stamps all zero': Input(stamps(np.zeros_like)),
     'worn on a wrist': Input(imu(_worn(4.0, 2.9))),
-    'a drive': Input(imu(_worn(1.5, 0.0))),
-    'axes that lean': Input(imu(_leaning)),
+    'a drive in a car': Input(imu(_worn(1.5, 0.0))),
+    'axes not orthogonal': Input(imu(_leaning)),
     'all zeros': Input(spoilt(lambda c: _set('counts', c.counts * 0)(c))),
     'a span of 1 K': Input(spoilt(lambda c: _set('board', 20 + c.board / 30)(c))),
     'Cyrillic serial': Input(spoilt(_set('serial', 'блок 7'))),

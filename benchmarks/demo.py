@@ -5,7 +5,7 @@ Fits the sample bags, plays another bag through the live node, and judges the ou
 
     python benchmarks/demo.py [--bags bags] [--out out]
 
-A bag that the fit did not use goes through the real path: player, DDS, the node, DDS, recorder.
+The bag that the fit did not use goes through player, DDS, the node, DDS and a recorder.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from thermo_comp.topics import IMU_OUT, REGIME
 from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-# Sd of the sample unit's bias from one turn-on to the next [m/s^2], which the norms of nine
-# positions do not show.
+# Sd of the sample unit's bias from turn-on to turn-on [m/s^2]. The norms of nine positions do not
+# determine this sd, so it is given to the fit.
 MOUNTING_SD = 1e-6 * STANDARD_GRAVITY
 
-# Groups of the fits by column heading: one curve for both regimes; two curves; all groups that the
-# evidence supports, which is the fit for the node.
+# Groups of columns of each fit, by heading in the table: a curve for both regimes; a curve per
+# regime; all groups that the fit selects, which is the calibration for the node.
 MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 
 def demo(folder: Path, output: Path) -> bool:
-    """Fit, play, judge and draw; return whether the node lost nothing and equals the replay."""
+    """Fit, play, judge, draw; return whether the node lost no message and equals the replay."""
     out = Output()
     output.mkdir(parents=True, exist_ok=True)
     held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'
@@ -77,8 +77,8 @@ def demo(folder: Path, output: Path) -> bool:
     result = evaluate([held_out], judged, gravity=STANDARD_GRAVITY)
     out.line()
     print_sections(out, result.judgements)
-    out.line('one set: one cubic for both regimes; two sets: a cubic for each regime, as in the')
-    out.line('paper; node: two sets and the thermal response that the fit selects')
+    out.line('one set: a cubic for both regimes; two sets: a cubic for each regime, as in')
+    out.line("Golovach's paper; node: two sets and the thermal response that the fit selects")
     page, figures = output / 'report.html', output / 'figures'
     with out.progress('drawing', total=None):
         evidence = evidence_of_bags(result.bags, models['node'], gravity=STANDARD_GRAVITY)
@@ -89,7 +89,7 @@ def demo(folder: Path, output: Path) -> bool:
 
 
 def messages(path: Path) -> list[tuple[int, bytes]]:
-    """Read the corrected samples of a bag: the time and the bytes of each."""
+    """Return log time and bytes of each message of corrected samples in a bag."""
     with open_recording(path, Topics(imu=IMU_OUT.name, input='imu'), require=['accel']) as bag:
         return [
             pair
@@ -99,7 +99,7 @@ def messages(path: Path) -> list[tuple[int, bytes]]:
 
 
 def main() -> int:
-    """Run the demonstration; 1 if the node lost messages or differs from the offline replay."""
+    """Run the demonstration; return 1 if the node lost messages or differs from the replay."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--bags', default='bags', help='folder of the sample bags')
     parser.add_argument('--out', default='out', help='folder for the results')

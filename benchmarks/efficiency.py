@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the efficiency of docs/accuracy.md: bias and scale of a fit against the Cramer-Rao bound.
+Owns the efficiency in docs/accuracy.md: errors of bias and scale against the Cramer-Rao bound.
 
 Run ``python benchmarks/efficiency.py``, or with fewer units: ``--units 10``.
 """
@@ -26,10 +26,10 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 def exact_unit(seed: int) -> UnitModel:
     """
-    Make a unit whose drift is only a quadratic of the board's temperature.
+    Make a unit whose bias and scale are quadratics of the board's temperature alone.
 
     The unit has no self-heating, so that its bags contain the reference state, in which no heat
-    flows. A bound on constants at a state outside the bags would not be meaningful.
+    flows. A bound on constants in a state outside the bags would not be meaningful.
     """
     rng = np.random.default_rng(seed)
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measures updates in the field against the best filter, on units that age (`field_units.py`).
+Measures updates in the field against an optimal filter, on units that age (`field_units.py`).
 
     python benchmarks/field.py [--units 10] [--days 60] [--recordings ../shared/data]
 
@@ -48,7 +48,7 @@ from thermo_comp.field.series import Series, series_of
 from thermo_comp.field.update import update
 from thermo_comp.unit.calibration import Calibration
 
-#: Number of attitudes and temperatures at which the errors are taken.
+#: Number of pairs of attitude and temperature at which the errors are evaluated.
 N_PROBES = 200
 LABORATORY = calibration()
 
@@ -72,7 +72,7 @@ def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, F
 
 
 def errors_of(series: Series, calibrated: Calibration, force: Floats) -> Floats:
-    """Return the errors of |f| and of the axes x, y, z [m/s^2], shape (n, 4)."""
+    """Return the errors of |f| and of the axes x, y, z after correction [m/s^2], shape (n, 4)."""
     f = series.force @ np.array(calibrated.misalignment).T
     return np.column_stack((series.residual, f - force))
 
@@ -84,11 +84,11 @@ def root_mean(values: Floats) -> float:
 
 def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     """
-    Return whether the update, and the best filter, have a larger error on the rests of a day than
-    the old calibration.
+    Return whether the update, and whether the best filter, has a larger error on the rests of a
+    day than the old calibration.
 
-    The excess of the error must be above the standard error of an RMS over n turn-ons, claimed sd
-    / sqrt(2 n).
+    The excess of the error must be above the standard error of an RMS over n turn-ons, which is
+    the claimed sd / sqrt(2 n).
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
@@ -109,7 +109,7 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
 
 
 def filtered(history: History, process: Process, days: int) -> Floats:
-    """Return the state of the best filter after `days` days, without the last turn-on offset."""
+    """Return the best filter's state after `days` days, without the offset of the last turn-on."""
     state = best(history, process, days).state.copy()
     state[21:] = 0.0
     return state
@@ -155,8 +155,8 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
     kalman = filtered(history, process, days)
     f = corrected(counts, warmth, kalman)
     of_best = np.column_stack((np.linalg.norm(f, axis=1) - G, f - force))
-    # The claimed sd is that of a window a day later, after another turn-on: add the offset of the
-    # turn-on, noise and a day's walk to the error.
+    # The claimed sd is that of a window a day later, after another turn-on: add a turn-on offset,
+    # noise and a random walk of a day to the error.
     rng = np.random.default_rng([seed, 9])
     of_bias = np.hypot(process.turn_on, process.bias)
     more = (series.direction * rng.normal(0.0, of_bias, (N_PROBES, 3))).sum(axis=1)
@@ -177,7 +177,7 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
 
 
 def simulated(kind: str, n_units: int, days: int) -> None:
-    """Print the figures of one kind of platform."""
+    """Print the figures of a kind of platform."""
     results = [unit(kind, seed, days) for seed in range(n_units)]
     joined = {name: np.array([result[0][name] for result in results]) for name in results[0][0]}
     print(f'\n{kind}: {n_units} units, {days} days, one shock each')
@@ -205,7 +205,7 @@ def simulated(kind: str, n_units: int, days: int) -> None:
 
 
 def log_size() -> None:
-    """Print the size of a month's rest log of an ageing unit."""
+    """Print the size of the rest log of an ageing unit over 30 days."""
     history = live('carried', 0, 30, Process())
     size = sum(len(encode(rest)) for _, rest in history.rests)
     size += sum(len(encode(start)) for start in {start for start, _ in history.rests})

@@ -3,9 +3,9 @@
 """
 Owns updates on real recordings, for the benchmark `field.py`.
 
-None of the recordings spans days, so each is cut into sections: a fit of the first section
-replaces the calibration of a laboratory, and each further section counts as one start of the node.
-On each section, an update by all previous sections is compared with the fit of the first section.
+No recording spans days, so each is cut into parts: a fit of the first part replaces the
+calibration of a laboratory, and each further part counts as a start of the node. On each part, an
+update by all earlier parts is compared with the fit of the first part.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def part(of: Columns, begin: float, end: float) -> Columns:
 
 
 def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple[Start, Rest]]:
-    """Return the rest log that a node started at the beginning of a recording would write."""
+    """Return the rests that a node, started at the begin of a recording, would log."""
     compensator = Compensator(calibration)
     correction = compensator.thermal.correction
     start = Start(
@@ -83,8 +83,8 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
 
 
 def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], float]]:
-    """Yield name, bag, the starts of all parts and the end [s], and the length of a window [s]."""
-    # From the sensor's last jump (docs/real_data.md) until the sensor is taken out of the freezer.
+    """Yield name, bag, begins of the parts and end of the last [s], length of a window [s]."""
+    # Use the time from the last jump (docs/real_data.md) until the sensor leaves the freezer.
     yield 'freezer', freezer_bag(folder, work), [518.5, *np.arange(900.0, 1941.0, 104.0)], 10.0
     for unit in range(3):
         yield f'handheld {unit}', handheld_bag(folder, work, unit), [0.0, *range(80, 157, 11)], 2.0
@@ -104,7 +104,7 @@ def judge_recordings(folder: Path) -> None:
                 rests_of(part(whole, *both), calibration, int(both[0] * 1e9))
                 for both in pairwise(edges[1:])
             ]
-            parts = [one for one in parts if one]
+            parts = [rests for rests in parts if rests]
             old, new, n_written = [], [], 0
             for k in range(3, len(parts)):
                 known = [rest for some in parts[:k] for rest in some]

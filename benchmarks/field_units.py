@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ageing units of the benchmark `field.py`: physics, rests, reference filter.
+Owns the units of the benchmark `field.py`, which age: physics, rests, reference filter.
 
 A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
-calibration states. In the field bias and scale walk at random, each turn-on has another bias
-offset, and one shock moves the biases. The forward model and the Kalman filter are written here in
-numpy and share no code with the update; the filter is given the true variances and the time of the
-shock.
+calibration states. In the field bias and scale follow random walks, each turn-on has another bias
+offset, and a shock changes the biases once. The forward model and the Kalman filter are written
+here in numpy and share no code with the update; the filter is given the true variances and the
+time of the shock.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ KINDS = ('level', 'carried', 'fixed', 'up and down', 'faces')
 
 @dataclass(frozen=True)
 class Process:
-    """The ageing process in the field: walks per root day, turn-on, sd of the shock."""
+    """The ageing process: random walks per root day, sd of turn-on offsets and of the shock."""
 
     bias: float = 15 * UG
     scale: float = 10e-6
@@ -67,14 +67,14 @@ class History:
     """Rests of a unit, and its true deviations from the calibration after each day."""
 
     rests: list[tuple[Start, Rest]] = field(default_factory=list)
-    #: For each window: day, and number of the turn-on.
+    #: Day, and number of the turn-on, of each window.
     day: list[int] = field(default_factory=list)
     start: list[int] = field(default_factory=list)
     states: list[Floats] = field(default_factory=list)
 
 
 def calibration() -> Calibration:
-    """Build the laboratory's calibration, with the covariance of its error."""
+    """Build the calibration of the laboratory, with the covariance of its errors."""
     axis = AxisSet(
         Polynomial((0.0, K * SLOPE)), Polynomial((1.0, SCALE_SLOPE)), residual_sd_m_s2=20 * UG
     )
@@ -125,13 +125,13 @@ def measured(force: Floats, warmth: Floats, state: Floats) -> Floats:
 
 
 def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
-    """Correct samples [counts / `K`] with a calibration file of deviations `state`."""
+    """Correct samples [counts / `K`] for the deviations `state`; return the force [m/s^2]."""
     bias, scale, M = _parts(state, warmth)
     return np.asarray((counts - bias) / scale @ M.T)
 
 
 def attitude(kind: str, rng: np.random.Generator) -> Floats:
-    """Draw a direction of f by `kind`: up within 10 deg, any, up, up or down, or a face."""
+    """Draw a direction of f for a kind of platform, see `KINDS`; level is up within 10 deg."""
     if kind == 'carried':
         u = rng.standard_normal(3)
         return np.asarray(u / np.linalg.norm(u))
@@ -143,14 +143,14 @@ def attitude(kind: str, rng: np.random.Generator) -> Floats:
 
 
 def temperature(day: float, rng: np.random.Generator) -> float:
-    """Draw a temperature: a season about the reference, and the weather [degC]."""
+    """Draw the board's temperature on a day [degC]: a yearly cycle and random weather."""
     return float(REFERENCE_C + 10.0 * np.sin(2.0 * np.pi * day / 60.0) + rng.normal(0.0, 2.0))
 
 
 def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
     """
-    Split a rest into times of constant attitude [s]: the whole rest on a vehicle, 20 to 90 s each
-    on a drone.
+    Split a rest into times of constant attitude [s]: 20 to 90 s each if the unit is carried, else
+    the whole rest.
     """
     while seconds >= WINDOW_S:
         rest = seconds if kind in ('level', 'fixed') else min(seconds, rng.uniform(20.0, 90.0))
@@ -195,7 +195,7 @@ def live(kind: str, seed: int, days: int, process: Process) -> History:
 
 
 class BestFilter:
-    """The best linear estimator: a Kalman filter that knows the process and the shock's time."""
+    """A Kalman filter that knows the variances of the ageing and the time of the shock."""
 
     def __init__(self, process: Process) -> None:
         self.process = process
@@ -207,7 +207,7 @@ class BestFilter:
         """
         Update the filter with a rest.
 
-        now: time [days]; counts: mean [counts / `K`]; variance of the norm of the mean
+        now: time [days]; counts: mean of the rest [counts / `K`]; variance: of the mean's norm
         """
         process = self.process
         if start != self._start:

@@ -1,14 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measures verdict and forecasts of the drift watch against simulated units (`field_units.py`).
+Measures verdicts and forecasts of the drift watch on simulated units (`field_units.py`).
 
     python benchmarks/field_watch.py [--units 20] [--days 30]
 
 Units with attitudes of five kinds age by random walks of known sd and log rests. For each unit 200
 futures are drawn: the random walk goes on until the RMS of |f| - g over the attitudes of use, with
 the scatter of the turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast are the share
-of the drawn times within its 10 to 90 % interval, and its median divided by the median drawn time.
+of the drawn times within the forecast's 10 to 90 % interval, and the forecast's median divided by
+the median drawn time.
 In a second part, a verdict is taken every five days on level and on carried units, half of which
 do not age; the figures are the number of verdicts "outside", by classes of the true RMS of |f| - g
 divided by the limit.
@@ -27,7 +28,7 @@ from thermo_comp.field.series import Series, series_of
 from thermo_comp.field.update import update
 from thermo_comp.field.watch import LIMIT, watch
 
-#: Classes of the true RMS of |f| - g divided by the limit.
+#: Limits of the classes of the true RMS of |f| - g divided by the limit of the verdict.
 CLASSES = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 9.0)
 LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
@@ -64,7 +65,7 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
         result = watch(series, LABORATORY, TOLERANCE)
         updated = update(series, LABORATORY, ahead=0.0).calibration
         rests = probes(kind, history.states[-1], seed)[0]
-        before, after = (series_of(rests, one) for one in (LABORATORY, updated))
+        before, after = (series_of(rests, known) for known in (LABORATORY, updated))
         for name, probe, printed in (
             ('forecast', before, result.forecast),
             ('interval', after, result.interval),
@@ -77,7 +78,7 @@ def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
 
 
 def verdicts(kind: str, n_units: int, days: int) -> None:
-    """Print how often the verdict is "outside", by the true RMS of |f| - g / limit."""
+    """Print the number of verdicts "outside" by the class of the true RMS of |f| - g / limit."""
     found = []
     for seed in range(2 * n_units):
         ageing = {'bias': 0.0, 'scale': 0.0} if seed % 2 else {}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of a fit: CPU time and peak memory over the number of bags, against reading alone,
-and the power of the number of samples with which the time grows.
+Owns the cost of a fit: CPU time and peak memory over the number of bags, compared with reading
+alone, and the exponent of the number of samples in the CPU time.
 
 Bags of four hours are simulated once and written to disk. Reading and fitting run in separate
 processes, so that each has its own peak of memory.
@@ -30,7 +30,7 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 
 def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
-    """Simulate the chamber program once per position, straight into bags."""
+    """Simulate the chamber program in each position, and write a bag per position."""
     from thermo_comp.recording.writer import BagWriter
 
     unit = unit_preset('thermostatted', 1)
@@ -50,7 +50,7 @@ def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
 
 
 def measure(task: str, paths: list[Path]) -> dict[str, float]:
-    """Run one task in a separate process."""
+    """Run a task in a separate process."""
     done = subprocess.run(
         [sys.executable, __file__, '--task', task, *map(str, paths)],
         check=False,

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of a fleet: scaling, overhead of the scheduler, network traffic, lost results.
+Owns the cost of a fleet: scaling with workers, overhead of the scheduler, network, lost results.
 
 Units are simulated and written to bags once (``--folder`` keeps them), and fitted as by the
 command `fleet fit`. Workers are processes of one thread, as in `fleet fit`.
 
-    python benchmarks/fleet.py scaling              strong and weak, 1 and 2 workers
-    python benchmarks/fleet.py overhead             500 small units, and 100 computed workers
-    python benchmarks/fleet.py kill --units 200     200 x 12 bags, a worker killed twice
+    python benchmarks/fleet.py scaling              strong and weak scaling, 1 and 2 workers
+    python benchmarks/fleet.py overhead             500 small units; estimate for 100 workers
+    python benchmarks/fleet.py kill --units 200     200 units of 12 bags, two workers killed
 """
 
 from __future__ import annotations
@@ -90,12 +90,12 @@ def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
 @dataclass(frozen=True)
 class Measured:
     """
-    Figures of one run of a fleet.
+    Figures of a run over a fleet.
 
     Parameters
     ----------
     seconds : float
-        Time from the first task sent to the last result [s].
+        Time from the submission of the first task to the last result [s].
     tasks : tuple of float
         Time of each task on its worker [s].
     own_cpu_s : float
@@ -199,9 +199,8 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             measure(folder / 'fleet', units, workers, options)
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
-        # Other programs on the processors slow two workers more than one worker. Two workers with
-        # a processor each lose time only by waiting and by sharing caches and memory, which does
-        # not depend on other programs.
+        # Other programs on the processors slow two workers more than one worker. With a free core
+        # each, two workers lose time only by waiting and by shared caches and memory.
         free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
         collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(
@@ -217,9 +216,7 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
 
 
 def overhead(folder: Path, n_units: int) -> None:
-    """
-    Measure the overhead between the tasks of many small units, and extrapolate to many workers.
-    """
+    """Measure the overhead of many small units, and extrapolate to many workers."""
     write_fleet(folder / 'small', 20, SMALL_BAGS, SMALL_PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model='golovach')
     cost = measure(folder / 'small', n_units, 2, FleetOptions(fit, certificates=False))
@@ -237,7 +234,7 @@ def overhead(folder: Path, n_units: int) -> None:
 
 
 def kill(folder: Path, n_units: int, model: str) -> int:
-    """Kill a worker twice in a run, while it fits a unit; return the number of lost results."""
+    """Kill two workers in a run, while they fit a unit; return the number of lost results."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fleet = Path(tempfile.mkdtemp(prefix='fleet-', dir=folder))
     for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:
@@ -272,7 +269,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
 
 
 def paper(found: Measured) -> None:
-    """Estimate runs with 100 and 1000 workers if one scheduler sends the measured tasks singly."""
+    """Estimate runs with 100 and 1000 workers if a scheduler sends the tasks one by one."""
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
     print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')
@@ -296,7 +293,7 @@ def paper(found: Measured) -> None:
 
 
 def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: float) -> float:
-    """Simulate a run: each worker gets the next task once worker and scheduler are free."""
+    """Return the duration of a run [s]: a free worker gets the next task from a free scheduler."""
     free = [0.0] * n_workers
     scheduler = end = 0.0
     for task in tasks:
@@ -312,7 +309,7 @@ def loads() -> str:
 
 
 def main() -> int:
-    """Run one part of the benchmark."""
+    """Run a part of the benchmark."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

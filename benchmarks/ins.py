@@ -1,16 +1,17 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the position error of an inertial navigator due to accelerometer drift, raw and compensated.
+Owns the position errors of an inertial navigator by accelerometer drift, raw and compensated.
 
-A platform stands in the chamber of the held-out bag, so that any motion that its navigator
-computes is an error. The navigator levels itself for five minutes, then navigates freely for half
-an hour; or it gets a zero-velocity update (ZUPT) every minute, and then coasts for five minutes.
-One flight of each kind begins in every minute of the run, with the raw samples, with the samples
-corrected by one set of coefficients, and with the compensated samples.
+The unit of the held-out bag stands still in the chamber, so any computed motion is an error. The
+navigator levels for five minutes, then navigates freely for half an hour; or it gets a
+zero-velocity update (ZUPT) every minute for 25 minutes, and then coasts for five minutes. A flight
+of each kind begins in every minute of the bag, with raw samples, with samples corrected by a cubic
+for both regimes, and with samples compensated as by the node.
 
-The gyroscopes are ideal and the Earth does not rotate, so that only the accelerometer matters; the
-height, which needs a barometer, is kept constant. The filter has four errors per level axis,
+The gyroscopes are ideal and the Earth does not rotate, so that all errors are of the
+accelerometer; the height is kept constant, as by a barometer. The filter estimates four errors per
+level axis, of
 position p, velocity v, tilt a and accelerometer b, as in [1]_ chapter 12::
 
     p' = v      v' = b - g a      a' = v / R      b' = -b / tau + noise
@@ -42,7 +43,7 @@ BAGS = Path(__file__).resolve().parent.parent / 'bags'
 #: Mean radius of the Earth [m]: IUGG, R_1.
 EARTH_RADIUS = 6.371009e6
 ALIGN_S, FREE_S, COAST_S, STANDING_S = 300.0, 1800.0, 300.0, 1500.0
-#: Interval of zero-velocity updates, their sd [m/s], and interval between starts of flights.
+#: Interval of zero-velocity updates [s], their sd [m/s], interval between starts of flights [s].
 ZUPT_S, ZUPT_SD, EVERY_S = 60.0, 1e-3, 60.0
 #: Correlation time of the accelerometer's error in the filter [s]: a few lags of a board.
 BIAS_S = 1800.0
@@ -50,7 +51,7 @@ COLOURS = {'raw': '#b2182b', 'one set': '#e08214', 'compensated': '#2166ac'}
 
 
 def turned(angles: Floats) -> Floats:
-    """Give the matrix of a small rotation, (..., 3) to (..., 3, 3)."""
+    """Return the matrices, shape (..., 3, 3), of small rotations, shape (..., 3) [rad]."""
     x, y, z = np.moveaxis(angles, -1, 0)
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*x.shape, 3, 3)
@@ -67,7 +68,7 @@ def levelled(force: Floats) -> Floats:
 
 @dataclass
 class Navigator:
-    """A strapdown navigator, or many with the same start: attitude, velocity, position."""
+    """Attitude, velocity and position of a strapdown navigator, or of many navigators at once."""
 
     attitude: Floats
     gravity: float
@@ -91,7 +92,7 @@ class Navigator:
         self.position = self.position + self.velocity * dt
 
     def correct(self, gain: Floats, innovation: Floats) -> None:
-        """Correct position, velocity, attitude and bias by the errors of both level axes."""
+        """Correct position, velocity, attitude and bias by the estimated errors."""
         level = innovation[..., :2, None] * gain
         up = np.zeros((*level.shape[:-2], 1))
         position, velocity, tilt, bias = (
@@ -106,9 +107,7 @@ class Navigator:
 
 @dataclass(frozen=True)
 class Model:
-    """
-    A correction of the bag: specific force (n, 3) [m/s^2], with its noise density and bias sd.
-    """
+    """Samples of the bag (n, 3) [m/s^2], raw or corrected, with noise density and bias sd."""
 
     force: Floats
     noise_density: float
@@ -117,7 +116,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Flights:
-    """Errors of all flights over time, shape (steps, flights), and sigma of the position [m]."""
+    """Errors of all flights over time, shape (steps, flights), and the filter's position sigma."""
 
     time_s: Floats
     position: Floats
@@ -127,7 +126,7 @@ class Flights:
 
 
 def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> Flights:
-    """Level, stand with zero-velocity updates, navigate freely; a flight starts every minute."""
+    """Fly from each minute on: levelling, zero-velocity updates for `zupts_s`, free navigation."""
     n_align = round(ALIGN_S / dt)
     n = round((zupts_s + (COAST_S if zupts_s else FREE_S)) / dt)
     starts = np.arange(0, len(model.force) - n_align - n, round(EVERY_S / dt))
@@ -139,7 +138,7 @@ def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> 
     )  # fmt: skip
     F = np.eye(4) + A * dt + 0.5 * A @ A * dt * dt
     Q = np.diag([0.0, model.noise_density**2, 0.0, 2.0 * model.bias_sd**2 / BIAS_S]) * dt
-    # Levelling turns an error of the accelerometer into a tilt that compensates this error.
+    # After levelling an error of the accelerometer is compensated by a tilt.
     tilt = np.array([0.0, 0.0, 1.0 / gravity, 1.0])
     P = np.outer(tilt, tilt) * model.bias_sd**2
     P[2, 2] += model.noise_density**2 / ALIGN_S / gravity**2
@@ -161,8 +160,8 @@ def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> 
 
 def models() -> tuple[dict[str, Model], float, Floats, float]:
     """
-    Fit the sample bags and correct the held-out bag; also return the bag's sample interval [s],
-    true direction of up and gravity [m/s^2].
+    Fit the sample bags and correct the held-out bag; return the raw and corrected samples, the
+    sample interval [s], the true direction of up and gravity [m/s^2].
     """
     bags, held_out = sorted((BAGS / 'fit').glob('*.mcap')), BAGS / 'held_out.mcap'
     full = tc.fit(bags, gravity=9.80665)
@@ -180,7 +179,7 @@ def models() -> tuple[dict[str, Model], float, Floats, float]:
     bias = np.array([axis.bias for axis in axes])
     scale = np.array([axis.scale_factor for axis in axes])
     raw = (recording.counts - bias) / scale @ np.array(full.misalignment).T
-    # Raw data have no stated uncertainty, so the filter uses that of the compensated data.
+    # Raw samples have no claimed sd: the filter uses the sd of the compensated samples.
     ours = collected['compensated']
     truth = json.loads(inspect_recording(held_out).metadata['truth'])
     return (

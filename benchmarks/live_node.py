@@ -4,7 +4,8 @@
 Runs the live node in this process, without loss of messages, and records its output.
 
 The demonstration, tests and benchmarks use this module. As in a bag written by `replay`, the log
-time of an Imu is its stamp, and the log time of any other output the newest Imu stamp before it.
+time of an Imu message is its stamp, and the log time of any other message the newest Imu stamp
+before this message.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from thermo_comp.ros.waitloop import WaitLoop, separate_node, wait_until
 from thermo_comp.topics import FLAGS, IMU_OUT, OUTPUTS, SAMPLES, thermometer
 from thermo_comp.unit.calibration_file import load_calibration
 
-#: Largest number of samples that the node may be behind the player; its middleware holds 5000.
+#: Largest number of samples that the node may be behind the player; the middleware holds 5000.
 IN_FLIGHT = 2000
 #: Time limit for discovery, and for the last messages [s]: Fast DDS sends a lost message again
 #: after 3 s, on a busy machine several times.
@@ -58,7 +59,7 @@ def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
 
 
 def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
-    """Return ROS arguments under which a node loses no message, at the price of latency."""
+    """Return ROS arguments with which a node loses no message, but has a larger latency."""
     inputs = [*(sample.name for sample in SAMPLES.values()), *map(thermometer, thermometers)]
     overrides = [
         *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
@@ -92,7 +93,7 @@ class Recorder:
         return self
 
     def __exit__(self, *raised: object) -> None:
-        """Stop recording; write the bag, or drop the bag after an error."""
+        """Stop recording; write the bag, unless an exception was raised."""
         self._stack.close()
         if raised[0] is not None:
             self._writer.abort()
@@ -118,7 +119,7 @@ class Recorder:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of messages received so far, by relative topic name."""
+        """Return the number of messages received so far by relative topic name."""
         counts = dict.fromkeys((topic.name for topic in OUTPUTS), 0)
         for name, messages in self._received:
             counts[name] += len(messages)
@@ -145,8 +146,8 @@ def through_the_node(
     """
     Play a bag into the node and record the output of the node, without loss.
 
-    Returns the player's report and the number of recorded messages by topic. Differences to a
-    robot: the QoS is reliable with unlimited depth, and the player waits for the node.
+    Returns the player's report and the number of recorded messages by topic. Unlike on a robot,
+    the QoS is reliable with unlimited depth, and the player waits for the node.
     """
     namespace = f'/demo_{os.getpid()}'
     ros_args = ['-r', f'__ns:={namespace}', '-r', f'/diagnostics:={namespace}/diagnostics']
@@ -190,6 +191,6 @@ def through_the_node(
             return n_in == n_sent and [*recorder.counts.values()] == [n_out, n_flags, n_flags]
 
         wait_until(is_complete, PATIENCE_S)
-    # The node counts samples and flags, but no readings: the flag of a reading after the last
-    # sample may arrive until the recorder is closed.
+    # The node does not count temperature readings: the flag of a reading after the last sample may
+    # arrive until the recorder is closed.
     return played, recorder.counts

@@ -5,17 +5,17 @@ Measures the node against a naive relay: CPU time per sample, loss and latency, 
 
     python benchmarks/node_relay.py [--quick] [--floor] [--core 1] [--sleep] [--rates 400]
 
-For each rate and reliability a source process publishes stamped samples at that rate and both
+For each rate and reliability a source process publishes stamped samples at this rate and both
 temperatures at 10 Hz, and a sink process receives the Imu messages. Between source and sink runs
-either the node, with everything on, or the naive relay: an rclpy node that copies Vector3Stamped
+either the node, with all functions, or the naive relay: an rclpy node that copies Vector3Stamped
 to Imu in a callback. The CPU time is that of all threads of the relay process, from the first
 sample to the last. The latency is the time from the source's publish call to the arrival in the
-sink's middleware, before any Python of the sink. Ratios of the node to the naive relay hold on
-other machines, times do not. The node uses its profile for Fast DDS; source, sink and naive relay
-use the default profile. At the last rate the node is measured once more while its
-`calibration_file` is set twice a second. `--core` binds each relay to a core. `--floor` measures
-a third relay, too, which copies bytes with one wait set, one subscription and the node's profile,
-and computes nothing.
+sink's middleware, before any Python code of the sink runs. Ratios of the node to the naive relay
+hold on other machines, times do not. The node uses its profile for Fast DDS; source, sink and
+naive relay use the default profile. At the last rate the node is measured once more while the
+parameter `calibration_file` is set twice a second. `--core` binds each relay to a core. `--floor`
+also measures a third relay, which copies bytes with a wait set, a subscription and the node's
+profile, and computes nothing.
 
 The source keeps `--depth` samples to send lost samples again. With a reliable relay Fast DDS
 removes samples from the source's store 859 at a time; with 2000 kept samples the removal delays
@@ -26,11 +26,11 @@ announcements, 3 s later. A process that opens another's shared memory may stand
 of a second, as Fast DDS waits for a reader. The measurement begins when all processes have been
 discovered.
 
-An idle core sleeps and needs time to wake up, and an idle virtual core may be given away. If the
-system allows it (Linux, as root) all cores are kept awake for all relays alike, by a request for
-no latency in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the cores may sleep. The host
-may stop a virtual machine with all its processes. The share of stolen time is at the end of each
-row ("stolen"): latencies are meaningful if it is small.
+An idle core sleeps and needs time to wake up, and the host may use an idle virtual core for other
+machines. If the system allows it (Linux, as root) all cores are kept awake for all relays alike,
+by a request for no latency in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the cores may
+sleep. The host may stop a virtual machine with all its processes. The share of stolen time is at
+the end of each row ("stolen"): latencies are meaningful if this share is small.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 
 
 def main() -> None:
-    """Run all cases."""
+    """Run all combinations of rate, reliability and relay."""
     arguments = _arguments()
     os.environ['ROS_DOMAIN_ID'] = str(81 + os.getpid() % 21)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -179,7 +179,7 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     """
-    Divide each run's CPU time by the naive relay's in the run before; return the median ratio.
+    Divide each run's CPU time by that of the naive relay in the run before; return the median.
 
     The speed of a machine changes over minutes by more than the differences to be measured.
     """
@@ -207,9 +207,7 @@ def _expect(process: subprocess.Popen[str], word: str) -> None:
 
 @contextmanager
 def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
-    """
-    Keep the cores awake as long as the context is open; yield whether the system allows it.
-    """
+    """Keep the cores awake while the context is open; yield whether the system allows this."""
     with ExitStack() as stack:
         asked = False
         if not may_sleep:
@@ -242,9 +240,7 @@ def _process(role: str, options: list[str]) -> Iterator[subprocess.Popen[str]]:
 
 
 def _cpu_time(pid: int) -> float:
-    """
-    Return the CPU time of another process with all threads [ns] (Linux: clock_getcpuclockid).
-    """
+    """Return the CPU time of all threads of a process [ns] (Linux: clock_getcpuclockid)."""
     return time.clock_gettime((~pid << 3) | 2)
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/beyond_1g.md: nonlinear terms from centrifuge runs, against their truth.
+Owns the figures of docs/beyond_1g.md: fitted nonlinear terms from centrifuge runs against truth.
 
 Run ``python benchmarks/nonlinearity.py``, or with fewer units: ``--units 4``. The runs come from
 a generator in this file, not from `thermo_comp.simulation`. A test has 12 mountings, each in three
@@ -33,9 +33,9 @@ from thermo_comp.unit.calibration import Calibration, parameter_layout
 G = 9.80665
 MICRO = 1e-6 * G
 LEVELS_G = (2.0, 4.0, 7.0, 10.0)
-#: Temperatures of the soaks [degC], length of each and of the ramps between them [s].
+#: Temperatures of the soaks [degC], duration of a soak and of a ramp between soaks [s].
 SOAKS_C, SOAK_S, RAMP_S = (20.0, 35.0, 5.0), 2700.0, 900.0
-#: Time for settling before a centrifuge run in a soak, length of each level, of a spin-up [s].
+#: Times in a soak [s]: settling before the centrifuge runs, each level of |f|, each spin-up.
 SETTLE_S, LEVEL_S, SPIN_UP_S = 1500.0, 240.0, 30.0
 FORCE_SD = 1e-6
 NOISE = 5.0 * MICRO
@@ -45,7 +45,7 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 @dataclass(frozen=True)
 class Unit:
-    """True constants of a unit for x, y, z; K2 [g/g^2], K3 [g/g^3] change by a `share` per K."""
+    """True constants of a unit; K2 [g/g^2] and K3 [g/g^3] change by the factor `share` per K."""
 
     scale: Floats
     scale_slope: Floats
@@ -82,7 +82,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Run:
-    """A run: its samples and readings, the true force, and the stated |f|."""
+    """A centrifuge run: samples and readings, true force, and stated |f|."""
 
     block: Block
     force: Floats
@@ -93,7 +93,7 @@ class Run:
 def run(
     unit: Unit, inward: Floats, rng: np.random.Generator, levels: tuple[float, ...] = LEVELS_G
 ) -> Run:
-    """Simulate a centrifuge run of one mounting: in each soak 1 g, then the levels of |f|."""
+    """Simulate a centrifuge run of a mounting: in each soak 1 g, then the levels of |f|."""
     knots, air = [0.0], [SOAKS_C[0]]
     for last, target in zip((SOAKS_C[0], *SOAKS_C), (*SOAKS_C, SOAKS_C[-1]), strict=False):
         if target != last:
@@ -154,19 +154,19 @@ def mountings(rng: np.random.Generator) -> Floats:
 def fitted(runs: list[Run], **options: float) -> Calibration:
     """Fit the runs of one unit."""
     sources = [
-        FitSource(f'run{k}', lambda one=one: [one.block], force=one.stated)
-        for k, one in enumerate(runs)
+        FitSource(f'run{k}', lambda record=record: [record.block], force=record.stated)
+        for k, record in enumerate(runs)
     ]
     wanted = FitOptions(gravity=G, input='m/s^2', full_scale=12.0 * G, **options)
     return fit(sources, wanted).calibration
 
 
-def residual_ug(calibration: Calibration, one: Run, level: float) -> float:
-    """Return the RMS vector error of 60 s means at one |f| [ug]."""
+def residual_ug(calibration: Calibration, record: Run, level: float) -> float:
+    """Return the RMS vector error of means over 60 s at a level of |f| [ug]."""
     compensator = Compensator(calibration, UNCHECKED)
-    corrected = process_block(compensator, one.block)
-    error = corrected.specific_force - one.force[corrected.index]
-    at = one.levels[corrected.index] == level
+    corrected = process_block(compensator, record.block)
+    error = corrected.specific_force - record.force[corrected.index]
+    at = record.levels[corrected.index] == level
     edges = np.flatnonzero(np.diff(np.r_[0, at, 0]))
     means = [
         error[a + k : a + k + 60].mean(axis=0)
@@ -177,7 +177,7 @@ def residual_ug(calibration: Calibration, one: Run, level: float) -> float:
 
 
 def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
-    """Fit a unit; return errors and claimed sd of its terms, and the residual at 5 g."""
+    """Fit a unit; return errors and error / claimed sd of its terms, and the residual at 5 g."""
     rng = np.random.default_rng(seed)
     unit = Unit.drawn(rng, k2, k3)
     runs = [run(unit, inward, rng) for inward in mountings(rng)]
@@ -188,22 +188,24 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
     result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # Repeat the fit with K2 and K3 pinned to 0: do nonlinear terms change bias and scale?
+        # Repeat the fit with K2 and K3 fixed at 0, to see whether bias and scale change.
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])
             for used in (calibration, without)
         ]
-        bias = sd[[one.static for one in layout.bias]] / [a.scale_factor for a in calibration.axes]
+        bias = sd[[curve.static for curve in layout.bias]] / [
+            a.scale_factor for a in calibration.axes
+        ]
         scale = sd[[block.static for block in layout.scale]]
         result['moved'] = (values[0] - values[1]) / np.column_stack((bias, scale))
         return result
-    for k, one in enumerate(nonlinearity.terms):
-        true = {'square': unit.k2, 'cube': unit.k3}.get(one.kind, np.zeros(3))
-        result[one.kind] = (np.array(one.coefficient) - true) / np.abs(true)
-        result[f'{one.kind} ratio'] = (np.array(one.coefficient) - true) / of_terms[:, 0, k]
-        slope = np.array(one.per_kelvin) - unit.share * true
-        result[f'{one.kind} slope ratio'] = slope / of_terms[:, 1, k]
+    for k, term in enumerate(nonlinearity.terms):
+        true = {'square': unit.k2, 'cube': unit.k3}.get(term.kind, np.zeros(3))
+        result[term.kind] = (np.array(term.coefficient) - true) / np.abs(true)
+        result[f'{term.kind} ratio'] = (np.array(term.coefficient) - true) / of_terms[:, 0, k]
+        slope = np.array(term.per_kelvin) - unit.share * true
+        result[f'{term.kind} slope ratio'] = slope / of_terms[:, 1, k]
     # The new mounting is nearly along an axis, where the nonlinear terms are largest.
     direction = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
     new = run(unit, direction / np.linalg.norm(direction), rng, (5.0,))
@@ -232,8 +234,12 @@ def main() -> int:
             f'{name:58} {value:9.3g}   goal {low:g} .. {high:g}   {"met" if is_met else "MISSED"}'
         )
 
-    for seed, one in enumerate(results):
-        print(seed, *one['kinds'], f'before {one["before"][0]:.0f} after {one["after"][0]:.2f} ug')
+    for seed, result in enumerate(results):
+        print(
+            seed,
+            *result['kinds'],
+            f'before {result["before"][0]:.0f} after {result["after"][0]:.2f} ug',
+        )
     for kind in ('square', 'cube'):
         has = [unit for unit in results if kind in unit]
         say(f'{kind}: share of units that have it', len(has) / len(results), 1.0, 1.0)
@@ -245,12 +251,13 @@ def main() -> int:
             say(f'{name}: RMS error / claim', float(np.sqrt(np.mean(ratio**2))), 0.7, 1.4)
     say(
         'all terms are square and cube',
-        float(all(len(one['kinds']) == 2 for one in results)),
+        float(all(len(result['kinds']) == 2 for result in results)),
         1,
         1,
     )
     rms = {
-        k: float(np.sqrt(np.mean([one[k] ** 2 for one in results]))) for k in ('before', 'after')
+        k: float(np.sqrt(np.mean([result[k] ** 2 for result in results])))
+        for k in ('before', 'after')
     }
     say('5 g in a new mounting without the terms, RMS [ug]', rms['before'], 200.0, 700.0)
     say('5 g in a new mounting, RMS [ug]', rms['after'], 0.0, 3.0)

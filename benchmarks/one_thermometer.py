@@ -30,7 +30,7 @@ MICRO_G = 9.80665e-6
 
 
 def command(*arguments: object) -> dict[str, Any]:
-    """Run a command and return its JSON; exit code 1, a verdict, is accepted."""
+    """Run a command and return its JSON output; exit code 1, for a bad verdict, is accepted."""
     line = [sys.executable, '-m', 'thermo_comp', *map(str, arguments), '--json']
     done = subprocess.run(line, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode not in {0, 1} or not done.stdout:
@@ -40,7 +40,7 @@ def command(*arguments: object) -> dict[str, Any]:
 
 
 def without_case(bag: Path, target: Path) -> Path:
-    """Copy samples and board temperatures only."""
+    """Copy a bag without the case temperature."""
     recording = read_recording(bag, require=('accel', 'board'))
     columns, board = recording.columns, recording.columns.temperatures['board']
     with BagWriter(target, metadata=dict(recording.info.metadata)) as writer:
@@ -53,7 +53,7 @@ def without_case(bag: Path, target: Path) -> Path:
 
 
 def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the bags of a fit and the held-out bags; simulated, except for the sample unit's."""
+    """Return the bags of a fit and held-out bags: sample bags, or simulated bags."""
     if unit == 'sample':
         return sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), [ROOT / 'bags' / 'held_out.mcap']
     common = ('simulate', '--unit', unit, '--rate-hz', RATE_HZ)
@@ -78,10 +78,10 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             bags, held = bags_of(unit, folder)
-            ones = folder / 'one'
-            ones.mkdir()
-            alone = [without_case(bag, ones / f'{bag.stem}.mcap') for bag in bags]
-            held_alone = [without_case(bag, ones / f'held_{bag.stem}.mcap') for bag in held]
+            board_only = folder / 'one'
+            board_only.mkdir()
+            alone = [without_case(bag, board_only / f'{bag.stem}.mcap') for bag in bags]
+            held_alone = [without_case(bag, board_only / f'held_{bag.stem}.mcap') for bag in held]
             two = left(bags, held, folder / 'two.yaml', *UNITS[unit])
             board = left(alone, held_alone, folder / 'one.yaml', *UNITS[unit])
             values = (two['raw_rms'], two['rms'], board['rms'])

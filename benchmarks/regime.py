@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/regime.md: the detector over ramps and soaks, in one run.
+Owns the figures of docs/regime.md: the regime detector in simulated ramps and soaks.
 
-Closed-form responses of a case (first-order lag) and a board (a second lag behind it) to a
-chamber's ramp, with the chamber's ripple and a self-heating drift, are read by sensors of several
-noises, quanta and rates. The detector has its default settings. All runs are seeded: the command
-always prints the same figures.
+A chamber's ramp, with ripple of the chamber and a self-heating drift, changes the temperatures of
+a case (first-order lag) and of a board (second lag, behind the case). Sensors of several noises,
+quanta and rates read these temperatures. The detector has its default settings. All runs are
+seeded: the command always prints the same figures.
 
     python benchmarks/regime.py --quick            # seconds
     python benchmarks/regime.py --workers 2        # some minutes
@@ -44,7 +44,7 @@ def quantiles(delays: list[float]) -> tuple[float, float]:
 
 
 def cost_table() -> Rows:
-    """Cost of a reading, and of the smallest numpy call for comparison."""
+    """Return the rows of CPU times of a reading, compared with a numpy call on a scalar."""
     measured = cost()
     unit = measured['numpy scalar call']
     rows = [['per reading', 'CPU us', 'numpy scalar calls']]
@@ -63,7 +63,7 @@ def table(title: str, rows: Rows) -> None:
 
 
 def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
-    """Return onset delays [s] by sensor, and those of a CUSUM test that knows the ramp."""
+    """Return rows of onset delays [s] by sensor: detector, and CUSUM test that knows the ramp."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, n, seed, rippled) for scene in scenes for rippled in (False, True)]
@@ -125,7 +125,7 @@ def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
 def run_matrix(
     pool: Pool, is_quick: bool, seed: int, rates: Sequence[float], n_ramps: int | None
 ) -> Matrix:
-    """Run the detector over all scenes."""
+    """Run the detector of the dynamic regime over all simulated scenes."""
     ramps = (0.1, 0.5, 3.0) if is_quick else (0.1, 0.2, 0.5, 1.0, 3.0)
     lags = (180.0, 900.0) if is_quick else (180.0, 900.0, 1200.0)
     jobs: list[Job] = [
@@ -161,7 +161,7 @@ def rate_table(matrix: Matrix) -> Rows:
 
 
 def scene_table(matrix: Matrix, lag: float) -> Rows:
-    """Median delay and flagged share in each scene of one lag."""
+    """Return rows of median delay and flagged share of the ramp, in each scene with a lag."""
     rows = [['sensor', 'Hz', 'K/min', 'median, s', 'share flagged']]
     for scene, result in matrix:
         if scene.lag_s == lag:
@@ -172,7 +172,7 @@ def scene_table(matrix: Matrix, lag: float) -> Rows:
 
 
 def draw_ramp(seed: int, folder: Path) -> None:
-    """Draw the temperatures of one ramp, and the regime flag."""
+    """Draw the temperatures of a ramp, and the regime flag."""
     scene = Scene(0.5, 900.0, 0.01, 0.0, 1.0)
     rng = rng_of(seed, 11, scene)
     t = np.arange(-2700.0, 10800.0)
@@ -187,7 +187,7 @@ Tables = Iterator[tuple[str, Rows]]
 def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
     """Measure the onset delays for ramps of 0.5 K/min behind a lag of 15 min."""
     rows = onset_table(pool, arguments.quick, arguments.seed)
-    yield 'Onset of 0.5 K/min behind 15 min at 1 Hz', rows
+    yield 'Onset of a ramp of 0.5 K/min behind a lag of 15 min, 1 Hz', rows
 
 
 def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
@@ -197,7 +197,7 @@ def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
 
 
 def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:
-    """Run the detector over all scenes."""
+    """Yield tables of the detector's results over all simulated scenes."""
     rates = arguments.rates or ((1.0, 0.1) if arguments.quick else tuple(RAMPS))
     matrix = run_matrix(pool, arguments.quick, arguments.seed, rates, arguments.ramps)
     yield 'Ramps by rate of the readings', rate_table(matrix)

@@ -19,13 +19,13 @@ from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
 from thermo_comp.thermal.thermometer import Thermometer
 from thermo_comp.typing import Bools, Floats
 
-#: Scene, number of ramps, seed, whether there are ripple and self-heating.
+#: Arguments of `run_ramps`: scene, number of ramps, seed, whether with ripple and self-heating.
 Job = tuple[Scene, int, int, bool]
 
 
 @dataclass
 class Outcome:
-    """Result of the detector for the ramps of one scene."""
+    """Result of the detector for the ramps of a scene."""
 
     delays: list[float]
     missed: int
@@ -43,7 +43,7 @@ def settings(scene: Scene) -> DetectorSettings:
 
 
 def rng_of(seed: int, purpose: int, scene: Scene) -> np.random.Generator:
-    """Make the generator of one scene, independent of the order of scenes."""
+    """Return the random generator of a scene, whatever the order of scenes."""
     return np.random.default_rng([seed, purpose, *(round(1e6 * v) for v in vars(scene).values())])
 
 
@@ -86,7 +86,7 @@ def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
 
 
 def run_ramps(job: Job) -> tuple[Scene, Outcome]:
-    """Run the package's detector over ramps of one scene."""
+    """Run the detector over ramps of a scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
     # The ramp lasts for four quanta of the sensor and two lags, but 40 min at least, 2 h at most.
@@ -114,7 +114,7 @@ def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
 
 
 def cost() -> dict[str, float]:
-    """CPU microseconds per reading, best of three, and those of one numpy scalar call."""
+    """Return CPU times [us], best of three: per reading, and per numpy call on a scalar."""
     scene = Scene(0.5, 900.0, 0.001, 0.0, 1.0)
     rng = np.random.default_rng(0)
     t = np.arange(-7200.0, 7200.0)
@@ -127,15 +127,16 @@ def cost() -> dict[str, float]:
     value = np.float64(2.0)
     for _ in range(3):
         own = settings(scene)
-        one, other, detector = Thermometer(own.case), Thermometer(own.board), RegimeDetector(own)
+        case_sensor, board_sensor = Thermometer(own.case), Thermometer(own.board)
+        detector = RegimeDetector(own)
         begin = time.process_time()
         for k, reading in enumerate(board):
-            other.update(k * 10**9, reading)
+            board_sensor.update(k * 10**9, reading)
         keep('thermometer', begin, len(board))
         begin = time.process_time()
         for k, reading in enumerate(case):
-            one.update(k * 10**9, reading)
-            detector.update(k * 10**9, one, other)
+            case_sensor.update(k * 10**9, reading)
+            detector.update(k * 10**9, case_sensor, board_sensor)
         keep('thermometer + detector', begin, len(case))
         begin = time.process_time()
         for _ in range(100_000):

@@ -19,7 +19,7 @@ SENSORS = ((0.001, 0.0), (0.01, 0.0), (0.001, 0.0625), (0.01, 0.0625), (0.01, 1.
 
 @dataclass(frozen=True)
 class Scene:
-    """One cell of the matrix of runs: a ramp, a lag, a sensor."""
+    """A scene of the benchmark: a ramp, the lag of the case, a sensor."""
 
     ramp_k_min: float
     lag_s: float
@@ -29,19 +29,19 @@ class Scene:
 
     @property
     def sensor(self) -> str:
-        """The sensor in words."""
+        """Noise and quantum of the sensor as text."""
         quantum = f', {1e3 * self.quantum:g} mK steps' if self.quantum else ''
         return f'{1e3 * self.noise_sd:g} mK{quantum}'
 
 
 def first_order(t: Floats, lag: float) -> Floats:
-    """Response of a lag to a unit ramp that starts at 0."""
+    """Return the response of a first-order lag to a ramp of slope 1 that starts at time 0."""
     x = np.maximum(t, 0.0)
     return x - lag * (1.0 - np.exp(-x / lag))
 
 
 def second_order(t: Floats, lag: float, other: float) -> Floats:
-    """Response of two different lags in series to a unit ramp that starts at 0."""
+    """Return the response of two lags in series to a ramp of slope 1 that starts at time 0."""
     x = np.maximum(t, 0.0)
     decay = lag**2 * np.exp(-x / lag) - other**2 * np.exp(-x / other)
     return x - lag - other + decay / (lag - other)
@@ -50,7 +50,7 @@ def second_order(t: Floats, lag: float, other: float) -> Floats:
 def temperatures(
     scene: Scene, t: Floats, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
 ) -> tuple[Floats, Floats]:
-    """Return case and board temperatures for a ramp from 0 to `duration`; 0: no ramp."""
+    """Return case and board temperatures in a ramp from time 0 to `duration`, or in a soak."""
     rate = scene.ramp_k_min / 60.0 * rng.choice((-1.0, 1.0))
     start = 20.0 + rng.uniform(-0.5, 0.5) * max(scene.quantum, 0.1)
     board_lag = BOARD_LAG_S if abs(BOARD_LAG_S - scene.lag_s) > 1.0 else 1.01 * scene.lag_s
@@ -88,8 +88,8 @@ def known_signature_delays(
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz
     bend = scene.ramp_k_min / 60.0 / scene.lag_s
-    # An onset accumulates 4.5 sigma within half of `longest` readings, and is detected reliably
-    # within `longest` readings.
+    # Half of `longest` readings of a ramp have a signal of 4.5 sigma, so that `longest` readings
+    # detect the ramp reliably.
     longest = round(2.0 * (20.0 * dt * (4.5 * scene.noise_sd / bend) ** 2) ** 0.2 / dt)
     signature = scene.ramp_k_min / 60.0 * first_order(np.arange(1, longest + 1) * dt, scene.lag_s)
 

@@ -25,7 +25,7 @@ from typing import Any
 
 RELIABILITIES = ('best_effort', 'reliable')
 DEPTH = 2000
-#: Silence after which the sink ends [s].
+#: Time without a message after which the sink ends [s].
 SILENCE_S = 2.0
 #: Longest wait for the first sample [s].
 PATIENCE_S = 30.0
@@ -34,7 +34,7 @@ SINK_REST_S = 2e-3
 
 COUNTS = struct.Struct('<4siII7s5x3d')
 ENCAPSULATION = b'\0\1\0\0'
-#: The frame_id passes through any relay and marks the samples that are counted.
+#: frame_id of the samples that are counted; every relay passes the frame_id on.
 WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 
@@ -70,7 +70,7 @@ def _source(arguments: argparse.Namespace) -> None:
 
     def publish(index: int, frame: bytes) -> None:
         sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
-        # A unit at rest with a count or two of noise, as the node rejects constant samples.
+        # Samples of a unit at rest, with noise of some counts, as the node rejects equal samples.
         x, y, z = 5.0 + index % 3, -3.0 + index % 2, 2950.0 + index % 5
         counts.publish(COUNTS.pack(ENCAPSULATION, sec, nanosec, 7, frame, x, y, z))
 
@@ -100,11 +100,11 @@ def _source(arguments: argparse.Namespace) -> None:
 
 def _sink(arguments: argparse.Namespace) -> None:
     """
-    Receive Imu messages until all have arrived or none comes; print number and latency
-    percentiles.
+    Receive Imu messages until all have arrived or no more come; print the number of messages and
+    percentiles of the latency.
 
-    The middleware stores when each message arrived, so messages may wait in the sink; a sink that
-    wakes up for each message would disturb the relay.
+    The middleware stores the time of arrival of each message, so messages may wait in the sink; a
+    sink that wakes up for each message would disturb the relay.
     """
     import numpy as np
     import rclpy
@@ -144,7 +144,7 @@ def _sink(arguments: argparse.Namespace) -> None:
 
 
 def _naive(arguments: argparse.Namespace) -> None:
-    """Copy Vector3Stamped to Imu as in the ROS tutorials."""
+    """Copy Vector3Stamped to Imu in a callback, as in the ROS tutorials."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.executors import ExternalShutdownException
@@ -184,8 +184,7 @@ def _floor(arguments: argparse.Namespace) -> None:
         Vector3Stamped, 'accel/counts', print, _qos(arguments.reliability), raw=True
     )
     take, publish = subscription.handle.take_message, publisher.handle.publish_raw
-    # The frame_ids of warm-up and counted samples have the same length, so the values are always
-    # the end of a message.
+    # All frame_ids have the same length, so the values have the same place in every message.
     head, frame = COUNTS.size - 24, bytearray(COUNTS.size - 24 + 37 * 8)
     with subscription.handle, node.context.handle:
         wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
@@ -200,7 +199,7 @@ def _floor(arguments: argparse.Namespace) -> None:
 
 
 def _node(arguments: argparse.Namespace) -> None:
-    """Run the real node."""
+    """Run the node of thermo_comp."""
     from thermo_comp.ros.node import main as run_node
 
     overrides = [
@@ -213,8 +212,8 @@ def _node(arguments: argparse.Namespace) -> None:
 
 def _reloader(arguments: argparse.Namespace) -> None:
     """
-    Set `calibration_file` repeatedly, to the calibration and to the largest file that is read
-    completely and refused; print the time of each answer.
+    Set `calibration_file` again and again, to the calibration and to the largest file that the
+    node reads before it refuses the file; print the time of each answer.
     """
     import rclpy
     from rcl_interfaces.srv import SetParameters
@@ -256,7 +255,7 @@ ROLES = {
 
 
 def main() -> None:
-    """Run one role."""
+    """Run the process with the given role."""
     parser = argparse.ArgumentParser(description='One process of node_relay.py.')
     parser.add_argument('role', choices=tuple(ROLES))
     parser.add_argument('--rate', type=int, required=True)

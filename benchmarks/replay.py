@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the measurement of the offline run: reading, compensating and writing a bag, in one run.
+Owns the measurement of `replay`: reading, compensating and writing bags, by thermo_comp and
+rosbags.
 
 The library of thermo_comp is measured as `thermo_comp replay` uses it. The peer is a script with
 rosbags that reads and deserializes each message, corrects the message with the same compensator,
@@ -43,7 +44,7 @@ BLOCK = 100 * RATE_HZ
 
 
 def calibration() -> Calibration:
-    """Return the example unit, converting at the bags' rate."""
+    """Return the example calibration with the sample rate of the bags."""
     value = load_calibration(CALIBRATION)
     return replace(value, unit=replace(value.unit, cycle_time_s=1.0 / RATE_HZ))
 
@@ -80,7 +81,7 @@ def read_and_compensate(path: Path) -> int:
 
 
 def compensate(path: Path) -> tuple[int, float]:
-    """Correct a bag's columns; return the number of samples and the correction's CPU time [s]."""
+    """Correct the columns of a bag; return number of samples and CPU time of correcting [s]."""
     compensator = Compensator(calibration())
     spent = 0.0
     n = 0
@@ -142,7 +143,7 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
 
 
 def seconds(run: Callable[[], object], repeats: int = 1) -> tuple[float, float]:
-    """Measure the best wall time and the best CPU time (all threads) of some repeats."""
+    """Return the smallest wall time and CPU time of all threads over some repeats [s]."""
     wall = cpu = float('inf')
     for _ in range(repeats):
         begin, begin_cpu = time.perf_counter(), time.process_time()

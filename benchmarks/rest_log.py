@@ -7,9 +7,9 @@ log.
     python benchmarks/rest_log.py [--rates 400 1000 10000] [--seconds 60]
 
 The node runs in this process, source and sink of samples in two others; the rest log is on in even
-seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because a shared
-machine changes its pace. The latency runs from the source's publish call to the arrival in the
-sink's middleware. A block of samples that is summed delays the next sample by at most the wall
+seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because the speed
+of a shared machine changes. The latency is the time from the source's publish call to the arrival
+in the sink's middleware. Summing a block of samples delays the next sample by at most the wall
 time of the sum, which is printed.
 """
 
@@ -45,7 +45,7 @@ from thermo_comp.typing import Floats
 def cost(
     node: CompensationNode, relay: Relay, keeper: RestKeeper, seconds: int
 ) -> tuple[list[float], list[float]]:
-    """Return CPU time per sample [us] of seconds with the rest log, and without."""
+    """Return the CPU time per sample [us] in each second with the rest log, and without."""
     found: tuple[list[float], list[float]] = ([], [])
     time.sleep(2.0 - time.time() % 2.0)
     for _ in range(seconds):
@@ -91,7 +91,7 @@ def measure(rate: int, seconds: int, folder: Path) -> None:
         _process('sink', options) as sink,
         _process('source', options) as source,
     ):
-        relay = node._relay  # noqa: SLF001 - the log can be switched on at start only
+        relay = node._relay  # noqa: SLF001 - users can switch the log on at start only
         keeper = relay.rests
         keeper.__class__ = Timed
         _expect(sink, 'ready')
@@ -115,14 +115,14 @@ def _compared(with_log: Floats, without: Floats, unit: str) -> str:
     """Describe the difference between neighbouring seconds and its standard error."""
     n = min(len(with_log), len(without))
     more, usual = with_log[:n] - without[:n], float(np.median(without))
-    # Use the median: a second in which the host stops the machine has a large latency.
+    # The median excludes seconds with large latencies, in which the host stops the machine.
     sd = 1.2533 * 1.4826 * float(np.median(np.abs(more - np.median(more)))) / np.sqrt(n)
     change = float(np.median(more))
     return f'{usual:.3g} {unit} without, {change / usual:+.1%} +- {sd / usual:.1%} with the log'
 
 
 def main() -> None:
-    """Measure the node at each sample rate."""
+    """Measure the node with and without the rest log at each sample rate."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--rates', type=int, nargs='+', default=(400, 1000, 10000))
     parser.add_argument('--seconds', type=int, default=60)

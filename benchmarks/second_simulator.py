@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a second simulator without code of the package, for fits of physics that the package lacks.
+Owns a second simulator, which shares no code with thermo_comp, of physics that the fit lacks.
 
 Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md, or a part of it:
 ``python benchmarks/second_simulator.py --kinds own,even --plans wide --seeds 1``.
 
-Air, case, board, three heads and their pendulums are nodes of one ODE network, integrated in steps
-of 2 s; the board's own heat makes it warmer than the case. Bias and scale are functions of the
-pendulums' temperatures. Samples come at 1 Hz with 5 ug of noise, thermometers at 0.5 Hz with 5 mK.
-Three runs are held out, with attitudes, ramps, order of ramps and temperature of the first soak
-other than in the runs of the fit.
+Air, case, board, three heads and their pendulums are nodes of a thermal network, integrated in
+steps of 2 s; by self-heating the board is warmer than the case. Bias and scale are functions of
+the pendulums' temperatures. Samples have 1 Hz and 5 ug of noise, readings of thermometers 0.5 Hz
+and 5 mK. Three runs are held out, with attitudes, ramps, order of ramps and temperature of the
+first soak other than in the runs of the fit.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ KINDS = ('own', 'products', 'hyst', 'hystm', 'even', 'convection', 'slow', 'plai
 
 
 def seed_of(text: str) -> int:
-    """Make a seed from a name."""
+    """Return a seed for random numbers that follows from a text."""
     return int(hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()[:12], 16)
 
 
@@ -131,7 +131,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
 
 
 def directions(n: int, seed: int) -> Floats:
-    """Spread attitudes over the sphere, rotated as a whole by the seed."""
+    """Return attitudes spread over the sphere, in a frame that depends on the seed."""
     k = np.arange(n) + 0.5
     polar, around = np.arccos(1.0 - 2.0 * k / n), np.pi * (1.0 + 5.0**0.5) * k
     spiral = np.c_[np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)]
@@ -140,7 +140,7 @@ def directions(n: int, seed: int) -> Floats:
 
 
 def program_of(program: Program) -> tuple[Floats, Floats]:
-    """Return the corners of a chamber's program: seconds and degC."""
+    """Return times [s] and temperatures [degC] of the corners of a chamber program."""
     start, first_min, ramps = program
     corners = [(0.0, start), (60.0 * first_min, start)]
     for target, rate, soak_min in ramps:
@@ -273,7 +273,7 @@ def plan_of(kind: str, seed: int, plan: str) -> tuple[list[Any], list[Any]]:
 
 
 def floor_of(tests: Sequence[Any]) -> tuple[float, float]:
-    """Return the noise of one-minute means: of |f|, and of the vector [ug]."""
+    """Return the noise of means over a minute, of |f| and of the vector [ug]."""
     means = [test.noise[: len(test.noise) // 60 * 60].reshape(-1, 60, 3).mean(1) for test in tests]
     norms = [
         mean @ test.truth.specific_force / STANDARD_GRAVITY
@@ -286,7 +286,7 @@ def floor_of(tests: Sequence[Any]) -> tuple[float, float]:
 
 
 def main() -> int:
-    """Print a row for each plan, kind and seed asked for."""
+    """Print a row for each selected plan, kind and seed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Soaks the node: hours at full rate with reloads and regime changes; every sample is accounted for.
+Tests the node for hours at full rate with reloads and regime changes, and counts every sample.
 
     python benchmarks/soak.py [--minutes 60] [--rate 2000] [--json FILE]
 
@@ -9,8 +9,8 @@ The node runs in a separate process, with settings under which no message is los
 ramp up, rest, ramp down and rest every three minutes, so the regime changes; `calibration_file` is
 set every two seconds. The resident memory of the node is read every second, the latency of the
 samples (from before the publish call to after the take) every ten seconds. The slopes of memory
-and latency are least squares over the run without its first tenth, with the standard error of
-independent windows of a minute. The exit code is 1 if a sample is missing.
+and latency are fitted by least squares, without the first tenth of the run, with standard errors
+from means over a minute. The exit code is 1 if a sample is missing.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ TIMEOUT_S = 30.0
 
 
 class Temperatures:
-    """Case and board temperature, step by step."""
+    """Simulates case and board temperature step by step."""
 
     def __init__(self) -> None:
         self.case = self.board = 20.0
@@ -66,7 +66,7 @@ class Temperatures:
 
 
 class Soak:
-    """The peer of the node: driver, INS and operator."""
+    """Plays driver, INS and operator for the node, and counts messages."""
 
     def __init__(self, node: Any, context: Any, rate: int) -> None:
         import rclpy
@@ -84,7 +84,7 @@ class Soak:
         self.process = node
         self.rate = rate
         self.node = rclpy.create_node('soak', context=context)
-        # The client has a node of its own, as the loop that takes samples does not serve clients.
+        # The client has another node, as the loop that takes samples does not serve clients.
         self._operator = rclpy.create_node('operator', context=context)
         self.client = self._operator.create_client(SetParameters, 'thermo_comp/set_parameters')
         self._executor = SingleThreadedExecutor(context=context)
@@ -114,7 +114,7 @@ class Soak:
         self._thread.start()
 
     def close(self) -> None:
-        """Leave the middleware."""
+        """Close node, client and subscriptions."""
         self._loop.stop()
         self._thread.join(TIMEOUT_S)
         self._executor.shutdown()
@@ -166,7 +166,7 @@ class Soak:
                 raise SystemExit(f'{what} did not come; {self.account}; {self.process.said}')
 
     def meet(self) -> None:
-        """Publish samples until the node returns the first sample; count from this sample on."""
+        """Publish samples until the node returns a sample; count the samples from then on."""
         deadline = time.monotonic() + TIMEOUT_S
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
@@ -254,8 +254,8 @@ def _resident_kib(pid: int) -> float:
 
 def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, float] | None:
     """
-    Return the slope per hour and its standard error, from means over windows; None if the run is
-    short.
+    Return the slope per hour and the slope's standard error, from means over windows; None for
+    too few windows.
     """
     table = np.array(rows)
     table = table[table[:, 0] >= 0.1 * table[-1, 0]]
@@ -273,8 +273,8 @@ def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, floa
 
 def calibrations(rate: int, folder: Path) -> list[str]:
     """
-    Write two calibrations of the example's unit at a rate, with quick lags, between which the
-    running node switches.
+    Write two calibrations between which the running node switches: the example with another
+    sample rate and short lags.
     """
     from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
     from thermo_comp.unit.calibration_file import load_calibration, save_calibration

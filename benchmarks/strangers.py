@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the accuracy on bags of units that the package has not modelled, beside that of curves fitted
-by scipy.
+Owns the accuracy of fits to bags of units whose physics the package does not model, compared with
+the accuracy of curves that scipy fits.
 
 Run ``python benchmarks/strangers.py`` for every case (many hours), or a part with fewer units:
 ``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A colon
@@ -43,7 +43,7 @@ from thermo_comp.fitting import FitOptions
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.posterior import Posterior
 
-#: Options of the three models that the package fits: the fit itself, and two of the four
+#: Options of the three models that the package fits: the evaluated fit, and two of the four
 #: baselines.
 PACKAGE: dict[str, dict[str, Any]] = {
     'fit': {},
@@ -51,8 +51,8 @@ PACKAGE: dict[str, dict[str, Any]] = {
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
-#: Smallest share of the minutes in which a correction must publish all samples; below 1, because
-#: the node publishes nothing before the first reading of a thermometer.
+#: Smallest share of the minutes of which all samples must be corrected; below 1, because samples
+#: before the first reading of a thermometer are not corrected.
 LEAST_PUBLISHED = 0.98
 #: Cases of recorded bags, each with a single unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
@@ -61,7 +61,7 @@ RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
 @dataclass(frozen=True)
 class Corrected:
     """
-    Corrected means over 60 s of one bag.
+    Corrected means over 60 s of a bag.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Corrected:
     claim : ndarray, shape (w, 3, 3)
         Published covariance of the means [m^2/s^4].
     white : ndarray, shape (3,)
-        The part of the variance that is independent from one mean to the next [m^2/s^4].
+        The part of the variance that is independent between means [m^2/s^4].
 
     """
 
@@ -82,8 +82,8 @@ class Corrected:
 def fitted(
     study: Study, prior: thermo_comp.Calibration | None = None, **model: Any
 ) -> thermo_comp.Calibration:
-    """Fit a study's bags; `model` holds further options of the fit."""
-    # Leave out the option `gravity_sd` for versions of the package that lack this option.
+    """Fit the bags of a study; `model` holds further options of the fit."""
+    # Leave out the option `gravity_sd` for versions of the package without this option.
     known = {option.name for option in fields(FitOptions)}
     options = {name: value for name, value in study.options.items() if name in known}
     if prior is not None:
@@ -105,7 +105,7 @@ def chosen_by(calibration: thermo_comp.Calibration) -> str:
 def corrected(
     calibration: thermo_comp.Calibration, bag: Bag, config: CompensatorConfig | None = None
 ) -> Corrected:
-    """Correct a bag and average the corrected forces over each minute."""
+    """Correct a bag, and average the corrected forces over each minute."""
     known = ('board', *calibration.sensors)
     given = {key: value for key, value in bag.temperatures.items() if key in known}
     out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
@@ -142,8 +142,8 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
     forces = [out.force for out in outs]
     plain = error_of(forces, bags, is_drift=is_drift)
     if is_drift:
-        # The offset of a new mounting cancels in the drift of one pose: subtract the smallest
-        # variance, that at the reference temperature.
+        # The offset of a new mounting cancels in the drift of a pose: subtract the smallest
+        # variance, which is that at the reference temperature.
         variances = [np.diagonal(out.claim, axis1=1, axis2=2) for out in outs]
         sd = np.sqrt(np.concatenate(
             [v - v.min(axis=0) + out.white for v, out in zip(variances, outs, strict=True)]
@@ -179,23 +179,23 @@ def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
 
 
 def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
-    """Fit constants and a cubic per axis by scipy."""
+    """Return the corrections by constants, and by a cubic per axis, which scipy fits."""
     bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
-        # One pose does not determine the scale factors: take the norm of the samples / gravity.
+        # A pose does not determine the scale factors: take the norm of the samples / gravity.
         scale = rms(np.linalg.norm(bags[0].samples, axis=1)) / GRAVITY
         return {name: by_drift(bags, scale, order=order) for name, order in orders.items()}
     return {name: by_norm(bags, study.gravity, order=order) for name, order in orders.items()}
 
 
 def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
-    """Correct an hour at the reference temperature and zero force: the result is the error."""
+    """Correct an hour at the reference temperature and zero force: this gives the bias error."""
     assert study.bound is not None
     unit, cycle_s = study.bound.unit, calibration.unit.cycle_time_s
     time_s = cycle_s * np.arange(1.0, 3600.0 / cycle_s)
     zero = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
-    # Readings have noise, as constant readings would be taken for those of a broken thermometer.
+    # Readings have noise, as constant readings are taken for those of a broken thermometer.
     rng, read_s = rng_of('rest'), np.arange(0.0, 3600.0, 5.0)
     rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
     temperatures = {
@@ -207,8 +207,8 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The bound is that of parameters: subtract the claim of a calibration whose parameters have no
-    # errors, that is, the claim for the thermometers' noise and for another turn-on.
+    # The Cramer-Rao bound is that of the parameters: subtract the claimed variance for the noise
+    # of the thermometers and another turn-on, which a calibration without a posterior claims.
     exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
@@ -223,8 +223,8 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
     """
     Return a calibration whose covariance has no constants: bias, scale and misalignment.
 
-    One pose determines the constants to 50 mg only. The drift of one pose does not contain the
-    constants, but the difference of two claimed variances does: an acceleration `a`, which has
+    A single pose determines the constants to 50 mg only. The drift in a pose does not depend on
+    the constants, but the difference of two claimed variances does: an acceleration `a`, which has
     noise, contributes ``a^2`` times the variance of the scale factor.
     """
     if calibration.posterior is None:
@@ -313,7 +313,7 @@ def run(
 
 
 def studies_of(case: str, unit: int, path: Path | None) -> Iterator[Study]:
-    """Return the studies of one unit of a case."""
+    """Return the studies of a unit of a case."""
     if case != 'cats':
         return samples(case) if case in RECORDED else CASES[case][0](unit)
     assert path is not None
@@ -336,7 +336,8 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Studies of one label, which leave out different bags, are numbered like units.
+                # Studies with the same label, which leave out different bags, are numbered as
+                # units.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the baselines fitted by scipy to one-minute means, for the benchmark `strangers.py`.
+Owns the baselines that scipy fits to means over a minute, for the benchmark `strangers.py`.
 
-Constants are nine numbers: bias, scale and misalignment. A cubic has in addition to the constants,
-for each axis, a cubic of the bias and a line of the scale over board temperature. Constants and
-cubic are fitted by scipy's least squares on ``|f| - g``.
+The baseline 'constants' has nine numbers: bias, scale and misalignment. The baseline 'cubic' has
+in addition, for each axis, a cubic of the bias and a line of the scale over board temperature.
+Both baselines are fitted by scipy's least squares on ``|f| - g``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from strangers_units import GRAVITY, REFERENCE_C, Bag, Floats
 Ints = npt.NDArray[np.int64]
 
 WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
-#: Largest bias [g], error of the scale and misalignment of a plausible unit. An unbounded fit to
+#: Largest bias [g], relative error of the scale and misalignment [rad]. A fit without bounds to
 #: few attitudes finds scale factors that make the forces of all attitudes equal.
 LARGEST = 0.2
 SPAN_K = (
@@ -48,7 +48,7 @@ def slots(bag: Bag) -> tuple[Ints, Ints]:
 
 
 def means(values: Floats, first: Ints, size: Ints) -> Floats:
-    """Average rows window by window."""
+    """Average the rows of each window."""
     edges = np.stack((first, first + size), axis=1).ravel()
     total = np.add.reduceat(values, edges[edges < len(values)], axis=0)[::2]
     return np.asarray(total / size.reshape(-1, *[1] * (values.ndim - 1)))
@@ -66,7 +66,7 @@ def minutes(bag: Bag) -> Minutes:
 
 
 def _curved(p: Floats, order: int, samples: Floats, board: Floats) -> Floats:
-    """Correct samples in units of g; p: bias, scale, misalignment, then curves of bias, scale."""
+    """Correct samples in g; p: bias, scale, misalignment, then curves of bias and of scale."""
     t = ((board - REFERENCE_C) / SPAN_K)[:, None]
     bias, scale = p[:3], 1.0 + p[3:6]
     if order:
@@ -81,10 +81,10 @@ def _curved(p: Floats, order: int, samples: Floats, board: Floats) -> Floats:
 def by_norm(
     bags: Sequence[Minutes], gravity: float = GRAVITY, *, order: int = 0
 ) -> Callable[[Minutes], Floats]:
-    """Fit constants, with curves of an order above 0, to ``|f| - g``; returns the correction."""
+    """Fit constants, and curves if `order` is above 0, to ``|f| - g``; return the correction."""
     samples = np.concatenate([bag.samples for bag in bags])
     board = np.concatenate([bag.board for bag in bags])
-    # Start with the RMS length of the samples as counts per g; the scale factors refine it.
+    # The RMS norm of the samples is taken as counts per g; the scale factors correct this number.
     size = np.sqrt(np.mean(np.sum(samples**2, axis=1)))
 
     def missed(p: Floats, order: int) -> Floats:
@@ -101,7 +101,7 @@ def by_norm(
 def by_drift(
     bags: Sequence[Minutes], scale: float, *, order: int = 0
 ) -> Callable[[Minutes], Floats]:
-    """Fit a polynomial in board temperature to each axis in one pose; `scale`: units per m/s^2."""
+    """Fit a polynomial in board temperature to each axis in a pose; `scale`: units per m/s^2."""
     t = np.concatenate([bag.board for bag in bags])
     y = np.concatenate([bag.samples for bag in bags]) / scale
     powers = np.vander((t - REFERENCE_C) / SPAN_K, order + 1, increasing=True)

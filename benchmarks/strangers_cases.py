@@ -52,7 +52,7 @@ HELD = (
 )
 FROST = program(5, 10, (12, 0.5, 60), (28, 0.8, 30))
 ROOM = program(21, 20)
-#: The temperatures of the program SHORT end 2 K before those of the programs USE on both sides.
+#: The range of the program SHORT is 2 K smaller than that of the programs USE, at both ends.
 SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
 USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
 #: Programs of the tests of MEMS units, as in a simple oven.
@@ -63,12 +63,12 @@ WARM_HELD = (program(15, 15, (40, 0.8, 40)), program(40, 15, (18, 1.2, 40)))
 @dataclass(frozen=True)
 class Study:
     """
-    Bags for one fit, and held-out bags.
+    Bags for a fit, and held-out bags.
 
     Parameters
     ----------
     label : str
-        Name within the case; empty where the case has one study.
+        Name within the case; empty if the case has a single study.
     bags : tuple of Bag
         Bags of the fit.
     tests : dict of str to tuple of Bag
@@ -80,8 +80,8 @@ class Study:
     prior_of : str
         Label of an earlier study whose calibration is the prior; empty without a prior.
     is_drift : bool
-        Whether the evaluated error is that of each axis less its mean over the bag, as for one
-        pose.
+        Whether the error of each axis less the mean error over the bag is evaluated, as for a
+        single pose.
     baseline_bags : tuple of Bag
         Bags at rest for the curves by scipy; if empty, the bags of the fit are used.
     bound : Bound or None
@@ -103,8 +103,8 @@ class Study:
 @dataclass(frozen=True)
 class Bound:
     """
-    True bias at the reference temperature, and the smallest sd that an unbiased fit may have
-    [m/s^2].
+    True bias at the reference temperature, and the smallest sd of the bias that an unbiased fit
+    can have [m/s^2].
     """
 
     unit: Unit
@@ -129,7 +129,7 @@ def plain(number: int) -> Iterator[Study]:
 
 
 def one_pose(number: int) -> Iterator[Study]:
-    """Record one pose for 9.5 h; the parts lag the board by 500 to 1500 s."""
+    """Record a single pose for 9.5 h; the parts lag the board by 500 to 1500 s."""
     rng = rng_of('one-pose', number)
     unit = navigation(rng)
     up = spread(1, rng)
@@ -150,7 +150,7 @@ def returned(number: int) -> Iterator[Study]:
         for celsius in (-15.0, 22.0, 45.0, 5.0):
             for number_of_pose, up in enumerate(ups, 1):
                 turned = up + np.cross(2e-4 * rng.standard_normal(3), up)
-                # At 10 Hz a sample's noise is as large as a count: means resolve parts of a count.
+                # At 10 Hz the noise of a sample is as large as a count: means resolve fractions.
                 fit += (record(unit, program(celsius, 30), turned / np.linalg.norm(turned), rng,
                                name=f'{celsius:g} degC, pose {number_of_pose}', rate_hz=10.0,
                                is_cold=True),)  # fmt: skip
@@ -190,7 +190,7 @@ def mems(number: int) -> Iterator[Study]:
         for sd in (100, 300, 1000):
             rng = rng_of('mems', n, sd, number)
             unit = consumer_grade(rng)
-            # At 10 Hz a sample's noise is as large as a count, so that rounding leaves no bias.
+            # At 10 Hz the noise of a sample is as large as a count, so rounding leaves no bias.
             fit, held = (
                 positions(
                     unit,
@@ -207,8 +207,8 @@ def mems(number: int) -> Iterator[Study]:
 
 def sessions(number: int) -> Iterator[Study]:
     """
-    Turn a MEMS unit by hand every 8 min in one and in two recordings, each with a turn-on of 0.3
-    mg, fitted jointly or, the second recording, with the first as a prior.
+    Turn a MEMS unit by hand every 8 min in two recordings, each with a turn-on of 0.3 mg. Fit the
+    first recording, both together, and the second with the fit of the first as a prior.
     """
     rng, hold_s, rate_hz = rng_of('sessions', number), 480.0, 10.0
     unit, up = consumer_grade(rng), spread(12, rng)
@@ -220,15 +220,15 @@ def sessions(number: int) -> Iterator[Study]:
     )  # fmt: skip
     shifts = 300.0 * rng.standard_normal((4, 3))
     held = one_test(positions(unit, WARM_HELD, spread(4, rng), rng, shifts, rate_hz=rate_hz))
-    one, two = (rests_of(bag, hold_s) for bag in bags)
+    first, second = (rests_of(bag, hold_s) for bag in bags)
     options = {'full_scale': 32767.0}
-    yield Study('one', bags[:1], held, options, baseline_bags=one)
-    yield Study('two', bags, held, options, baseline_bags=one + two)
+    yield Study('one', bags[:1], held, options, baseline_bags=first)
+    yield Study('two', bags, held, options, baseline_bags=first + second)
     yield Study('update', bags[1:], held, options, prior_of='one')
 
 
 def ageing(number: int) -> Iterator[Study]:
-    """Let the bias walk by 12 ug from bag to bag, beside a turn-on of 15 ug."""
+    """Add a random walk of the bias, 12 ug from bag to bag, and turn-ons of 15 ug."""
     rng = rng_of('ageing', number)
     unit = navigation(rng)
     shifts = 15.0 * rng.standard_normal((16, 3))
@@ -239,7 +239,7 @@ def ageing(number: int) -> Iterator[Study]:
 
 
 def kink(number: int) -> Iterator[Study]:
-    """Change the slope of the bias by 8 to 20 ug/K at one temperature."""
+    """Change the slope of the bias by 8 to 20 ug/K at some temperature."""
     rng = rng_of('kink', number)
     unit = navigation(rng, kink=signed(rng, 8, 20), kink_c=rng.uniform(12, 30))
     fit = positions(unit, HALF, spread(12, rng), rng)
@@ -269,7 +269,7 @@ def bump(number: int) -> Iterator[Study]:
 
 
 def carry(number: int) -> Iterator[Study]:
-    """Step the bias by 50 to 150 ug after half of the bags, as if the unit was carried."""
+    """Change the bias by 50 to 150 ug after half of the bags, as carrying a unit can do."""
     rng = rng_of('carry', number)
     unit = navigation(rng)
     step = signed(rng, 50, 150)
@@ -342,7 +342,7 @@ def coarse_thermometer(number: int) -> Iterator[Study]:
 
 
 def slow_drift(number: int) -> Iterator[Study]:
-    """Let the bias walk in each bag, the support tilt, or a bias of 1 mg decay within 10 min."""
+    """Add a random walk of the bias, tilts of the support, or a bias of 1 mg that decays."""
     for kind, grade, full_scale, rate_hz, ways in (
         ('bias', navigation, 8388607.0, 0.5, (HALF, HELD)),
         ('support', navigation, 8388607.0, 0.5, (HALF, HELD)),
@@ -358,7 +358,7 @@ def slow_drift(number: int) -> Iterator[Study]:
 
 
 def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
-    """Add a walk of the bias, 20 ug per square root of an hour, or tilts of 60 urad in 4 h."""
+    """Add a random walk of the bias, 20 ug per root hour, or slow tilts of 60 urad in 4 h."""
     force = np.ones((len(bag.samples), 1)) * bag.force
     if kind == 'power-on':
         decay = 1e3 * UG * rng_of('decay', unit.bias.tolist()).standard_normal(3)
@@ -374,7 +374,7 @@ def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
 
 
 def flicker(number: int) -> Iterator[Study]:
-    """Give units a bias instability: flicker noise of 3 ug, and of 60 ug in a MEMS unit."""
+    """Add flicker noise (bias instability) of 3 ug, or of 60 ug in a MEMS unit."""
     for label, floor, grade, full_scale, rate_hz in (
         ('navigation', 3.0, navigation, 8388607.0, 0.5),
         ('MEMS', 60.0, consumer_grade, 32767.0, 10.0),
@@ -408,7 +408,7 @@ def third_node(number: int) -> Iterator[Study]:
 
 
 def bench3(number: int) -> Iterator[Study]:
-    """Record 18 positions on a bench, and 3 in a chamber over a range 2 K short of that of use."""
+    """Record 18 positions on a bench, and 3 in a chamber over a range smaller than that of use."""
     rng = rng_of('bench3', number)
     unit = navigation(rng)
     bench = positions(unit, ROOM, spread(18, rng), rng)

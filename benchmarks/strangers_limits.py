@@ -17,12 +17,12 @@ from strangers_units import Floats
 @dataclass(frozen=True)
 class Score:
     """
-    RMS figures of one unit, one model and one set of held-out bags; NaN where undefined.
+    RMS figures of a unit, a model and a set of held-out bags; NaN where undefined.
 
     Parameters
     ----------
     norm, vector : float
-        Error of ``|f| - g``, and length of the error vector (in one pose: drift per axis) [ug].
+        Error of ``|f| - g``, and length of the error vector (for drift: of an axis) [ug].
     norm_ratio, ratio : float
         Error / claimed sd along the norm, and of the three axes together.
     claim : float
@@ -43,16 +43,16 @@ class Score:
 @dataclass(frozen=True)
 class Result:
     """
-    The scores of one unit, one study and one set of held-out bags.
+    The scores of a unit, a study and a set of held-out bags.
 
     Parameters
     ----------
     title : str
         Title of the row: case, study and held-out bags.
     unit : int
-        The unit's number.
+        Number of the unit.
     scores : dict of str to Score
-        By model; a model that refused the bags is absent.
+        Scores by model; a model that refused the bags is absent.
     chosen : str
         Groups that the fit chose, each with its number of columns.
     fit_s : float
@@ -81,7 +81,7 @@ class Limit:
     norm, vector : float
         Largest errors [ug].
     best : float
-        Largest error / smallest error of the baselines, both for norm and for vector.
+        Largest error / smallest error of the baselines, for the norm and for the vector.
     low, high : float
         Smallest and largest RMS over all units of error / claimed sd.
     unit : float
@@ -110,7 +110,7 @@ class Limit:
 _ONE_THERMOMETER = Limit(norm=25.0, low=0.7, high=1.4)
 _REAL_UNIT = Limit(norm=560.0, low=0.7, high=1.4)
 _TURN_ON = Limit(low=0.7, high=1.4, unit=2.0)
-#: Limits of the rows whose title begins with the key; of several such keys the longest applies.
+#: Limits of the rows whose title begins with the key; the longest such key applies.
 LIMITS = {
     'sample-bags': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'no-case': _ONE_THERMOMETER,
@@ -121,13 +121,13 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # The variance at the reference temperature, which `score` subtracts for 'returned', contains
-    # that of a slope: error / claimed sd has no limit.
+    # In 'returned', `score` subtracts the variance at the reference temperature, which contains
+    # the variance of a slope: error / claimed sd has no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
     'mems': _TURN_ON,
-    # One recording does not show how well turn-ons repeat: error / claimed sd has no limit.
+    # A single recording does not show how well turn-ons repeat: error / claimed sd has no limit.
     'sessions one': Limit(high=np.inf),
     'sessions two': Limit(low=0.7, high=1.4),
     # The error after an update is that of the joint fit, within the noise of the sd of turn-ons.

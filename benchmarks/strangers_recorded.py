@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the recorded cases of the benchmark `strangers.py`: the sample bags, with and without the
-case thermometer, and a recording of a real unit, which another package distributes.
+Owns the cases of recorded bags of the benchmark `strangers.py`: the sample bags, with and without
+the case thermometer, and a recording of a real unit, which another package distributes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import thermo_comp
 from thermo_comp.recording.reader import read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Length of the blocks into which the recording of the real unit is cut, and of the means by which
-#: its rests are found [s].
+#: Length of the blocks into which the recording of the real unit is cut, and of the means in which
+#: rests are searched [s].
 BLOCK_S, MINUTE_S = 10800.0, 60
 #: Largest change of the mean from one minute to the next at rest [m/s^2]. When the real unit was
 #: carried from one room to another its bias changed by 0.1 m/s^2 in a minute.
@@ -32,7 +32,7 @@ LEAST_MINUTES = 4
 
 
 def sample_bag(path: Path) -> Bag:
-    """Read one sample bag, whose metadata hold its true attitude."""
+    """Read a sample bag; its metadata hold the true attitude."""
     columns = thermo_comp.read(path)
     truth = json.loads(read_recording(path, None, require=['accel']).info.metadata['truth'])
     force = GRAVITY * np.array(truth['up'])
@@ -60,7 +60,7 @@ def real_unit(path: Path) -> Bag:
     with h5py.File(path) as file:
         force = file['acceleration'][:]
         celsius = file['temperature'][:]
-    # The times of the file are whole seconds since the first sample: use the sample's number.
+    # The times in the file are rounded to whole seconds: use the numbers of the samples.
     time_s = np.arange(1.0, len(force) + 1.0)
     return Bag('cats', time_s, force, {'board': (time_s, celsius)})
 
@@ -80,13 +80,13 @@ def rests_of(bag: Bag) -> list[slice]:
 
 
 def part(bag: Bag, rows: slice, name: str) -> Bag:
-    """Cut rows out of a recording whose thermometers are read beside its samples."""
+    """Cut rows out of a recording in which each sample has readings of the thermometers."""
     temperatures = {key: (t[rows], v[rows]) for key, (t, v) in bag.temperatures.items()}
     return Bag(name, bag.time_s[rows], bag.samples[rows], temperatures)
 
 
 def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
-    """Cut a recording, or one rest of a recording, into blocks by the clock."""
+    """Cut a recording, or a rest of a recording, into blocks on a common grid of time."""
     number = (bag.time_s // BLOCK_S).astype(int)
     edges = np.flatnonzero(np.diff(number, prepend=-1, append=-1)).tolist()
     return {

@@ -3,11 +3,11 @@
 """
 Owns the units and recordings of the benchmark `strangers.py`: physics by numpy and scipy alone.
 
-Case, board, the sensing part of each axis and one hidden node are the nodes of a linear thermal
+Case, board, the sensing part of each axis and a hidden node are the nodes of a linear thermal
 network. The input of the network is the air temperature of the chamber, which is linear in time
 between two steps, so the state at each step is exact. Bias and scale of an axis are functions of
-the temperature of its sensing part. This module shares no code with the package, so an error of
-the package is not an error of the simulated truth.
+the temperature of the axis's sensing part. This module shares no code with the package, so that an
+error of the package is not an error of the simulated truth.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from scipy.signal import lfilter
 Floats = npt.NDArray[np.float64]
 
 GRAVITY = 9.80665  # standard gravity [m/s^2]
-UG = 1e-6 * GRAVITY  # one micro-g [m/s^2]
+UG = 1e-6 * GRAVITY  # a micro-g [m/s^2]
 REFERENCE_C = 20.0  # temperature at which the curves of bias and scale are zero [degC]
 STEP_S = 5.0  # step of the thermal network; the air temperature is linear within a step [s]
-SOAK_S = 5400.0  # time of the unit in the chamber before a recording [s]
+SOAK_S = 5400.0  # time for which the unit is in the chamber before a recording [s]
 CASE, BOARD, PARTS, HIDDEN = 0, 1, slice(2, 5), 5
 
 
@@ -183,7 +183,7 @@ def signed(rng: np.random.Generator, low: float, high: float) -> Floats:
 
 
 def spread(n: int, rng: np.random.Generator) -> Floats:
-    """Choose attitudes, unit vectors (n, 3), each far from all before it, in a random frame."""
+    """Choose unit vectors (n, 3), each far from the earlier vectors, in a random frame."""
     many = rng.standard_normal((2000, 3))
     many /= np.linalg.norm(many, axis=1)[:, None]
     chosen = [many[0], -many[0]][:n]
@@ -209,7 +209,7 @@ def navigation(rng: np.random.Generator, **given: Any) -> Unit:
 
 
 def consumer_grade(rng: np.random.Generator) -> Unit:
-    """Draw a MEMS unit with one thermometer, on the die."""
+    """Draw a MEMS unit with a single thermometer, on the die."""
     return Unit(
         bias=2e4 * rng.standard_normal(3),
         gain=0.01 * rng.standard_normal(3),
@@ -345,7 +345,7 @@ def record(
     states = integrate(A, b, h, air, STEP_S, x)
     n = int(lasts_s * rate_hz)
     stamps = (np.arange(n) + 1.0) / rate_hz
-    # A sample is the mean over its cycle, and has the stamp of the cycle's end.
+    # A sample is the mean over a cycle, and has the stamp of the end of the cycle.
     middle = stamps - 0.5 / rate_hz
     nodes = np.array([np.interp(middle, grid, node) for node in states.T]).T
     parts = np.where(unit.part_s > 0.0, nodes[:, PARTS], nodes[:, [BOARD]])
@@ -438,7 +438,7 @@ def lagged(node: Floats, tau_s: float) -> Floats:
     if not tau_s:
         return node
     decay = np.exp(-STEP_S / tau_s)
-    # Late in a ramp the lagged temperature is behind the node's by rate times `tau_s`.
+    # Late in a ramp the lagged temperature differs from the node's by the rate times `tau_s`.
     gain = tau_s / STEP_S * (1.0 - decay)
     behind = lfilter([gain], [1.0, -decay], np.diff(node, prepend=node[0]))
     return np.asarray(node - behind)

@@ -27,8 +27,8 @@ from thermo_comp.simulation.unit import Stream, SwitchedLoad, UnitModel, generat
 from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G
 
-#: Kinds of triads, each with one kind of physics beside temperature coefficients. The order of
-#: the kinds gives the numbers of their streams of random numbers, from `FIRST_KIND`.
+#: Kinds of triads, each with a kind of physics besides temperature coefficients. The position of a
+#: kind in this list gives the number of its stream of random numbers, from `FIRST_KIND` on.
 TRIAD_NAMES = (
     *('own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load'),
     *('paper', 'slow-noise', 'plain'),
@@ -50,9 +50,9 @@ class LeakageEffect(Effect):
 @dataclass(frozen=True)
 class SlipEffect(Effect):
     """
-    A joint that is strained by a part's temperature and slips; its stress [K of free strain]
-    depends on the path, not the time. The joint slips abruptly at `width` (Jenkins) or gradually
-    towards it (Dahl, Bouc-Wen); it starts relaxed.
+    A joint that the temperature of a part strains, and that slips; the stress [K of free strain]
+    depends on the path, not on the time, and is 0 at the start. The joint slips abruptly at a
+    stress of `width` (Jenkins) or gradually up to this stress (Dahl, Bouc-Wen).
     """
 
     part: str
@@ -82,7 +82,7 @@ def _only(axis: int, value: float) -> Triple:
 def triad(kind: str, seed: int = 0) -> UnitModel:
     """
     Return a triad of bare sensor heads on a board, with temperature coefficients of parts that
-    lag, and the physics of its kind.
+    lag, and the physics of the given kind.
     """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
@@ -97,7 +97,7 @@ def triad(kind: str, seed: int = 0) -> UnitModel:
         if to_case:
             links.append(Link('case', head, 0.02 * to_case))
     if kind == 'convection':
-        # Convection carries part of the heat between case and board.
+        # Convection transports part of the heat between case and board.
         links[1] = Link('case', 'board', 0.15)
         links.append(Link('case', 'board', draw.between(0.15, 0.35), exponent=1.25))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
@@ -152,7 +152,7 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
         )
     ],
     'hysteresis': _slips,
-    # A heat pump between case and board: its load, its losses, and the convection it causes.
+    # A heat pump between case and board: effects of load, losses and convection.
     'even': lambda draw: [
         FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
@@ -168,8 +168,8 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
 
 def sibling(unit: UnitModel, seed: int, spread: float = 0.15) -> UnitModel:
     """
-    Return another unit of the same type, with other constants and misalignment; each
-    coefficient, width and heat capacity differs by a share of up to `spread`.
+    Return another unit of the same type, with other constants and misalignment; coefficients,
+    widths and heat capacities each differ by a share of up to `spread`.
     """
     rng = generator(seed, Stream.SIBLING)
 

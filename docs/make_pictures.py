@@ -185,8 +185,8 @@ def draw_year(axes: Axes) -> None:
     for week in range(52):
         chosen = [history.rests[k] for k in np.flatnonzero(day // 7 == week)]
         old, new = (series_of(chosen, cal) for cal in (laboratory, calibrated))
-        for one in np.unique(new.day):
-            at = new.day == one
+        for day in np.unique(new.day):
+            at = new.day == day
             for name, values in (
                 ('old', old.residual),
                 ('new', new.residual),

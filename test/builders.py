@@ -45,7 +45,7 @@ def calibration(**keys):
 
 
 def thermal_calibration():
-    """Make a unit whose correction depends on temperature, by a negligible amount."""
+    """Make a unit whose correction depends on temperature, but by a negligible amount."""
     return calibration(dynamic=regime_set(z=axis_set((0.0, 1e-12))))
 
 
@@ -157,7 +157,7 @@ def columns_from_events(events):
 
 
 def stream(compensator, events):
-    """Process events one by one, with 1e-3 of a sample as its rate; return rows and indices."""
+    """Process events one by one; a sample times 1e-3 is its angular rate; return rows, indices."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:
@@ -206,7 +206,7 @@ def arrays_of(run, every=1):
 
 
 def drawn(unit, layout, d):
-    """Add `d` to all parameters of a unit but the levels of scale curves, which are fixed at 1."""
+    """Add `d` to the parameters of a unit except the levels of scale curves, which are 1."""
 
     def moved_by(values, start):
         return tuple(value + d[start + k] for k, value in enumerate(values))

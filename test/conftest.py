@@ -158,7 +158,7 @@ def _caught(name, descriptor):
 
 @contextmanager
 def _as_a_process(cwd):
-    """Give a command the state of a new process; restore the state of this process afterwards."""
+    """Give a command the state of a new process; afterwards restore the state of this process."""
     folder, environment = Path.cwd(), dict(os.environ)
     log = logging.getLogger()
     handlers, log.handlers = log.handlers, []  # pytest's handlers keep log messages from stderr
@@ -215,7 +215,7 @@ def small_disk(tmp_path, request):
 
 @pytest.fixture
 def peer():
-    """Return the other end of a node, a peer on DDS."""
+    """Return a peer on DDS: the publishers, subscribers and clients of a node under test."""
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from ros_helpers import Peer
 
@@ -285,7 +285,7 @@ class _Unpickler(pickle.Unpickler):
 
 @pytest.fixture(scope='session')
 def equal_fits_once(once):
-    """Fit equal bags with equal options once, as many pages and examples need equal fits."""
+    """Fit equal bags with equal options once, because many pages and examples need equal fits."""
     from thermo_comp import fitting
 
     fit = fitting.fit

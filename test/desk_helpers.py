@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A folder with every file that an example in a help text or a page names."""
+"""Owns a folder with every file that the examples in help texts and pages name."""
 
 import itertools
 import os
@@ -137,7 +137,7 @@ class Desk:
             write_new(path, np.random.default_rng(5))
 
     def run(self, command, cli=None):
-        """Run one example with short waits for subscribers, in a new folder (fleets share one)."""
+        """Run an example with short waits for subscribers, in a new folder, or that of fleets."""
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}

@@ -56,7 +56,7 @@ Inject = Callable[[list[Event]], list[Event]]
 
 
 def unit(**changes):
-    def one(dynamic):
+    def set_in(dynamic):
         return axis_set(
             (0.0, BIAS_SLOPE, BIAS_CURVE),
             (1.0, SCALE_SLOPE),
@@ -68,8 +68,8 @@ def unit(**changes):
     values = {
         'unit': Unit('F-1', 'counts', FULL_SCALE, 1.0 / RATE_HZ),
         'axes': Axes(*[AxisReference(K, bias) for bias in BIAS]),
-        'static': regime_set(*[one(False)] * 3, **ranges),
-        'dynamic': regime_set(*[one(True)] * 3, **ranges),
+        'static': regime_set(*[set_in(False)] * 3, **ranges),
+        'dynamic': regime_set(*[set_in(True)] * 3, **ranges),
         'noise_density_m_s2_sqrt_hz': (NOISE_SD / math.sqrt(RATE_HZ),) * 3,
         'response': (
             term('gradient', (BY_GRADIENT,) * 3, during='dynamic', range=(-6.0, 6.0)),
@@ -109,7 +109,7 @@ class Truth:
 
 
 def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
-    """Compute temperatures: case lags air, board lags case; memory is board minus its lag [K]."""
+    """Compute temperatures: case lags air, board lags case; memory is board less its lag [K]."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])
@@ -129,7 +129,7 @@ def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
 
 
 def counts_of(force, case, board, memory):
-    """Return the counts of the converter for a specific force (paper, equations 6 to 9)."""
+    """Return the counts for a specific force (equations 6 to 9 of Golovach's paper)."""
     t = board - 20.0
     drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
     drift += BY_GRADIENT * (case - board) + BY_MEMORY * memory

@@ -31,7 +31,7 @@ from fault_rig import (
 )
 
 OK, WARN, ERROR = 0, 1, 2
-#: Number of samples of the undisturbed bag.
+#: Number of samples in the bag without a fault.
 N_SAMPLES = round(RATE_HZ * DURATION_S)
 
 
@@ -81,7 +81,7 @@ def faster(begin_s, end_s, factor):
 
 
 def half_time(begin_s):
-    """Let time jump back: play the messages before `begin_s`, then the whole bag."""
+    """Let the stamps jump back: play the messages before `begin_s`, then the whole bag."""
     return lambda events: [e for e in events if seconds_of(e[1]) < begin_s] + events
 
 

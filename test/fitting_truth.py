@@ -18,7 +18,7 @@ from thermo_comp.typing import Floats
 
 GRAVITY = 9.81
 NOMINAL = np.array([1000.0, 1010.0, 990.0])
-#: Groups of the columns of a table: curve (t, t^2), board (two lags), idle (two without effect).
+#: Groups of the columns: curve (t, t^2), board (two lags), idle (two columns without effect).
 GROUPS = ('curve', 'curve', 'board', 'board', 'idle', 'idle')
 TAUS = np.array([400.0, 2500.0])
 START = np.array([[0.25, 0.1], [0.1, 1.0]])

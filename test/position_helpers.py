@@ -17,7 +17,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass
 class Imu:
-    """Those Imu columns of a recording that the check for a jump needs."""
+    """The Imu columns that the search for jumps needs."""
 
     angular_velocity: np.ndarray
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns bags made by other tools, and the plain-Python result that a reader must give for them."""
+"""Owns bags made by other tools, and their content as read by plain Python."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache

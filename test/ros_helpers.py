@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the other end of the node in tests: a peer on DDS with publishers and clients."""
+"""Owns the peer of a node in tests: publishers, subscribers and clients on DDS."""
 
 import threading
 from contextlib import contextmanager, suppress

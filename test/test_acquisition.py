@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The progress of a test during recording: positions are found in blocks of any length."""
+"""The state of a test during recording: positions are found in blocks of any length."""
 
 from dataclasses import replace
 
@@ -143,7 +143,8 @@ def test_a_clock_that_goes_back_begins_a_position(stream):
     for start_ns in (START_NS, 10**15):
         begins = [begin for block in stream.blocks(0.5, start_ns) for begin in test.add(block)]
     assert begins == [10**15]
-    assert [one.still_s for one in test.account().positions] == pytest.approx([40.0] * 2, abs=1.0)
+    still_s = [position.still_s for position in test.account().positions]
+    assert still_s == pytest.approx([40.0] * 2, abs=1.0)
 
 
 def test_a_dead_sensor_has_no_direction():

@@ -122,7 +122,7 @@ def in_whole_degrees(rest):
     ],
 )
 def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text):
-    # WHY: temperatures of another clock or in mK, or a dead axis, ended in a traceback.
+    # WHY: temperatures of another clock or in mK, or a dead axis, ended the fit with a traceback.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 
@@ -152,7 +152,7 @@ def test_likely_mistakes_are_refused_by_name(rng, spoil, name, text):
 
 
 def test_rests_without_noise_advise_the_parameter_of_the_node(rng):
-    # WHY: the node takes equal samples for a stuck converter: it dropped 60 % of those at rest.
+    # WHY: the node, which takes equal samples for a stuck converter, dropped 60 % of the samples.
     rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]
     for rest in rests[:2]:
         # The drift of 40 mg changes the samples by steps of 4 mg.
@@ -173,7 +173,7 @@ def test_an_axis_that_is_dead_in_one_position_is_named(rng):
         fit(sources_of(rests), FORCE)
     for rest in rests:
         rest.accel[:, 2] = rest.level[2]
-    # WHY: an axis that was stuck in all positions, at a number of each, ended in a traceback.
+    # WHY: an axis that repeated one number in each position ended the fit with a traceback.
     with pytest.raises(
         FitError, match=r'^bag0: z reads \S+ to the bit for 0\.\d+ h; bag1: z .*dead'
     ):

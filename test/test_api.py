@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The library as a script uses it: arrays in and out, equal to the compensator bit for bit."""
+"""The Python interface: corrected arrays are equal to the compensator's output bit for bit."""
 
 import shutil
 from dataclasses import replace

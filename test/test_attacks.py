@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks on the node's surroundings: clocks, rates, many clients, links, full disks, logs."""
+"""The node withstands attacks by clocks, rates, many clients, links, full disks and logs."""
 
 import itertools
 import random
@@ -149,10 +149,10 @@ def test_links_exchanged_in_the_folder_never_lead_out_of_it(tmp_path):
 
     def swap():
         while not is_over.is_set():
-            for one, other in ((door, folder / 'real'), (link, door)):
-                one.rename(other)
-            for one, other in ((door, link), (folder / 'real', door)):
-                one.rename(other)
+            for source, target in ((door, folder / 'real'), (link, door)):
+                source.rename(target)
+            for source, target in ((door, link), (folder / 'real', door)):
+                source.rename(target)
 
     thread = threading.Thread(target=swap)
     thread.start()

@@ -81,8 +81,8 @@ BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
 
 
 def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span():
-    one, two = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
-    unit = calibration(static=regime_set(one), dynamic=regime_set(two))
+    static, dynamic = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
+    unit = calibration(static=regime_set(static), dynamic=regime_set(dynamic))
     for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
         at_edge, *outside = np.moveaxis(
             curves_at(unit, edge + sign * np.array([0.0, 1e-9, 3.0, 7.5, 7.5 + 1e-9, 300.0])), 2, 0
@@ -97,7 +97,7 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span(
             np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_a_set_that_ends_first_follows_the_other_and_then_its_tangent():
+def test_beyond_the_narrower_range_of_a_set_it_follows_the_other_set_and_then_a_tangent():
     # The static set has a range of 5 to 35 degC, the dynamic set of 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
@@ -119,11 +119,11 @@ def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
     # range, 0 to 30 degC, ends before the static range at the top and after it at the bottom.
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
-    one = AxisSet(spline, Polynomial((1.0, 1e-4)))
+    splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
     two = AxisSet(exponential, Polynomial((1.0, 1e-4, 1e-6)))
     unit = calibration(
-        static=regime_set(one, two, axis_set(BENT)),
-        dynamic=regime_set(two, one, axis_set(WAVY), temperature_range_c=(0.0, 30.0)),
+        static=regime_set(splined, two, axis_set(BENT)),
+        dynamic=regime_set(two, splined, axis_set(WAVY), temperature_range_c=(0.0, 30.0)),
     )
     layout = parameter_layout(unit)
     change = 1e-3 * rng.standard_normal(layout.n_parameters)
@@ -182,8 +182,8 @@ def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
 
 
 def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
-    # WHY: a temperature difference of 10 K, after bags with 0.1 K, exceeds the range 100 times,
-    # and its square 10000 times. For 10 K the claimed sd was 0.1 g, that of 10000 half ranges.
+    # WHY: a temperature difference of 10 K, after bags with up to 0.1 K, is 100 times the range,
+    # the square of the difference 10000 times. The claimed sd was 0.1 g, for 10000 half ranges.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(Layout(correction.memory).width)

@@ -51,7 +51,7 @@ def functions(draw, at_reference):
 
 @st.composite
 def calibrations(draw):
-    def one():
+    def drawn_set():
         return replace(
             axis_set(),
             bias_function=draw(functions(0.0)),
@@ -69,8 +69,8 @@ def calibrations(draw):
         calibration(sensors=('case', 'frame')),
         response=tuple(replace(t, bias=weights(number), scale=weights(small)) for t in terms),
         evidence=(noted,),
-        static=regime_set(one(), one(), one()),
-        dynamic=regime_set(one(), one(), one()),
+        static=regime_set(drawn_set(), drawn_set(), drawn_set()),
+        dynamic=regime_set(drawn_set(), drawn_set(), drawn_set()),
         unit=replace(calibration().unit, serial=draw(serials)),
     )
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: help with examples, tables that fit and pipe, valid JSON, quick starts."""
+"""The command line prints help, plain tables and valid JSON, and takes topics by name."""
 
 import json
 import os
@@ -208,7 +208,7 @@ class TestTopics:
         profile = named.with_name('lab.yaml')
         profile.write_text('board: [1]\n')
         refused = cli('info', named, '--topics', profile, code=1).stderr
-        assert f'{profile}: expected lines of INPUT: TOPIC' in refused
+        assert f'{profile}: expected lines INPUT: TOPIC' in refused
         assert 'cannot be read' in cli('info', named, '--topics', named, code=1).stderr
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration works as described: over real DDS, without loss, equal to the offline run."""
+"""The demonstration plays a bag over DDS without loss, and the output equals the offline run."""
 
 import re
 import sys
@@ -40,7 +40,7 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
     assert is_alike(speed.sub('', printed), speed.sub('', shown()['demo'][1])), printed
     lines = speed.sub('', printed).splitlines()
     shown_lines = [speed.sub('', line) for line in shown_of_demo()]
-    assert [one for one in shown_lines if not any(is_alike(line, one) for line in lines)] == []
+    assert [row for row in shown_lines if not any(is_alike(line, row) for line in lines)] == []
     out = tmp_path / 'out'
     topics = inspect_recording(out / 'out.mcap').topics
     (imu,) = (count for name, (_, count) in topics.items() if name.endswith('imu/data_raw'))

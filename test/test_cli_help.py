@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The output on a terminal: examples run, JSON parses, --quiet prints nothing, lines fit."""
+"""Examples of the help run, JSON output parses, --quiet prints nothing, lines fit a terminal."""
 
 import re
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The table of columns: all columns, the memory they need, and each value by hand."""
+"""The columns of the thermal response have the values computed by hand, and limited memory."""
 
 import math
 

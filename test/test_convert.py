@@ -82,7 +82,7 @@ def test_a_table_is_unchanged_by_a_round_trip_through_a_bag(tmp_path):
     assert (report.rows, report.messages['accel']) == (400, 400)
     assert report.rate_hz == pytest.approx(100.0)
     assert report.duration_s == pytest.approx(3.99)
-    assert 'gravity is 1 g' in report.believed
+    assert 'gravity is 1 g' in report.inferred_unit
 
 
 def test_counts_become_an_imu_with_a_sensitivity(tmp_path):
@@ -287,7 +287,7 @@ class TestColumnMap:
             ({'further': [{'name': 'case', 'column': 'c'}]}, 'further[0].name',
              'fit into a topic'),
             ({'further': [{'name': 'a', 'column': column} for column in 'bc']}, None,
-             'two thermometers of one'),
+             'two thermometers with the same'),
             ({'stamp': {'column': 't'}}, 'stamp.unit', 'iso if `column` is given'),
             ({'stamp': {}}, 'stamp', 'give either `column` and `unit`, or `rate_hz`'),
             ({'stamp': {'column': 't', 'unit': 's', 'rate_hz': 1.0}}, 'stamp', 'give either'),

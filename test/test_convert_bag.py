@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of other programs: topics of any name, ROS 1 and 2, units recognised at rest."""
+"""Bags of other programs are converted: topics of any name, ROS 1 and 2, units by gravity."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from thermo_comp.convert.bag import bag_log, find_topics
-from thermo_comp.convert.log import contradiction, find_stillness, inferred_unit, write_log
+from thermo_comp.convert.log import contradiction, find_stillness, infer_unit, write_log
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
 
@@ -163,9 +163,9 @@ def test_convert_takes_a_bag(tmp_path, rng, cli):
         (32.2, 'unknown'),  # gravity in ft/s^2
     ],
 )
-def test_the_magnitude_at_rest_tells_the_unit(magnitude, unit):
-    believed, reason = inferred_unit(magnitude)
-    assert believed == unit
+def test_the_unit_follows_from_the_magnitude_at_rest(magnitude, unit):
+    inferred, reason = infer_unit(magnitude)
+    assert inferred == unit
     assert f'{magnitude:.4g}' in reason
 
 

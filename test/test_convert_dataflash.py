@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ArduPilot logs: a file as in DataFlash's public description gives the data of each sensor."""
+"""ArduPilot logs, written by the public description of DataFlash, give the data of each sensor."""
 
 import struct
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other programs: headings, dates, units by physics, 24-bit words."""
+"""Tables of other programs are read by their headings; units follow from gravity and rates."""
 
 from datetime import datetime, timedelta, timezone
 from itertools import takewhile
@@ -223,7 +223,7 @@ def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, rea
 
 
 def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
-    # WHY: if the last cell of most rows was blank, the headings counted as a cell too many.
+    # WHY: if the last cell of most rows was blank, the row of headings had a cell too many.
     path = slow_table(tmp_path / 'log.csv', 'time', [k / 100 for k in range(N)], last=31.99)
     head, *rows = path.read_text().splitlines()
     rows = [row if k % 100 == 0 else f'{row.rpartition(",")[0]},' for k, row in enumerate(rows)]
@@ -428,7 +428,7 @@ def test_unidentified_columns_are_refused(tmp_path, rng):
         # WHY: decimal commas divided cells; the message was `its headings name no accelerometer`.
         (
             't;ax;ay;az\n' + '0,01;0,0;0,1;9,8\n' * 100,
-            'has decimal commas, as in 0,01: use points',
+            'has decimal commas, it begins with 0,01: write decimal points',
         ),
         ('0 0 0 9.8 20\n' * 100, '5 columns without headings cannot be identified'),
     ):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of numbers: layouts give equal columns; errors name the place of every bad cell."""
+"""Tables of any layout give equal columns; errors name the place of a bad cell."""
 
 import numpy as np
 import pytest
@@ -110,10 +110,10 @@ def test_layout_prefers_the_delimiter_that_splits_all_lines_alike():
         ('a,b\n1,2\n', 'c', "no column 'c'; there are: 'a', 'b'"),
         ('a,a\n1,2\n', 'a', "2 columns are called 'a'"),
         ('1,2\n3,4\n', 'a', "no column 'a': the table has no headings"),
-        ('1,2\n3,4\n', 2, 'no column 2: the table has 2, 0 to 1'),
-        ('1,2\n3,4\n', -1, 'no column -1: the table has 2, 0 to 1'),
+        ('1,2\n3,4\n', 2, 'no column 2: the table has 2 columns, 0 to 1'),
+        ('1,2\n3,4\n', -1, 'no column -1: the table has 2 columns, 0 to 1'),
         # WHY: rows without whole numbers were left out of a table with decimal commas.
-        ('a;b\n1,5;2\n3;4\n5;6\n', 'a', "column 'a' has decimal commas, as in 1,5"),
+        ('a;b\n1,5;2\n3;4\n5;6\n', 'a', "column 'a' has decimal commas, it begins with 1,5"),
         ('a,b\n\0\0\n', 'a', 'it holds zero bytes'),
     ],
 )

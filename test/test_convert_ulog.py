@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PX4 logs: a file as in ULog's public description gives the data of each sensor."""
+"""PX4 logs, written by the public description of ULog, give the data of each sensor."""
 
 import struct
 
@@ -246,7 +246,7 @@ def test_the_use_of_a_log_of_1_hz_is_reported(tmp_path, rng, cli):
     path = tmp_path / 'slow.ulg'
     path.write_bytes(log.body)
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
-    assert '1 Hz: good for soaks of minutes' in printed
+    assert '1 Hz: sufficient for soaks of minutes' in printed
     assert 'sensor_accel at 10 Hz' in printed
 
 

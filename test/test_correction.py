@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections with all columns: blocks have the bits of a stream; errors scatter as claimed."""
+"""With all kinds of columns, blocks have the bits of a stream, and errors scatter as claimed."""
 
 import math
 from dataclasses import replace

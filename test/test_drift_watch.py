@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The drift watch: verdicts and forecasts against simulated units and closed forms."""
+"""Verdicts and forecasts of the drift watch agree with simulated units and closed forms."""
 
 import sys
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Topics of a driver over DDS: a temperature in another message, or without a stamp."""
+"""The node and `record` read a driver's topics: temperatures in any message, or unstamped."""
 
 import threading
 import time
@@ -150,7 +150,8 @@ def test_record_writes_fields_of_messages_as_temperatures(peer):
         for news in live.blocks(wait):
             for role, own in news[0].raw.items() if news else ():
                 outputs.setdefault(role, []).extend(own)
-    case, board = (deserialize_message(outputs[one][0], Temperature) for one in ('case', 'board'))
+    case = deserialize_message(outputs['case'][0], Temperature)
+    board = deserialize_message(outputs['board'][0], Temperature)
     # A reading without a stamp gets the stamp of the previous sample.
     assert (case.temperature, case.header.stamp.sec) == (23.0, START_NS // SECOND_NS)
     assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)

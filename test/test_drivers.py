@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each file of config/drivers against a bag with the topics and types of that driver."""
+"""Each file of config/drivers fits a bag with the topics and types of the driver."""
 
 import csv
 import re

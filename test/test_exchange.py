@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Exchange with other tools: formulas of the tools, round trips, losses and refusals."""
+"""Exported and imported calibrations agree with the formulas of the other tools."""
 
 import re
 from dataclasses import replace
@@ -77,8 +77,9 @@ def numbers(text, separator):
 
 def bias_at(calibration, axis, celsius):
     reference = (calibration.axes.x, calibration.axes.y, calibration.axes.z)[axis]
-    one = calibration.static.axes()[axis]
-    return reference.bias + one.bias_function.value(celsius - calibration.reference_temperature_c)
+    curves = calibration.static.axes()[axis]
+    t = celsius - calibration.reference_temperature_c
+    return reference.bias + curves.bias_function.value(t)
 
 
 def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):
@@ -229,7 +230,7 @@ def test_losses_of_an_export_are_noted(cubic):
     )
     text = export_calibration(calibration, 'ardupilot')
     for expected in (
-        'replaced by cubics',
+        'cubics replace',
         '1000 urad',
         r'response is lost (gradient): ',
         'dynamic set is lost',
@@ -385,7 +386,7 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
     # The reading (1.01, 1.99, 3.06) was computed by hand as M a, with a = (1, 2, 3) m/s^2.
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(
-        CalibrationError, match='choose one of the IMUs with --number: there are imu0, imu1'
+        CalibrationError, match='choose an IMU with --number: the file has imu0, imu1'
     ):
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')
 

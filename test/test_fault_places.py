@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Faults at the worst times of a ramp, through the compensator without DDS.
+Faults at the worst times of a ramp are covered by the covariance (compensator without DDS).
 
 WHY: the covariance was large enough for a fault in the middle of a ramp, but not for an equal
 fault at the start of a ramp, nor after a sensor came back with another value. PROMISE: every

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of processes and files around the node: restarts, signals, reloads, calibration files."""
+"""The node survives restarts, signals, reloads and bad calibration files."""
 
 import os
 import signal

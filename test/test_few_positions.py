@@ -49,7 +49,7 @@ def left_by(pair, **options):
 
 
 @pytest.mark.slow
-def test_two_positions_tell_the_thermal_response():
+def test_two_positions_determine_the_thermal_response():
     # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine the sd to 6 %, and
     # superfluous columns may add 10 %. The median error of all 36 pairs of bags is 1.3 ug
     # (docs/accuracy.md).
@@ -95,8 +95,8 @@ def tumbled(n):
     return fit([turned(np.random.default_rng(20161), positions(n, 3))], OPTIONS)
 
 
-def pulls_of(calibration, low, high, slopes):
-    """Return the error of each axis' drift between two temperatures / its claimed sd."""
+def ratios_of(calibration, low, high, slopes):
+    """Return error / claimed sd of the drift of each axis between two temperatures."""
     covariance, layout, pulls = (
         calibration.posterior.covariance(),
         parameter_layout(calibration),
@@ -147,7 +147,7 @@ def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
         rest = Rest(rng, level=tuple(GRAVITY * UP), sd=0.1 * MG, warm=celsius, fall=0.0)
         rest.accel += (celsius - 20.0) * MG * slope
         bags.append(rest.source(name=f'{celsius:g}'))
-    pulls = pulls_of(fit(bags, OPTIONS).calibration, 5.0, 15.0, MG * slope)
+    pulls = ratios_of(fit(bags, OPTIONS).calibration, 5.0, 15.0, MG * slope)
     assert (pulls < 3.0).all()
 
 
@@ -189,7 +189,7 @@ def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
             # With turn-on offsets of 0.1 mg only the drifts within the rests determine the curve.
             rest.accel += rng.normal(0.0, 0.1 * MG, 3)
             bags.append(rest.source(name=f'{len(bags)}'))
-    pulls = pulls_of(fit(bags, OPTIONS).calibration, -15.0, 15.0, slopes)
+    pulls = ratios_of(fit(bags, OPTIONS).calibration, -15.0, 15.0, slopes)
     assert (pulls < 3.0).all()
 
 
@@ -266,7 +266,7 @@ def test_positions_without_temperature():
     )
 
 
-def test_the_assumed_repeatability_of_the_bias_is_said(rng):
+def test_the_assumed_repeatability_of_the_bias_is_stated(rng):
     # The nine constants of a triad explain nine norms, whatever the offsets of the mountings.
     assert 'mountings' in names_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
@@ -333,7 +333,7 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     # WHY: with positions cut into several rests, the fitted mounting sd was 1/20 of the true sd.
     whole, cut = tumbled(9), fit([turned(rng, np.repeat(positions(9, 3), 5, axis=0))], OPTIONS)
-    sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, cut))
+    sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, cut))
     # Nine norms do not determine the mounting sd, which stays at its prior in both fits.
     assert sd_cut == pytest.approx(sd, rel=0.1)
     assert 'mountings' in names_of(cut)
@@ -355,11 +355,11 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
-    n_turn_ons = [one.fit.windows.data.n_turn_ons for one in (whole, parts, others)]
+    n_turn_ons = [done.fit.windows.data.n_turn_ons for done in (whole, parts, others)]
     assert n_turn_ons == [1, 1, 2]
-    n_mountings = [len(one.fit.selected.score.norms.square) for one in (whole, parts, others)]
+    n_mountings = [len(done.fit.selected.score.norms.square) for done in (whole, parts, others)]
     assert n_mountings == [9, 9, 10]
-    sd, sd_cut = (one.calibration.static.x.residual_sd_m_s2 for one in (whole, parts))
+    sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, parts))
     assert sd_cut == pytest.approx(sd, rel=0.1)
 
 
@@ -375,8 +375,8 @@ def test_a_calibration_has_the_date_of_its_test(rng):
     assert (undated.tested, undated.date) == ('', undated.created)
 
 
-def test_a_prior_tells_how_well_turn_ons_repeat(rng):
-    # WHY: with a prior sd of mountings of 8 ug, the fitted sd was 43 ug, as without a prior.
+def test_a_prior_states_how_well_turn_ons_repeat(rng):
+    # WHY: with a prior sd of mountings of 8 ug, the fitted sd was 43 ug, as without the prior.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=2e-4)).calibration
     assert known.static.x.residual_sd_m_s2 == pytest.approx(2e-4)
     six = [turned(rng, positions(6, 4))]

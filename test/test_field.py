@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Updates from rests in the field against the truth, a Kalman filter and closed forms."""
+"""Updates from rests in the field agree with truth, a Kalman filter and closed forms."""
 
 import sys
 from dataclasses import replace
@@ -267,7 +267,7 @@ def test_a_changed_curve_is_detected_and_corrected():
     assert curves[1] - curves[0] == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
 
 
-def test_the_slopes_over_temperature_age_by_a_fixed_walk():
+def test_the_slopes_over_temperature_age_by_a_fixed_random_walk():
     # Level rests do not determine the x axis: the sd of its bias slope grows by 1 ug/K per root
     # year.
     unit = known(
@@ -300,7 +300,7 @@ def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
     # alone.
     unit = known()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
-    image = {one.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for one, _ in logged}
+    image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
     last = logged[-1][0].start_ns
     expected = None
     for number, wrong in enumerate(({}, image, {last: 30 * 10**9})):
@@ -448,9 +448,9 @@ def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
 
 @pytest.mark.parametrize('lags', [0.0, 1.0])
 def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
-    # Each start has three rests, the first at once. Walks of bias and scale are 15 and 10 ug per
-    # root day, turn-ons 20 ug, the scatter of rests 3 ug; the initial lag states have `lags` times
-    # the assumed sd, 40 to 100 ug.
+    # Each start has three rests, the first at once. Per root day the bias has a random walk of 15
+    # ug, the scale of 10 ug; turn-ons are 20 ug, the scatter of rests 3 ug; the initial lag states
+    # have `lags` times the assumed sd, 40 to 100 ug.
     unit = rich_calibration()
     each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
     n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]

@@ -50,7 +50,7 @@ def test_a_knee_of_the_bias_is_found():
     # Trial knees are 1 K apart: the fit uses the two trial knees around the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
     # A mean slope between the two trial knees instead of the true knee gives an error of at most
-    # 20 ug/K times 0.25 K = 5 ug, in 1 K of the range of 22 K.
+    # 20 ug/K times 0.25 K = 5 ug, within 1 K of the range of 22 K.
     assert left < 1.5
 
 
@@ -70,11 +70,11 @@ def test_a_thermometer_on_two_topics_counts_once():
             readings = dict.fromkeys(copies, (time_s[::5], board[::5]))
             collected.append(tc.Columns(time_s, force, readings, name=f'rest{k}'))
         bags.append(collected)
-    one, two = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
-    assert one.static == two.static
-    assert one.axes == two.axes
-    assert any('temperature/case repeats' in note for note in two.provenance.notes)
-    assert not any('repeats' in note for note in one.provenance.notes)
+    first, second = (tc.fit(each, gravity=G, input='m/s^2', groups=('curve',)) for each in bags)
+    assert first.static == second.static
+    assert first.axes == second.axes
+    assert any('temperature/case repeats' in note for note in second.provenance.notes)
+    assert not any('repeats' in note for note in first.provenance.notes)
 
 
 def columns_of(slopes, shift=0.0):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The whole fit on simulated units with known truth."""
+"""Fits to simulated units agree with the known truth."""
 
 from dataclasses import replace
 
@@ -159,7 +159,7 @@ def test_the_calibration_file_holds_the_fit(response, tmp_path):
     assert load_calibration(path) == response.calibration
 
 
-def test_the_compensator_does_what_the_fit_promised(response):
+def test_the_compensator_has_the_errors_that_the_fit_states(response):
     # The error in a new attitude is below twice the left-out error, and near its claimed sd.
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)

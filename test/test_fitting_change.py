@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Self-heating makes a board warmer than its case: effects are even about the rest gradient."""
+"""A board is warmer than its case at rest: effects are even in T_case - T_board about rest."""
 
 from itertools import pairwise
 
@@ -26,7 +26,7 @@ def lagged(values, tau):
 
 
 def recorded(rng, up, name, targets):
-    """Record a unit whose bias is even in case minus board about the rest gradient."""
+    """Record a unit whose bias is even in T_case - T_board about its value at rest."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
@@ -56,8 +56,8 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # 5000 readings (noise 3 mK) give the rest gradient to 0.1 mK; rates from differences over
-    # 120 s add an error.
+    # 5000 readings (noise 3 mK) determine T_case - T_board at rest to 0.1 mK; rates from
+    # differences over 120 s add an error.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (
@@ -67,7 +67,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # Columns even about a gradient of 0 leave a part of an effect even about the rest gradient.
+    # Columns even about T_case - T_board = 0 leave a part of the effect.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit estimates the noise of series, and the condition that ends the dynamic regime."""
+"""A fit estimates the noise of a series, and the condition that ends the dynamic regime."""
 
 from dataclasses import replace
 

@@ -217,7 +217,7 @@ def test_options_out_of_range_are_refused(change, message):
         FitOptions(**{'gravity': 9.81, **change})
 
 
-def test_the_gradient_of_a_soak_is_that_without_the_ramps(good, rng):
+def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
     # The unit heats itself by 3 K; the board lags the case by 600 s in ramps, and by 1500 s while
     # a soak settles.
     windows, _ = good

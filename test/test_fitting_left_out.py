@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of models by their errors on left-out data."""
+"""Models are compared by their errors on left-out data."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ import numpy as np
 from thermo_comp.fitting.left_out import Folds, Score, is_better, is_undecided
 from thermo_comp.fitting.selection import Trial, better_start
 
-MICRO = 9.80665e-6  # one micro-g [m/s^2]
+MICRO = 9.80665e-6  # a micro-g [m/s^2]
 
 
 def score(drift, norms=(), by_thermometer=0.0):
@@ -50,8 +50,8 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
 
 
 def test_large_mounting_offsets_must_not_spoil_left_out_norms():
-    # WHY: a bias that walks by 20 ug per square root of an hour left drifts that mounting offsets
-    # of 5 mg explained by scale factors: the evidence was larger, and the error 5 mg.
+    # WHY: a random walk of the bias of 20 ug per root hour left drifts that mounting offsets of 5
+    # mg explained by scale factors: the evidence was larger, and the error 5 mg.
     def trial(norm, log_evidence):
         posterior = SimpleNamespace(
             prior=SimpleNamespace(offset_scale=0.0),

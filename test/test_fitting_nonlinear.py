@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits of nonlinear terms beyond 1 g: derivatives, choice of terms, radius, stated |f|, runs."""
+"""Fits to forces beyond 1 g estimate nonlinear terms and the radius of a rotation."""
 
 import math
 from dataclasses import replace
@@ -212,11 +212,11 @@ def test_a_constant_rotation_is_a_rest_a_changing_rotation_is_not(rng):
     time = np.arange(0.0, 240.0, 0.02)
     rate = np.interp(time, [0, 80, 100, 180, 190], [0.0, 0.0, 3.0, 3.0, 0.0])
     force = np.column_stack((0.0 * time, rate**2, 9.8 + 0.0 * time))
-    cells = CellAccumulator(0.5, None)
+    accumulator = CellAccumulator(0.5, None)
     noise = 1e-3 * rng.standard_normal((2, len(time), 3))
     turning = np.column_stack((0.0 * time, 0.0 * time, rate))
-    cells.add((time * 1e9).astype(np.int64), force + noise[0], turning + noise[1])
-    summed = cells.finish()
+    accumulator.add((time * 1e9).astype(np.int64), force + noise[0], turning + noise[1])
+    summed = accumulator.cells()
     still = still_intervals(without_rotation(summed), 3.0)
     edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
     # The median of the rate follows a change after 5 s, and cells beside a motion are not still.

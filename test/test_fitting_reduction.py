@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reduction of samples: cells, still intervals, windows, readings; gravity; sensor settings."""
+"""Samples are reduced to cells, still intervals and windows; gravity and sensors are estimated."""
 
 from dataclasses import replace
 
@@ -246,9 +246,9 @@ def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
     samples = still(rng, 30.0, (0.0, 0.0, 3000.0))
     results = []
     for origin in (0, 1_900_000_000_000_000_000):
-        cells = CellAccumulator(0.5, None)
-        cells.add(np.arange(3000, dtype=np.int64) * 10_000_000 + origin, samples)
-        results.append(cells.finish())
+        accumulator = CellAccumulator(0.5, None)
+        accumulator.add(np.arange(3000, dtype=np.int64) * 10_000_000 + origin, samples)
+        results.append(accumulator.cells())
     np.testing.assert_array_equal(results[0].mean, results[1].mean)
     np.testing.assert_array_equal(results[0].time, results[1].time)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The regression against dense linear algebra: mode, covariance, evidence, left-out errors."""
+"""The regression agrees with dense linear algebra: mode, covariance, evidence, left-out errors."""
 
 from dataclasses import replace
 

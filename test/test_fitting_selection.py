@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The selected model, its prior sd, noises and claimed sd, for tables with known truth."""
+"""Selected model, prior sd, noises and claimed sd are right for tables with known truth."""
 
 from dataclasses import replace
 
@@ -238,12 +238,12 @@ def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_without_it():
     assert [(group.part, group.group) for group in evidence] == [
         (part, group) for part in ('bias', 'scale') for group in ALL
     ]
-    for one in evidence:
+    for row in evidence:
         rest = prior.column_sd.copy()
-        rest[['bias', 'scale'].index(one.part), np.array(GROUPS) == one.group] = 0.0
+        rest[['bias', 'scale'].index(row.part), np.array(GROUPS) == row.group] = 0.0
         without = mode_of(regression, posterior.state, replace(prior, column_sd=rest))
         fall = posterior.log_evidence - without.log_evidence
-        assert one.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), one
+        assert row.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), row
     falls = {(group.part, group.group): group.log_evidence_change for group in evidence}
     assert falls['bias', 'board'] > 10.0
     assert falls['bias', 'idle'] < 0.5
@@ -264,12 +264,12 @@ def test_with_a_calibration_as_prior_the_loss_is_that_of_keeping_its_values():
         return mode_of(regression, state, replace(prior, informative=known))
 
     posterior = posterior_of(sd)
-    for one in group_evidence(regression, posterior):
+    for row in group_evidence(regression, posterior):
         kept = sd.copy()
-        part, of_group = ['bias', 'scale'].index(one.part), np.array(GROUPS) == one.group
+        part, of_group = ['bias', 'scale'].index(row.part), np.array(GROUPS) == row.group
         kept[layout.weights[part][:, of_group]] *= 1e-4
         fall = posterior.log_evidence - posterior_of(kept).log_evidence
-        assert one.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), one
+        assert row.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), row
 
 
 def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
@@ -294,19 +294,19 @@ def test_noise_alone_is_no_effect_that_the_model_lacks(noise):
 
 
 def test_outliers_do_not_shift_the_fit(calm):
-    regression, one, truth = calm
+    regression, calm_fit, truth = calm
     rng = np.random.default_rng(6)
     clean = regression.windows
     dirty = replace(clean, mean=clean.mean.copy())
     struck = rng.choice(len(clean.time), len(clean.time) // 50, replace=False)
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
-    sd = np.sqrt(one.posterior.variance[one.posterior.layout.bias])
+    sd = np.sqrt(calm_fit.posterior.variance[calm_fit.posterior.layout.bias])
     # 2 % outliers of 100 sd, each down-weighted to 3 sd, shift the bias by less than 1 sd.
-    assert np.abs((other.posterior.state.bias - one.posterior.state.bias) / sd).max() < 1.0
+    assert np.abs((other.posterior.state.bias - calm_fit.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     used, used_with_outliers = (
-        fitted.posterior.prior.column_sd[0] > 0.0 for fitted in (one, other)
+        fitted.posterior.prior.column_sd[0] > 0.0 for fitted in (calm_fit, other)
     )
     np.testing.assert_array_equal(used_with_outliers, used)
 
@@ -358,8 +358,8 @@ def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, up
 def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, offset):
     # A unit may differ from the mean of a prior by 0 or by 30 sd: the evidence selects the prior
     # with the sd that fits.
-    _, one, truth = calm
-    state = one.posterior.state
+    _, selected, truth = calm
+    state = selected.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
     candidates = candidates_of(regression.windows)
     layout = regression.layout(candidates.typical > 0.0)

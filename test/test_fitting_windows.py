@@ -236,13 +236,13 @@ def states_of(windows, calibration):
     states[:, 0], states[:, 3] = windows.temperature, windows.weight
     raw = dict(zip(windows.model.columns, windows.raw.T, strict=True))
     plain = {(c.kind, c.sensor, c.tau_s, c.width_k): value for c, value in raw.items()}
-    for one, place in layout.places.items():
-        if isinstance(one, Play):
-            states[:, place] = plain['play', 'case', one.tau_s, one.width_k]
-        elif isinstance(one, Lag):
-            kind = 'board' if one.input == 'board' else 'gradient_lag'
-            states[:, place] = plain.get((kind, 'case', one.tau_s, 0.0), 0.0)
-        elif isinstance(one, Gradient):
+    for column, place in layout.places.items():
+        if isinstance(column, Play):
+            states[:, place] = plain['play', 'case', column.tau_s, column.width_k]
+        elif isinstance(column, Lag):
+            kind = 'board' if column.input == 'board' else 'gradient_lag'
+            states[:, place] = plain.get((kind, 'case', column.tau_s, 0.0), 0.0)
+        elif isinstance(column, Gradient):
             states[:, place] = windows.gradient
     return states.T
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet survives bad bags, refusals, dead workers and interruptions."""
+"""A run over a fleet survives bad bags, refusals, dead workers and interruptions."""
 
 import csv
 import json
@@ -335,7 +335,10 @@ def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
     # The scale error of one axis may be small by chance, so the norm over all axes is compared.
     scale = np.array(siblings[0].scale_factor)
     errors, sds = (
-        [np.array([float(one[name.format(axis)]) for axis in 'xyz']) for one in (row, before_row)]
+        [
+            np.array([float(cells[name.format(axis)]) for axis in 'xyz'])
+            for cells in (row, before_row)
+        ]
         for name in ('scale_{}', 'scale_sd_{}_ppm')
     )
     after, before_it = (float(np.linalg.norm(error / scale - 1.0)) for error in errors)

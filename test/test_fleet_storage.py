@@ -65,11 +65,11 @@ class TestElsewhere:
         fs.put(f'{unit}/', f'{url}/unit/', recursive=True)
         (here,), (there,) = find_units(Storage(str(unit.parent))), find_units(Storage(url))
         assert list(here.bags) == list(there.bags)
-        one, other = (
+        alone, other = (
             process_unit(here, str(unit.parent), OPTIONS),
             process_unit(there, url, OPTIONS),
         )
-        first, second = (parse_calibration(text.calibration.encode()) for text in (one, other))
+        first, second = (parse_calibration(text.calibration.encode()) for text in (alone, other))
         assert replace(first, provenance=second.provenance) == second
         assert first.provenance.sources == second.provenance.sources
         assert other.hashes == {name: digest(unit.parent / name) for name in here.bags}
@@ -135,7 +135,7 @@ class TestDiscovery:
         (tmp_path / '.hidden').mkdir()
         (tmp_path / '.hidden' / 'x.mcap').touch()
         units = find_units(Storage(str(tmp_path)))
-        assert [(one.name, one.lot, len(one.bags)) for one in units] == [
+        assert [(unit.name, unit.lot, len(unit.bags)) for unit in units] == [
             ('lot-A/u1', 'lot-A', 2),
             ('lot-B/u2', 'lot-B', 1),
             ('u3', '', 1),
@@ -149,7 +149,7 @@ class TestDiscovery:
         write_unit(tmp_path, 3, 1, serial='', names=['e.mcap'])
         (tmp_path / 'f.mcap').write_bytes(b'no bag')
         units = find_units(Storage(str(tmp_path)))
-        assert {one.name: list(one.bags) for one in units} == {
+        assert {unit.name: list(unit.bags) for unit in units} == {
             'mems-0001': ['a.mcap', 'd.mcap'],
             'mems-0002': ['b.mcap', 'c.mcap'],
             # The folder names a unit whose bags have no serial; one bag cannot be opened at all.
@@ -161,8 +161,8 @@ class TestDiscovery:
         write_unit(tmp_path / 'lot\x1b[31m' / 'a\nb', 1, 1)
         write_unit(tmp_path, 1, 1, serial='S1\nCAL_ACC0_ID 7', names=['loose.mcap'])
         units = find_units(Storage(str(tmp_path)))
-        assert [one.name for one in units] == ['S1\\nCAL_ACC0_ID 7', 'lot\\x1b[31m/a\\nb']
-        rows = [process_unit(one, str(tmp_path), OPTIONS).row for one in units]
+        assert [unit.name for unit in units] == ['S1\\nCAL_ACC0_ID 7', 'lot\\x1b[31m/a\\nb']
+        rows = [process_unit(unit, str(tmp_path), OPTIONS).row for unit in units]
         assert rows[0]['verdict'] == 'refused'
         assert str(rows[0]['problem']).startswith('`serial` must be one printable line')
         for row in rows:
@@ -177,7 +177,7 @@ class TestDiscovery:
         (fleet / 'again').symlink_to(fleet)
         (fleet / 'nowhere.mcap').symlink_to(tmp_path / 'gone')
         units = find_units(Storage(str(fleet)))
-        assert [name for one in units for name in one.bags] == ['unit/1.mcap']
+        assert [name for unit in units for name in unit.bags] == ['unit/1.mcap']
 
     def test_a_relative_path_is_the_same_for_every_process(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

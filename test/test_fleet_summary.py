@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The statistics of a fleet table: real outliers and drifts are reported, chance is not."""
+"""The statistics of a fleet report real outliers and drifts, and none by chance."""
 
 import re
 from datetime import datetime, timedelta
@@ -64,7 +64,8 @@ class TestOutliers:
         rows = fleet_of(60, rng)
         for i in range(5):
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
-        assert {one.serial for one in summarise(rows).outliers} == {f'S{i:03d}' for i in range(5)}
+        serials = {outlier.serial for outlier in summarise(rows).outliers}
+        assert serials == {f'S{i:03d}' for i in range(5)}
 
     @pytest.mark.parametrize('n', [10, pytest.param(40, marks=pytest.mark.slow)])
     def test_fleets_without_outliers_have_a_false_alarm_in_one_of_twenty(self, n, rng):
@@ -94,7 +95,7 @@ NOISE_X = 'noise_x_ug_sqrt_hz'
 
 
 def spread_of(name, rows):
-    return next(one for one in summarise(rows).spreads if one.quantity.name.startswith(name))
+    return next(each for each in summarise(rows).spreads if each.quantity.name.startswith(name))
 
 
 class TestUndetermined:
@@ -113,7 +114,7 @@ class TestUndetermined:
         return rows
 
     @pytest.mark.parametrize('n', [1, 4, 16])
-    def test_they_are_no_outliers_and_leave_median_spread_and_limit_alone(self, n, rng):
+    def test_undetermined_values_change_neither_outliers_median_spread_nor_limit(self, n, rng):
         rows = self.with_few_positions(n, rng)
         summary = summarise(rows)
         assert summary.outliers == ()
@@ -181,7 +182,8 @@ class TestDrift:
         assert before == first
         later = fleet_of(3, rng, day=90.0, like=first)
         drifts = summarise(later, before).drifts
-        assert sorted(one.earlier for one in drifts) == [f'earlier /u00{i}@0' for i in range(3)]
+        names = sorted(drift.earlier for drift in drifts)
+        assert names == [f'earlier /u00{i}@0' for i in range(3)]
         # The same calibrations in a second table are not a drift.
         assert summarise(first, before).drifts == ()
 

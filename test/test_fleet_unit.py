@@ -88,7 +88,7 @@ class TestRow:
         drawn = np.random.default_rng(1).multivariate_normal(
             slope.free_coefficients, covariance, n_drawn
         )
-        curves = [slope.with_free(tuple(one), 1.0) for one in drawn.tolist()]
+        curves = [slope.with_free(tuple(row), 1.0) for row in drawn.tolist()]
         slopes = [float(curve.value(1e-3) - curve.value(-1e-3)) / 2e-3 * 1e6 for curve in curves]
         assert row['scale_slope_sd_x_ppm_k'] == pytest.approx(np.std(slopes), rel=0.05)
         assert row['board_lag_s'] == calibration.board_lag_s

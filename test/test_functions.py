@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Temperature functions, predictions and residual statistics against hand numbers and scipy."""
+"""Temperature functions, predictions and residual statistics agree with hand numbers and scipy."""
 
 from dataclasses import replace
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The gyroscope: its fit against simulated truth and closed forms, its file, its triad."""
+"""The calibration of a gyroscope agrees with simulated truth and closed forms."""
 
 from dataclasses import replace
 

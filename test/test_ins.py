@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The navigator of benchmarks/ins.py against closed forms."""
+"""The inertial navigator of benchmarks/ins.py agrees with closed forms."""
 
 import numpy as np
 import pytest
@@ -42,18 +42,18 @@ def test_levelling_makes_the_force_vertical(rng):
     np.testing.assert_allclose((attitude @ force[..., None])[..., 0], expected, atol=1e-12)
 
 
-def test_the_sigma_is_that_of_white_noise(rng):
-    # Expected sd of the position: oscillation of the levelling error (Schuler), plus the noise,
-    # integrated twice.
+def test_the_sigma_of_the_filter_is_the_position_sd_by_white_noise(rng):
+    # Expected variance of the position: Schuler oscillation of the levelling error, plus the white
+    # noise through the impulse response of the Schuler loop, sin(w t) / w.
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)
     omega, T = np.sqrt(G / EARTH_RADIUS), FREE_S
     by_levelling = density**2 / 300.0 * ((1.0 - np.cos(omega * T)) / omega**2) ** 2
-    by_integration = density**2 * (T / 2.0 - np.sin(2.0 * omega * T) / (4.0 * omega)) / omega**2
-    expected = np.sqrt(2.0 * (by_levelling + by_integration))
+    by_noise = density**2 * (T / 2.0 - np.sin(2.0 * omega * T) / (4.0 * omega)) / omega**2
+    expected = np.sqrt(2.0 * (by_levelling + by_noise))
     assert free.sigma[-1, 0] == pytest.approx(expected, rel=0.01)
-    # only about eight of the 298 overlapping flights are independent
+    # Of the 298 overlapping flights only about eight are independent.
     assert 0.5 < np.sqrt(np.mean(free.position[-1] ** 2)) / expected < 1.5
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The judge: residuals known by hand, windows of the stated length, each verdict."""
+"""A judgement has the residuals computed by hand, windows of the stated length, each verdict."""
 
 import csv
 import dataclasses
@@ -78,8 +78,8 @@ def corrected_by(slope, claim=0.0, **changes):
     return dataclasses.replace(calibration(static=part, dynamic=part), **changes)
 
 
-def judged(bag, one, **keys):
-    return evaluate([bag], [('it', one)], **keys).judgements['it']
+def judged(bag, calibration, **keys):
+    return evaluate([bag], [('it', calibration)], **keys).judgements['it']
 
 
 def made(residual, raw, claimed, n=40, dynamic=10, outside=0):
@@ -375,9 +375,9 @@ class TestShifts:
 
     def test_a_large_shift_is_written_without_an_exponent(self):
         # WHY: the verdict had an sd with an exponent, `x bias +829 +- 1.3e+02 ug`.
-        one = AxisShift(829.4 * MICRO_G, 129.2 * MICRO_G, 0.0, 1.0)
+        big = AxisShift(829.4 * MICRO_G, 129.2 * MICRO_G, 0.0, 1.0)
         small = AxisShift(-1.234 * MICRO_G, 0.0567 * MICRO_G, 0.0, 1.0)
-        assert change_texts((one, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')
+        assert change_texts((big, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')
 
     def test_an_unchanged_unit_shows_no_shift(self):
         judgement = judge(around(12, (0.0,) * 3, (0.0,) * 3, noise=MICRO_G), CLAIMING)

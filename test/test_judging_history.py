@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The history of a unit, with covariances known by hand, and one verdict of all commands."""
+"""The history of a unit agrees with covariances by hand; all commands give the same verdict."""
 
 import dataclasses
 import json

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Jumps at rest: time and size; turns, motions and knocks are not jumps."""
+"""Jumps at rest are found with time and size; turns, motions and knocks are not jumps."""
 
 from dataclasses import replace
 

@@ -73,7 +73,7 @@ def parameters_set(arguments):
 
     (node,) = parse(OURS).findall('node')
     elements = [element for element in node.findall('param') if element.get('name')]
-    return {value(one.get('name', '')): value(one.get('value', '')) for one in elements}
+    return {value(tag.get('name', '')): value(tag.get('value', '')) for tag in elements}
 
 
 def test_a_driver_is_a_file_of_topics():

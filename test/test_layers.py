@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Packages import from lower layers only; each heavy library is imported in one package only."""
+"""Packages import from lower layers only; a heavy library is imported by certain packages only."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every path in the viewers' layouts leads to a number in a replayed bag."""
+"""Every path in the layouts of the viewers leads to a number in a replayed bag."""
 
 import json
 import re

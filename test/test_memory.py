@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal memory against closed forms: lags of ramps and steps, plays, unknown starts."""
+"""The thermal memory agrees with closed forms: lags of ramps and steps, plays, unknown starts."""
 
 import math
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node's Fast DDS profile avoids wake-ups, and a profile of the user replaces that profile."""
+"""The node's Fast DDS profile avoids wake-ups; a profile of the user replaces this profile."""
 
 import json
 import os

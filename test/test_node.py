@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node on real DDS: its input, its output and its diagnostics."""
+"""The node has the right input, output and diagnostics on DDS."""
 
 import math
 import time

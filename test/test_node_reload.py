@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as a process: its calibration changes through ROS services while samples flow."""
+"""The calibration of a node process changes through ROS services while samples flow."""
 
 import sys
 import threading
@@ -85,7 +85,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         before = flow.more()
         assert flow.bias(before - 1) == 1.0
 
-        # A new calibration file is in use when the answer comes; it changes between two samples.
+        # When the answer comes, the new calibration is in use; it was exchanged between samples.
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
 
@@ -254,12 +254,12 @@ def test_a_calibration_of_another_unit_is_named(peer, tmp_path, capfd):
     # sd.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    one = of_bias(1.0).unit
-    save_calibration(of_bias(77.0, unit=replace(one, serial='Z-9')), second)
+    unit = of_bias(1.0).unit
+    save_calibration(of_bias(77.0, unit=replace(unit, serial='Z-9')), second)
     with node_in_thread(*lossless(), '-p', f'calibration_file:={first}'):
         for path in (first, second):
             (result,) = peer.set_parameters(calibration_file=str(path))
             assert result.successful, result.reason
     said = capfd.readouterr().err
     assert said.count('replaces unit') == 1
-    assert f'unit Z-9 replaces unit {one.serial}: set the parameter `serial`' in said
+    assert f'unit Z-9 replaces unit {unit.serial}: set the parameter `serial`' in said

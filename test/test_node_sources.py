@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of two publishers are never mixed, and a restarted driver is accepted soon."""
+"""The node never mixes samples of two publishers, and soon accepts a restarted driver."""
 
 import contextlib
 import os

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as a process: bad starts end at once with one clear line, good starts end cleanly."""
+"""A node process with a bad start ends at once with a clear line, another ends cleanly."""
 
 import signal
 import subprocess

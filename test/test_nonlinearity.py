@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Nonlinear axes: closed forms of the inverse, bits of stream and batch, variance."""
+"""The correction of nonlinear axes agrees with closed forms, in stream and batch."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def test_a_correction_inverts_the_terms_at_their_temperature():
     unit = calibration(nonlinearity=BENT)
     f = np.array([5.0, -3.0, 2.0])
     t = 6.0
-    at = [np.array(one.coefficient) + t * np.array(one.per_kelvin) for one in BENT.terms]
+    at = [np.array(term.coefficient) + t * np.array(term.per_kelvin) for term in BENT.terms]
     x = f + at[0] * f**2 + at[1] * np.abs(f) * f + at[2] * f**3
     compensator = Compensator(unit, UNCHECKED)
     for k in range(120):

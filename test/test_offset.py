@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Raw words with an offset give the calibration of signed words, with the offset in its bias."""
+"""A fit to raw words with an offset gives the calibration of signed words, offset in the bias."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def words_of(ups, rng, seconds=20.0):
 
 def constants(result):
     triad = result.calibration.axes
-    return np.array([axis.bias for axis in triad]), np.array([one.scale_factor for one in triad])
+    return np.array([axis.bias for axis in triad]), np.array([axis.scale_factor for axis in triad])
 
 
 @pytest.fixture(scope='module')
@@ -105,8 +105,8 @@ def test_the_offset_of_a_prior_is_used(rng, plain):
 
 
 def test_drifts_and_rotations_of_one_pose_are_no_offset_code(rng):
-    # WHY: a sphere through the readings of four bags in one pose was taken for the sphere of an
-    # offset code: the corrected drift was off by 143 mg.
+    # WHY: the centre of a sphere through the readings of four bags in one pose was taken for an
+    # offset of the words: the corrected drift was off by 143 mg.
     for up in (np.eye(3)[2], np.array([-0.06, -0.25, -0.97])):
         for n in (4, 6, 8):
             for _ in range(100):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits of units of benchmarks/strangers_units.py that were heated in one or two attitudes."""
+"""Fits to units of benchmarks/strangers_units.py, heated in one or two attitudes, are right."""
 
 from types import SimpleNamespace
 

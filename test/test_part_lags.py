@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bias of an axis follows its part: fitted lags, kinks and bumps of units with known truth."""
+"""Lags, kinks and bumps of the parts of simulated units are fitted right."""
 
 import json
 from dataclasses import replace
@@ -89,7 +89,9 @@ def soaked(grade):
 
 def taus_of(calibration):
     return [
-        sorted({one.tau_s for one in calibration.response if one.kind == 'board' and one.bias[k]})
+        sorted(
+            {term.tau_s for term in calibration.response if term.kind == 'board' and term.bias[k]}
+        )
         for k in range(3)
     ]
 
@@ -114,7 +116,7 @@ def test_a_part_between_board_and_case():
     case_share = np.array([0.6, 0.3, 0.0])
     unit, study = study_of('between', part_s=PARTS_S, case_share=case_share)
     calibration = strangers.fitted(study)
-    parts = {one.part for one in calibration.response if one.kind == 'board'}
+    parts = {term.part for term in calibration.response if term.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares, leads = np.array(sorted(parts)).T
     # Ramps determine a time constant to 1 %, and so the case's share in a part's input to 0.01.
@@ -134,7 +136,7 @@ def test_thermometers_that_lag_board_and_case(sensors):
     calibration = strangers.fitted(study)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
-    parts = {one.part for one in calibration.response if one.kind == 'board'}
+    parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
         # Each part lags board + share * (case - board); the share is equal for all axes.
@@ -200,7 +202,7 @@ def test_bags_of_one_warm_up_predict_another():
     given = {'held': program(-15.0, 10.0, (20.0, 20.0, 90.0)), 'part_s': PARTS_S / 4.0}
     _, study = study_of('thaw', up=10, corners=thaw, **given)
     calibration = strangers.fitted(study)
-    assert {one.group for one in calibration.response if any(one.bias)} == {'part'}
+    assert {term.group for term in calibration.response if any(term.bias)} == {'part'}
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
 
@@ -220,7 +222,7 @@ def test_a_curve_over_a_part_is_a_sum_of_columns():
     for axis, power, row in zip(*curves, strict=True):
         np.testing.assert_allclose(row @ columns, (t - m) ** power)
         assert axis in (0, 1, 2)
-    without = replace(model, columns=tuple(one for one in model.columns if one.kind != 'cube'))
+    without = replace(model, columns=tuple(col for col in model.columns if col.kind != 'cube'))
     assert not len(without.part_curves.sums)
 
 
@@ -264,7 +266,7 @@ def test_a_bump_is_no_disturbance_and_no_motion():
 
 @pytest.mark.slow
 def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
-    # Heads lag the board, pendulums lag the heads; stress by board - pendulum changes the bias.
+    # Heads lag the board, pendulums the heads; stress by T_board - T_pendulum changes the bias.
     unit = second_simulator.unit_of('products', 2)
     # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
@@ -281,7 +283,9 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     result = fit_and_correct(records, tests, full_scale=FULL_SCALE['full_scale'], groups=groups)
     least, _ = second_simulator.floor_of(tests)
     assert errors(result.specific_force, result.sd, tests).norm < 2.0 * least
-    stages = {(one.tau_s, one.second_tau_s) for one in result.calibration.response if one.tau_s}
+    stages = {
+        (term.tau_s, term.second_tau_s) for term in result.calibration.response if term.tau_s
+    }
     # The simulator's steps of 2 s add a second to each time constant.
     near = pytest.approx(2.0 * unit.head_s[0], rel=0.01)
     assert any(tau + second == near for tau, second in stages)
@@ -380,7 +384,7 @@ def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
 
 
 @pytest.mark.slow
-def test_soaks_alone_do_not_tell_lags_or_a_loose_thermometer():
+def test_soaks_alone_show_neither_lags_nor_a_loose_thermometer():
     # Soaks determine no time constant. Soaks do not show the lag of the board either, so the
     # gradient of a ramp does not indicate a fault.
     study = next(soaks(1))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Impossible readings of a thermometer are rejected, possible readings never."""
+"""Impossible readings of a thermometer are rejected, possible readings are not."""
 
 import math
 from functools import cache

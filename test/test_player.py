@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Player and recorder on real DDS: every message, byte for byte, in the order of the bag."""
+"""Player and recorder pass every message over DDS byte for byte, in the order of the bag."""
 
 import hashlib
 import subprocess

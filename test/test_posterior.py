@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The posterior: covariance to factor and back, order of parameters, worst attitude."""
+"""The posterior in a file: its factor gives the covariance; its parameters have a fixed order."""
 
 from dataclasses import replace
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The benefit of an earlier calibration and of siblings for a fit with little data."""
+"""An earlier calibration, or siblings of a unit, improve a fit with little data."""
 
 from dataclasses import replace
 from functools import cache

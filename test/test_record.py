@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A test recorded position by position: from a growing bag, and with a driver on real DDS."""
+"""`record` records a test position by position, from a growing bag and from a driver on DDS."""
 
 import json
 import shlex

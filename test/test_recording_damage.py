@@ -234,7 +234,7 @@ HUGE = 1 << 60
         (struct.pack('<BQ', Opcode.CHUNK, 40) + bytes(28) + b'\xff' * 12, 'damaged head'),
         (struct.pack('<BQ', Opcode.CHUNK, HUGE) + bytes(10), 'not whole'),
         (struct.pack('<BQ', Opcode.MESSAGE, 3) + bytes(3), 'message record has 3 bytes'),
-        (struct.pack('<BQ', Opcode.SCHEMA, 3) + bytes(3), 'shorter than its content'),
+        (struct.pack('<BQ', Opcode.SCHEMA, 3) + bytes(3), 'shorter than the lengths in it'),
         (struct.pack('<BQ', 0, 3) + bytes(3), 'not whole'),
     ],
 )  # fmt: skip
@@ -295,7 +295,7 @@ def test_false_times_of_a_chunk_are_found(tmp_path):
     start, end = struct.unpack_from('<QQ', content, position + 9)
     changed = content.replace(struct.pack('<QQ', start, end), struct.pack('<QQ', start + 5, end))
     path.write_bytes(changed)
-    with pytest.raises(RecordingError, match='outside its declared time'):
+    with pytest.raises(RecordingError, match='outside its declared times'):
         read(path)
 
 

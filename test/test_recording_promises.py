@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag that contains less than it states is reported; opening a bag costs little."""
+"""A bag with fewer messages than it states is reported; bags expand within limits."""
 
 import os
 import sqlite3
@@ -37,7 +37,7 @@ def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
         (topic,) = database.execute('select id from topics where name = ?', (ACCEL,)).fetchone()
         query = 'delete from messages where id > 100 and topic_id = ?'
         n_left = 400 - database.execute(query, (topic,)).rowcount
-    text = f'{ACCEL}: {n_left} of the 400 messages listed are there'
+    text = f'{ACCEL}: {n_left} of 400 listed messages are in the bag'
     assert inspect_recording(bag).truncated == text
     assert text in cli('info', bag, code=1).stdout
     calibration = Path(__file__).parent.parent / 'config' / 'calibration.example.yaml'
@@ -46,7 +46,7 @@ def test_rows_deleted_from_a_database_are_reported(tmp_path, cli):
     assert (tmp_path / 'o.mcap').is_file()
 
 
-def test_a_conversion_tells_what_the_bag_lacks(tmp_path, cli):
+def test_a_conversion_reports_messages_that_the_bag_lacks(tmp_path, cli):
     messages = regular_messages(400, accel=IMU_IN)
     for message in messages:
         if message.topic == IMU_IN:  # `convert` requires |f| = g at rest
@@ -56,7 +56,7 @@ def test_a_conversion_tells_what_the_bag_lacks(tmp_path, cli):
         database.execute('delete from messages where id > 400')
     topics = ('--topic', f'board={BOARD}', '--topic', f'case={CASE}')
     done = cli('convert', tmp_path / 'bag', '-o', tmp_path / 'o.mcap', *topics, code=1)
-    assert 'messages listed are there' in done.stderr
+    assert 'listed messages are in the bag' in done.stderr
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
@@ -70,7 +70,7 @@ def test_a_topic_in_the_metadata_alone_is_reported(tmp_path, storage):
     topic['message_count'] = 7
     topics.append(topic)
     path.write_text(yaml.safe_dump(content))
-    assert inspect_recording(bag).truncated == '/gone: 0 of the 7 messages listed are there'
+    assert inspect_recording(bag).truncated == '/gone: 0 of 7 listed messages are in the bag'
 
 
 def test_missing_messages_are_reported_at_the_end(tmp_path):
@@ -80,7 +80,7 @@ def test_missing_messages_are_reported_at_the_end(tmp_path):
         reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
         for _ in range(2):  # the loss is reported once, however often the bag is read
             assert sum(map(len, reader.blocks())) == 40
-        assert reader.info.truncated == f'{ACCEL}: 40 of the 64 messages listed are there'
+        assert reader.info.truncated == f'{ACCEL}: 40 of 64 listed messages are in the bag'
 
 
 def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
@@ -96,7 +96,7 @@ def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
         assert 0 < len(recording.columns) < 8000
         for topic, n_all in ((ACCEL, 8000), (BOARD, 1000), (CASE, 1000)):
             n_read = recording.info.topics[topic][1]
-            assert f'{topic}: {n_read} of the {n_all} messages' in message
+            assert f'{topic}: {n_read} of {n_all} listed messages' in message
     assert f'{packed.name} is unreadable after' in message
     packed.write_bytes(data[:8])
     with pytest.raises(RecordingError, match=rf'{packed.name}: damaged: it has no content'):

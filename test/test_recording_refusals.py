@@ -258,7 +258,7 @@ def test_a_topic_corrected_already_is_refused_with_the_reason(tmp_path):
     path = driver_bag(
         tmp_path / 'bag', ('imu/data_raw', 'imu'), metadata={'corrected_by': 'thermo_comp 0.1'}
     )
-    told = '/imu/data_raw is corrected already: thermo_comp wrote it'
+    told = '/imu/data_raw is no input: thermo_comp wrote it'
     with pytest.raises(RecordingError, match=told):
         open_recording(path, require=('accel',))
     assert told in str(inspect_recording(path).chosen)

@@ -289,9 +289,10 @@ def test_regime_topics_are_offered_as_the_node_offers_them(tmp_path, name):
     with path.open('rb') as file:
         channels = make_reader(file).get_summary().channels.values()
         offered = {
-            one.topic: yaml.safe_load(one.metadata['offered_qos_profiles'])[0] for one in channels
+            channel.topic: yaml.safe_load(channel.metadata['offered_qos_profiles'])[0]
+            for channel in channels
         }
-    assert {topic: one['durability'] for topic, one in offered.items()} == {
+    assert {topic: profile['durability'] for topic, profile in offered.items()} == {
         '/imu0/regime/dynamic': 'transient_local',
         '/imu0/regime/stamped': 'transient_local',
         '/diagnostics': 'volatile',

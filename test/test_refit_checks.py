@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The checks of a chosen model: rests in pieces of an hour, and supports that tilt slowly."""
+"""A fit is repeated with rests in pieces of an hour, which detects supports that tilt slowly."""
 
 import sys
 from dataclasses import replace
@@ -64,9 +64,9 @@ def test_a_rest_of_one_sample_has_a_report(rng):
     # WHY: the first rest of a real recording had one sample, and its fit ended in a division by 0.
     bag = reduce_source(Rest(rng, duration_s=600.0, rate_hz=2.0).source(), full_scale=None)
     (rest,) = bag.intervals
-    one = replace(rest, end_ns=rest.start_ns, time=rest.time[:1])
+    single = replace(rest, end_ns=rest.start_ns, time=rest.time[:1])
     report = PositionReport('rest', rest.start_ns, 0.0, (0.0, 0.0, 1.0), 3.0, 30.0)
-    assert of_whole_rests([report], [replace(bag, intervals=(one,))]) == (report,)
+    assert of_whole_rests([report], [replace(bag, intervals=(single,))]) == (report,)
 
 
 def test_a_refused_second_fit_keeps_the_first(rng, monkeypatch):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The detector on short runs: early, few false alarms, no missed ramps; long runs are in
+The regime detector detects ramps early, with few false alarms, in short runs; long runs are in
 benchmarks/regime.py.
 
 All runs are seeded. The limits allow for the scatter of medians: the median of 12 delays scatters
@@ -286,7 +286,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     t = np.arange(-1500.0, 6600.0)
     truths = lagged(t, RAMP, lag), lagged_twice(t, RAMP, lag, behind)
     case, board = (read(20.0 + truth, noise, quantum, rng) for truth in truths)
-    late, early = (switches(one, t, case, board) for one in (board_too, case_alone))
+    late, early = (switches(settings, t, case, board) for settings in (board_too, case_alone))
     assert [regime for _, regime, _ in late] == [STATIC, DYNAMIC, STATIC]
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]

@@ -320,12 +320,11 @@ def test_all_topics_copies_every_topic(tmp_path, storage):
             AnyReader([mcap]) as reader_of_all,
             Writer(bag, version=9, storage_plugin=StoragePlugin.SQLITE3) as sqlite,
         ):
-            for one in reader_of_all.connections:
-                connection = sqlite.add_connection(
-                    one.topic, one.msgtype, msgdef=one.msgdef.data, rihs01=one.digest or 'RIHS01_0'
-                )
-                for _, stamp, data in reader_of_all.messages(connections=[one]):
-                    sqlite.write(connection, stamp, data)
+            for source in reader_of_all.connections:
+                content = {'msgdef': source.msgdef.data, 'rihs01': source.digest or 'RIHS01_0'}
+                copied = sqlite.add_connection(source.topic, source.msgtype, **content)
+                for _, stamp, data in reader_of_all.messages(connections=[source]):
+                    sqlite.write(copied, stamp, data)
     replay(bag, rich_calibration(), tmp_path / 'out', all_topics=True)
     replay(bag, rich_calibration(), tmp_path / 'plain')
     with AnyReader([tmp_path / 'out']) as copy, AnyReader([mcap]) as given:
@@ -335,7 +334,7 @@ def test_all_topics_copies_every_topic(tmp_path, storage):
                 for bag in (copy, given)
             )
             assert copied == original, topic
-        (output,) = (one for one in copy.connections if one.topic == f'/{IMU_OUT.name}')
+        (output,) = (link for link in copy.connections if link.topic == f'/{IMU_OUT.name}')
         assert output.msgtype == 'sensor_msgs/msg/Imu'
         times = [stamp for _, stamp, _ in copy.messages()]
         assert times == sorted(times)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate: its content is true and complete; the page loads no file, runs no script."""
+"""The certificate is true and complete; its page loads no file and runs no script."""
 
 import re
 import tracemalloc
@@ -206,20 +206,20 @@ def test_hours_of_bag_stay_a_small_page():
 
 
 def test_bag_is_read_in_bounded_memory(tmp_path):
-    one = run(0)
+    simulated = run(0)
     n_times = 50
     with BagWriter(tmp_path / 'long.mcap') as writer:
-        writer.write_temperature('temperature/board', one.board_stamp_ns, one.board)
+        writer.write_temperature('temperature/board', simulated.board_stamp_ns, simulated.board)
         for k in range(n_times):
             step = round(k * 1e9 / RATE_HZ / n_times)
-            writer.write_counts('accel/counts', one.accel_stamp_ns + step, one.counts)
+            writer.write_counts('accel/counts', simulated.accel_stamp_ns + step, simulated.counts)
     tracemalloc.start()
     try:
         (opened,) = open_bags([tmp_path / 'long.mcap'])
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert opened.n_samples == n_times * len(one.counts)
+    assert opened.n_samples == n_times * len(simulated.counts)
     # All samples and stamps in memory would take more than 32 bytes a sample, a block takes less.
     assert peak < 64 * opened.n_samples
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate of a laboratory: its statements, uncertainties and rounding."""
+"""The certificate has the statements of the laboratory, uncertainties and correct rounding."""
 
 import math
 from dataclasses import replace
@@ -149,7 +149,7 @@ def test_statements_that_are_no_text_file_are_refused(tmp_path):
 
 
 def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
-    standards = {one.name: one.standard for one in budget(evidence(), CertificateInfo())}
+    standards = {source.name: source.standard for source in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
     # Noise, attitude and model add up to the claimed sd; the residual is below the claimed sd.
@@ -170,7 +170,7 @@ def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
 def test_residual_beyond_the_claim_is_repeatability():
     judgement, claim = evidence().judgement, combined(budget(evidence(), CertificateInfo()))
     doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=3.0 * claim))
-    standards = {one.name: one.standard for one in budget(doubtful, CertificateInfo())}
+    standards = {source.name: source.standard for source in budget(doubtful, CertificateInfo())}
     whole = combined(budget(doubtful, CertificateInfo()))
     assert standards['repeatability'] == pytest.approx(8.0**0.5 * claim)
     assert whole == pytest.approx(3.0 * claim)
@@ -189,7 +189,7 @@ def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
     # The gravity uncertainty given to the fit is in the covariance, and is not counted twice.
     stated = replace(evidence(), gravity_sd=2e-5)
     assert 'withheld' not in render_report(stated, figures=[])
-    assert {one.name: one.standard for one in budget(stated, info)}['gravity'] == 0.0
+    assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 0.0
 
 
 def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
@@ -244,10 +244,10 @@ def test_values_and_deviations_have_one_place_where_u_is_withheld(is_known, tmp_
                 n_withheld += expanded == '–'
                 assert len(text.partition('.')[2]) == len(deviation.partition('.')[2])
                 # A withheld uncertainty does not change the numbers by more than their rounding.
-                for one, place in ((text, k), (deviation, k + 2)):
-                    half = 0.5 * 10.0 ** -len(one.partition('.')[2])
+                for value, place in ((text, k), (deviation, k + 2)):
+                    half = 0.5 * 10.0 ** -len(value.partition('.')[2])
                     number, expected = (
-                        float(cell.replace('−', '-')) for cell in (one, others[place])
+                        float(cell.replace('−', '-')) for cell in (value, others[place])
                     )
                     tolerance = half + 0.06 * float(others[k + 1])
                     assert number == pytest.approx(expected, abs=tolerance)
@@ -274,7 +274,7 @@ def test_the_uncertainty_of_gravity_is_that_of_the_scale_factors(tmp_path):
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert (
         rows['bias x']
-        == {one.quantity: one for one in results(evidence(), CertificateInfo(), ())}['bias x']
+        == {row.quantity: row for row in results(evidence(), CertificateInfo(), ())}['bias x']
     )
 
 

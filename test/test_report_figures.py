@@ -36,12 +36,12 @@ def test_bias_and_scale_curves_by_hand():
         regime_set(*[axis_set((0.0, 0.3), (1.0, 7e-5), delta=delta)] * 3, rate_range_k_min=(0, 2))
         for delta in (0.0, 0.5)
     )
-    one = calibration(
+    unit = calibration(
         static=static,
         dynamic=dynamic,
         response=(term('board', (0.3, 0.0, 0.0), (0.0, 1e-6, 0.0), tau_s=600.0),),
     )
-    soak, heating = curves(one)
+    soak, heating = curves(unit)
     assert (soak.program.label, heating.program.label) == ('soak', 'heating at 1 K/min')
     count = 1.0 / 300.0 / MICRO_G
     t = soak.temperature - 20.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rest log: rests gathered on real DDS, and the files of a killed node or on a full disk."""
+"""The node logs rests on DDS; a killed node or a full disk damages the rest log little."""
 
 import json
 import signal
@@ -38,15 +38,15 @@ def rest(number):
     return Rest(stamp, 1000, (1.0, -2.0, 2941.25), (3.0,) * 3, (*state, 0.25, 0.0), (0.5,))
 
 
-def test_a_state_with_rates_survives_the_log_and_one_without_names_none():
+def test_a_rest_with_rates_and_a_rest_without_rates_survive_the_log():
     between = ('board', 600.0, 60.0, 'case', 0.4)
     memory = MemorySpec(('case',), (('board', 60.0), between), ((600.0, 0.8, *between[2:]),),
                         ('case',))  # fmt: skip
     start = replace(START, memory=memory)
-    one = rest(1)
-    one = replace(one, shares=(0.5, 0.25),
-                  state=(*one.state[:7], 0.01, 1e-9, *one.state[7:], 0.4, 0.0, 0.2))  # fmt: skip
-    assert decode(encode(start) + encode(one)) == ([(start, one)], 0)
+    row = rest(1)
+    row = replace(row, shares=(0.5, 0.25),
+                  state=(*row.state[:7], 0.01, 1e-9, *row.state[7:], 0.4, 0.0, 0.2))  # fmt: skip
+    assert decode(encode(start) + encode(row)) == ([(start, row)], 0)
     assert b'"memory":[["case"],[["board",60.0]],[]]' in encode(START)
 
 
@@ -71,7 +71,7 @@ def send(driver, samples, begin=0):
 
 
 def logged(folder):
-    return [one for file in sorted(folder.glob('*.rests')) for one in decode(file.read_bytes())[0]]
+    return [row for file in sorted(folder.glob('*.rests')) for row in decode(file.read_bytes())[0]]
 
 
 def finder():
@@ -88,17 +88,17 @@ def test_windows_are_means_of_ten_seconds_at_rest():
     samples = np.concatenate((first, handled, second))
     stamps = START_NS + np.arange(len(samples)) * CYCLE_NS
     whole = finder().add(stamps, samples)
-    assert [(one.stamp_ns - START_NS) / SECOND_NS for one in whole] == [5.0, 15.0, 31.0, 41.0]
+    assert [(row.stamp_ns - START_NS) / SECOND_NS for row in whole] == [5.0, 15.0, 31.0, 41.0]
     parts = [part[k : k + 500] for part in (first, second) for k in (0, 500)]
-    for one, part in zip(whole, parts, strict=True):
-        assert np.allclose(one.mean, part.mean(axis=0), atol=1e-9)
-        assert np.allclose(one.sd, part.std(axis=0), rtol=0.05)
+    for row, part in zip(whole, parts, strict=True):
+        assert np.allclose(row.mean, part.mean(axis=0), atol=1e-9)
+        assert np.allclose(row.sd, part.std(axis=0), rtol=0.05)
     # The result does not depend on the blocks in which the samples arrive.
     pieces, rests = finder(), []
     for cut in np.split(np.arange(len(samples)), [7, 333, 334, 1201]):
         rests += pieces.add(stamps[cut], samples[cut])
-    assert [one.stamp_ns for one in rests] == [one.stamp_ns for one in whole]
-    assert np.allclose([one.mean for one in rests], [one.mean for one in whole], atol=1e-9)
+    assert [row.stamp_ns for row in rests] == [row.stamp_ns for row in whole]
+    assert np.allclose([row.mean for row in rests], [row.mean for row in whole], atol=1e-9)
 
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
@@ -113,18 +113,18 @@ def test_rests_are_found_at_any_rate_of_samples(rate, rng):
     samples[n // 2 :] = samples[n // 2 :, [2, 1, 0]]
     whole = finder().add(stamps, samples)
     # At most two windows are lost at the change of attitude, and one at the end of the samples.
-    assert sum(one.n for one in whole) >= 0.6 * n
+    assert sum(row.n for row in whole) >= 0.6 * n
     assert len(whole) >= 6
-    for one in whole:
-        is_first = one.stamp_ns < START_NS + 60 * SECOND_NS
+    for row in whole:
+        is_first = row.stamp_ns < START_NS + 60 * SECOND_NS
         expected = (30.0, -20.0, 2941.0) if is_first else (2941.0, -20.0, 30.0)
-        assert np.abs(np.array(one.mean) - expected).max() < 5.0 * 3.0 * excess / np.sqrt(one.n)
+        assert np.abs(np.array(row.mean) - expected).max() < 5.0 * 3.0 * excess / np.sqrt(row.n)
     pieces, found = finder(), []
     for cut in np.split(np.arange(n), np.sort(rng.choice(n, 20, replace=False))):
         if len(cut):
             found += pieces.add(stamps[cut], samples[cut])
-    assert [one.stamp_ns for one in found] == [one.stamp_ns for one in whole]
-    assert np.allclose([one.mean for one in found], [one.mean for one in whole], atol=1e-9)
+    assert [row.stamp_ns for row in found] == [row.stamp_ns for row in whole]
+    assert np.allclose([row.mean for row in found], [row.mean for row in whole], atol=1e-9)
 
 
 @pytest.mark.parametrize('fault', ['moves', 'shakes', 'stuck', 'tilts', 'saturated', 'gap'])
@@ -148,11 +148,11 @@ def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
 
 def test_windows_of_a_rest_of_a_day_are_kept_ever_more_rarely():
     # Windows kept of a rest: 60 in 10 min, one a minute up to 1 h, then one in 5 min.
-    kept, one = 0, finder()
+    kept, searching = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):
         stamps = START_NS + (np.arange(len(samples)) + minute * len(samples)) * SECOND_NS // 6
-        kept += len(one.add(stamps, samples))
+        kept += len(searching.add(stamps, samples))
     assert kept == 60 + 50 + 3
 
 
@@ -161,15 +161,15 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     content = encode(START) + b''.join(encode(rest(k)) for k in range(9))
     whole, n_damaged = decode(content)
     assert n_damaged == 0
-    assert [one for _, one in whole] == [rest(k) for k in range(9)]
-    assert {one for one, _ in whole} == {START}
+    assert [row for _, row in whole] == [rest(k) for k in range(9)]
+    assert {start for start, _ in whole} == {START}
     cut = decode(content[:place])[0]
     assert cut == whole[: len(cut)]
     changed = bytearray(content)
     changed[place % len(content)] = value
-    left = [one for _, one in decode(bytes(changed))[0]]
+    left = [row for _, row in decode(bytes(changed))[0]]
     # A changed byte in a rest log loses one rest, a lost newline two, a damaged start line all.
-    assert all(one in [rest(k) for k in range(9)] for one in left)
+    assert all(row in [rest(k) for k in range(9)] for row in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 
 
@@ -187,9 +187,9 @@ def test_a_line_with_a_checksum_may_hold_anything(value, place):
         text = json.dumps(data).encode()
         rests, n_damaged = decode(encode(START) + b'%08x %s\n' % (zlib.crc32(text), text))
         assert len(rests) + n_damaged == 1
-        for _, one in rests:
-            assert np.isfinite([*one.mean, *one.sd, *one.state, *one.shares]).all()
-            assert (len(one.mean), len(one.sd), len(one.state)) == (3, 3, 9)
+        for _, row in rests:
+            assert np.isfinite([*row.mean, *row.sd, *row.state, *row.shares]).all()
+            assert (len(row.mean), len(row.sd), len(row.state)) == (3, 3, 9)
 
 
 def test_thinning_halves_the_rests_and_keeps_each_start():
@@ -197,7 +197,7 @@ def test_thinning_halves_the_rests_and_keeps_each_start():
     lines = [encode(start) + b''.join(map(encode, map(rest, range(5)))) for start in starts]
     content = thinned(b''.join(lines))
     rests = decode(content)[0]
-    assert [one.stamp_ns for _, one in rests] == 3 * [rest(k).stamp_ns for k in (0, 2, 4)]
+    assert [row.stamp_ns for _, row in rests] == 3 * [rest(k).stamp_ns for k in (0, 2, 4)]
     while len(content) > len(thinned(content)):
         content = thinned(content)
     assert [start for start, _ in decode(content)[0]] == starts
@@ -292,8 +292,8 @@ def test_the_diagnostics_warn_of_a_full_disk(small_disk, unit, peer):
 
         def warned():
             return any(
-                'not kept in the rest log: No space left on device' in one.status[0].message
-                for one in heard
+                'not kept in the rest log: No space left on device' in message.status[0].message
+                for message in heard
             )
 
         peer.wait_for(warned, 'the warning')

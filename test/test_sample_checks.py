@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid samples (stuck, zero, at too high a rate) are treated alike in streams and in blocks."""
+"""Invalid samples (stuck, zero, too fast) are treated alike in streams and in blocks."""
 
 import math
 
@@ -83,26 +83,26 @@ def test_standstills_are_found_however_long_the_batch(parts, cuts, period):
     samples = 1.0 + np.cumsum(1.0 - stands.reshape(-1, 3), axis=0)
     samples[7::97, 1] = np.nan
     stamps = np.arange(len(samples), dtype=np.int64) * 20_000_000
-    one, many = (StuckCheck(period / 50.0, 30.0) for _ in range(2))
+    single, batched = (StuckCheck(period / 50.0, 30.0) for _ in range(2))
     expected = []
     for stamp_ns, (x, y, z) in zip(stamps.tolist(), samples.tolist(), strict=True):
-        last = one.last
+        last = single.last
         if x == last[0] or y == last[1] or z == last[2]:
-            expected.append(one.again(stamp_ns, x, y, z))
+            expected.append(single.again(stamp_ns, x, y, z))
         else:
-            one.last, one.runs = (x, y, z, stamp_ns), ()
+            single.last, single.runs = (x, y, z, stamp_ns), ()
             expected.append(False)
     collected = []
     begin = 0
     for cut in [*cuts, len(stamps)]:
         end = min(begin + cut, len(stamps))
         if end > begin:
-            collected += many.find(stamps[begin:end], samples[begin:end]).tolist()
+            collected += batched.find(stamps[begin:end], samples[begin:end]).tolist()
         begin = end
     assert collected == expected
     # NaN before the first sample.
-    np.testing.assert_array_equal(many.last, one.last)
-    for run, other in zip(one.runs, many.runs, strict=bool(one.runs)):
+    np.testing.assert_array_equal(batched.last, single.last)
+    for run, other in zip(single.runs, batched.runs, strict=bool(single.runs)):
         np.testing.assert_array_equal(np.hstack(run), np.hstack(other))
 
 

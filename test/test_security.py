@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes from outside stay data, and the node opens only the topics and services of the policy."""
+"""Bytes from outside are never executed; the node opens only topics and services of the policy."""
 
 import xml.etree.ElementTree as ET
 
@@ -25,7 +25,7 @@ def allowed():
     for group in profile:
         ((what, verdict),) = group.attrib.items()
         assert verdict == 'ALLOW'
-        names = [(one.text or '').replace('~', f'/{NODE}') for one in group]
+        names = [(entry.text or '').replace('~', f'/{NODE}') for entry in group]
         collected[what] = {name if name.startswith('/') else f'/{name}' for name in names}
     return collected
 

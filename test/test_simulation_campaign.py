@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Programs, whole tests in memory and ready-made units, whose converter loses no charge."""
+"""Chamber programs, simulated tests and ready-made units are as described."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -53,7 +53,7 @@ def test_a_perfect_model_leaves_the_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # The bias walk has a mean square of 9 * 7.3 / 2 ug^2 per axis in 7.3 h; the wide limits
+        # The random walk has a mean square of 9 * 7.3 / 2 ug^2 per axis in 7.3 h; the wide limits
         # allow for the scatter of 3 runs.
         assert 4.0 < vector < 20.0
     else:
@@ -125,8 +125,8 @@ def test_a_switched_load_heats_its_part():
     loaded = replace(unit, load=load)
     program = parse_cyclogram('20 16h')
     on, off = (
-        simulate(one, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
-        for one in (loaded, unit)
+        simulate(model, program, STATION.up, rate_hz=0.1, temperature_rate_hz=0.01).truth
+        for model in (loaded, unit)
     )
     warmer = of_part(on, 'board') - of_part(off, 'board')
     np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)

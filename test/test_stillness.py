@@ -55,7 +55,7 @@ def test_a_flight_is_no_rest(rng, with_gyro):
         reduce_bag(source(accel, gyro if with_gyro else None), OPTIONS)
 
 
-def test_a_smooth_flight_is_told_by_its_gyroscope(rng):
+def test_a_smooth_flight_is_recognised_by_its_gyroscope(rng):
     # A noisy sensor at rest may scatter by 15 mg, but no gyroscope at rest shows 4 deg/s.
     accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
     with pytest.raises(FitError, match='its angular rate is never that of a rest'):
@@ -141,7 +141,7 @@ def test_the_user_sets_the_shortest_rest(rng):
 
 
 def test_a_ramp_moves_no_unit_at_rest(rng):
-    # A drift of 60 ug per cell, 60 times the noise, is not a motion, a knock of 0.1 mrad is.
+    # A drift of 60 ug per cell, 60 times the noise, is not a motion; a knock of 0.1 mrad is.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The generators and the judge of benchmarks/strangers.py against closed forms."""
+"""The units and the scores of benchmarks/strangers.py agree with closed forms."""
 
 from dataclasses import replace
 
@@ -263,9 +263,9 @@ def test_a_cubic_by_scipy_finds_a_pose_s_drift():
         of_attitudes(given, board) for board in (np.linspace(5, 35, 31), np.array([9.0, 22]))
     ]
     fit, held = (
-        Minutes(one.samples[: len(one.board) // 18], one.board[: len(one.board) // 18],
-                one.force[: len(one.board) // 18])
-        for one in minutes_
+        Minutes(bag.samples[: len(bag.board) // 18], bag.board[: len(bag.board) // 18],
+                bag.force[: len(bag.board) // 18])
+        for bag in minutes_
     )  # fmt: skip
     error = strangers.error_of([by_drift([fit], 1.0, order=3)(held)], [held], is_drift=True)
     assert error.vector < 1e-6

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A survey of a recording lists the data that a fit would lack."""
+"""A survey of a recording lists the data that a fit lacks."""
 
 import numpy as np
 import pytest
@@ -58,25 +58,25 @@ def test_a_good_recording_has_no_findings(tmp_path):
         (up_and_down(20.0, 24.0), {}, ['spans 4.0 K: 25 K or more are advised']),
         (up_and_down(10.0, 28.0), {}, ['spans 18.0 K: 25 K or more are advised']),
         (up_and_down(5e3, 35e3), {},
-         [f'{name} reads 5000 .. 3.5e+04: that is not degC' for name in ('board', 'case')]),
+         [f'{name} reads 5000 .. 3.5e+04: this is not in degC' for name in ('board', 'case')]),
         (up_and_down(278.0, 308.0), {},
          [f'temperature/{name} reads 278 .. 308 degC: that looks like kelvins'
           for name in ('board', 'case')]),
         (None, {}, ['no board temperature', 'no case temperature']),
         (up_and_down(5.0, 35.0), {'gap_s': 30.0, 'backwards': True},
          ['gaps between samples: 1, the longest 30.2 s',
-          'stamps not later than that of the sample before: 1; those samples are left out']),
+          'samples with a stamp not later than an earlier stamp: 1; these samples are left out']),
     ],
 )  # fmt: skip
 def test_faults_of_a_recording_are_named(tmp_path, temperature, options, text):
     findings = survey(tmp_path / 'bag', temperature, **options).findings
-    assert [one for one in text if not any(one in found for found in findings)] == []
+    assert [part for part in text if not any(part in found for found in findings)] == []
 
 
 @pytest.mark.parametrize(
     ('back_s', 'text'),
     [
-        (600.0, 'the sample before: 3000; those'),
+        (600.0, 'an earlier stamp: 3000; these'),
         (7200.0, 'than an hour (1 times): a fit takes each jump'),
     ],
 )
@@ -89,7 +89,7 @@ def test_samples_after_a_clock_was_set_back_are_counted(tmp_path, back_s, text):
 def test_a_missing_cooling_ramp_is_reported(tmp_path):
     heating = np.interp(np.arange(3600.0), [0, 600, 3000, 3600], [5.0, 5.0, 35.0, 35.0])
     findings = survey(tmp_path / 'bag', heating).findings
-    assert findings == ['no cooling ramp: record one, else the correction in it is extrapolated']
+    assert findings == ['no cooling ramp: record one, or cooling is corrected by extrapolation']
 
 
 def test_a_quantum_is_no_ramp(tmp_path):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text from outside (serials, topics, metadata) is printable, without escape sequences."""
+"""Text from outside (serials, topics, metadata) is printed without escape sequences."""
 
 import io
 import json

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal tracker: memory against its closed form, blend of sets, lost sensors, restart."""
+"""The thermal tracker agrees with closed forms: memory, blend of sets, lost sensors, restart."""
 
 import math
 
@@ -53,28 +53,28 @@ def test_memory_start_is_unknown_and_settles():
 
 
 def test_the_thermal_state_does_not_depend_on_earlier_queries():
-    one = ThermalTracker(DetectorSettings(), LAG)
+    tracker = ThermalTracker(DetectorSettings(), LAG)
     other = ThermalTracker(DetectorSettings(), LAG)
     t = np.arange(0, 3000)
     board = 20.0 + 0.005 * t
-    feed(one, board, board + 1.0)
+    feed(tracker, board, board + 1.0)
     for k, celsius in enumerate(board.tolist()):
         other.read('board', k * SECOND_NS, celsius)
         other.read('case', k * SECOND_NS, celsius + 1.0)
         other.sample(k * SECOND_NS + 123)
         other.is_settled(k * SECOND_NS + 456_000_000)
     at = 3000 * SECOND_NS
-    assert one.sample(at) == other.sample(at)
+    assert tracker.sample(at) == other.sample(at)
 
 
 def test_the_thermal_state_does_not_depend_on_the_origin_of_time():
     epoch_ns = 1_790_000_000 * SECOND_NS
-    one = ThermalTracker(DetectorSettings(), LAG)
+    tracker = ThermalTracker(DetectorSettings(), LAG)
     other = ThermalTracker(DetectorSettings(), LAG)
     board = 20.0 + 0.01 * np.arange(500)
-    feed(one, board, board + 2.0)
+    feed(tracker, board, board + 2.0)
     feed(other, board, board + 2.0, start_s=1_790_000_000)
-    assert one.sample(500 * SECOND_NS) == other.sample(epoch_ns + 500 * SECOND_NS)
+    assert tracker.sample(500 * SECOND_NS) == other.sample(epoch_ns + 500 * SECOND_NS)
 
 
 def ramp(tracker):

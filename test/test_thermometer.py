@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermometer against closed-form temperatures: error, claimed variance, outliers."""
+"""The thermometer's estimates agree with closed-form temperatures, also with outliers."""
 
 import math
 

@@ -89,9 +89,9 @@ def test_a_third_thermometer_explains_what_board_and_case_do_not(runs, tmp_path)
         replace(term, bias=(0.0,) * 3, scale=(0.0,) * 3) if term.sensor == 'lid' else term
         for term in calibration.response
     )
-    for sees_lid, one in ((False, replace(calibration, response=blind)), (True, calibration)):
+    for sees_lid, tried in ((False, replace(calibration, response=blind)), (True, calibration)):
         output = tmp_path / f'{sees_lid}.mcap'
-        replay(held_out, one, output)
+        replay(held_out, tried, output)
         corrected = read_recording(
             output, Topics(imu='imu/data_raw', input='imu'), require=('accel',)
         ).columns
@@ -103,7 +103,7 @@ def test_a_third_thermometer_explains_what_board_and_case_do_not(runs, tmp_path)
         n = int(use.sum()) // 120 * 120
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G
-        judged = evaluate([held_out], [('unit', one)]).judgements['unit']
+        judged = evaluate([held_out], [('unit', tried)]).judgements['unit']
         norms = np.linalg.norm(judged.windows.force, axis=1)
         spreads[sees_lid] = float(np.std(norms)) / MICRO_G
     switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to recordings in which the unit is turned while its temperature changes."""
+"""Fits are right for recordings in which the unit is turned while its temperature changes."""
 
 from dataclasses import replace
 
@@ -55,7 +55,7 @@ def rms(values):
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     # WHY: a fit with products and squares of a lag, but without the lag, had left-out errors as
-    # small as with the lag. At twice the rates a fit without the lag erred by over 1.7 mg.
+    # small as with the lag. At twice the ramp rates the fit without the lag erred by over 1.7 mg.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
@@ -82,8 +82,8 @@ def test_a_single_turn_on_is_claimed_with_the_repeatability_of_its_grade():
     rng = np.random.default_rng(3)
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
-    # The noise of 0.25 mg in 1 Hz is that of a MEMS, whose turn-ons repeat within 0.1 to 1 mg:
-    # the claim is at least their geometric mean, 0.3 mg, and at most 1.5 times their largest.
+    # The noise of 0.25 mg in 1 Hz is that of a MEMS, whose turn-ons repeat within 0.1 to 1 mg: the
+    # claimed sd must be at least 0.3 mg, the geometric mean of 0.1 and 1 mg, and at most 1.5 mg.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
 
 

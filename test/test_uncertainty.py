@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The covariance after a start in a ramp, with a lost thermometer, and beyond 1 g."""
+"""The covariance covers a start in a ramp, a lost thermometer, and forces beyond 1 g."""
 
 import math
 

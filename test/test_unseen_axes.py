@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The claim for axes that no position had along gravity at some temperatures."""
+"""The claimed sd covers axes that no position had along gravity at some temperatures."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -68,7 +68,7 @@ def test_nothing_is_added_where_all_positions_show_the_same_axes(up):
     only_x = np.allclose(up, [1.0, 0.0, 0.0])
     assert unseen_axes.with_unseen_axes(fit, ((), ()), None) == [(), ()]
     assert unseen_axes.judge_unseen_axes(fit, None) == []
-    # A prior knows all axes in its range, also those that no position shows.
+    # A prior determines all axes within its temperature range, also axes that no position shows.
     (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), prior_of(0.0, 40.0))
     assert bool(lack) == only_x
 
@@ -94,7 +94,7 @@ def kinked(bag, unit):
 @pytest.mark.parametrize('number', [1, 2])
 @pytest.mark.parametrize('is_prior', [False, True])
 def test_one_cold_bag_does_not_claim_the_scale_factors_of_all_axes(number, is_prior):
-    # WHY: 138 ug were left at a claimed 14 ug.
+    # WHY: the error was 138 ug at a claimed sd of 14 ug.
     rng = rng_of('unseen axes', number)
     unit = navigation(rng)
     warm = positions(unit, WARM, spread(12, rng), rng)

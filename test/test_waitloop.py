@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Undocumented parts of rclpy, used by waitloop.py only: a change in rclpy fails these tests."""
+"""Undocumented parts of rclpy, which waitloop.py uses, have not changed."""
 
 import threading
 import time

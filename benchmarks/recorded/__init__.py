@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns recordings that other people made, as `test/test_real_data.py` reads them.
+Owns the access to recordings that other people made, for `test/test_real_data.py`.
 
-The recordings are not part of the project: they are read from a folder beside the project, turned
-into bags in a temporary directory.
+The recordings are not part of the project: they are read from a folder beside the project, and
+converted to bags in a temporary directory.
 """
 
 from __future__ import annotations

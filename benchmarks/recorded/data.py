@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the conversion of the recordings' files to bags."""
+"""Owns the conversion of recordings that other people made to bags."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def freezer_bag(folder: Path, work: Path) -> Path:
 
 
 def handheld_bag(folder: Path, work: Path, unit: int) -> Path:
-    """Convert one handheld unit with the column map that ships with the project."""
+    """Convert a handheld unit with the column map that ships with the project."""
     bag = work / f'handheld{unit}.mcap'
     columns = load_column_map(ROOT / 'config' / 'columns' / 'handheld.yaml')
     columns = replace(columns, serial=f'mpu9150-{unit}')
@@ -39,7 +39,7 @@ def handheld_bag(folder: Path, work: Path, unit: int) -> Path:
 
 
 def faces_bag(folder: Path, work: Path) -> Path:
-    """Convert the Ferraris session: its annotations are not read, only its counts."""
+    """Convert the counts of the Ferraris session; the annotations are not read."""
     bag = work / 'faces.mcap'
     columns = ColumnMap(
         serial='ferraris',

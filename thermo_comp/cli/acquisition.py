@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the progress of a test during recording: positions, resulting accuracy, missing data.
+Owns the state of a test during recording: its positions, resulting accuracy, missing data.
 
 Blocks of samples are added as they arrive. A rest in another direction than the present position
 begins the next position; knocks and handling in between belong to the previous position.
@@ -21,21 +21,21 @@ from ..recording.stillness import CellAccumulator, Cells, still_intervals
 from ..typing import Floats, Ints
 from ..unit.gravity import STANDARD_GRAVITY
 
-# Minimum length of a rest [s]; the wanted soak if that is shorter.
+# Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Minimum length of a cell (samples averaged together) [s], and number of samples from which the
-# length is chosen.
+# Minimum length of a cell (samples averaged together) [s]; number of samples needed to choose the
+# length.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
-# Number of earlier cells that are searched again for the start of a rest.
+# Number of cells, already searched, that are searched again for the start of a rest.
 _LOOKED_BACK = 200
-# Sd of a position's force by hysteresis, mounting and drift, for any length of the rest [g].
+# Sd of the mean force in a position by hysteresis, mounting and drift, however long the rest [g].
 _FLOOR_SD = 2e-5
-# Ratio of a rest's noise to the median of all rests, above which the rest is 'restless'; ratio to
-# the noise of the previous rest, above which the unit is held by hand.
+# A rest is 'restless' if its noise exceeds this multiple of the median over all rests. A still
+# interval whose noise exceeds the second multiple of that of earlier rests is a unit held by hand.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
-# A stamp earlier than any other [ns].
+# A stamp earlier than any stamp of a sample [ns].
 _FIRST_NS = -(1 << 62)
 
 Surveys = Mapping[str, ThermometerSurvey]
@@ -44,8 +44,8 @@ Surveys = Mapping[str, ThermometerSurvey]
 @dataclass(frozen=True)
 class Position:
     """
-    A position: direction of the force (NaN before a rest), duration and number of its rests, noise
-    of its mean, temperatures, and the reason why it is not good ('' = good).
+    A position: direction of the force (NaN before a rest), duration and number of rests, sd of the
+    mean force, temperatures, and the reason why the position does not count ('' if it counts).
     """
 
     up: Floats
@@ -63,9 +63,9 @@ class Account:
 
     The last of `positions` is unfinished. `worst_sd_g` is the sd of the force in the worst
     attitude, `constants_sd` the sd of bias [g], relative scale and M [rad], as in `coverage`.
-    `next_up` is the recommended next direction, `next_deg` away from `now`, the direction of the
-    newest reading (NaN before any); `farthest_up` is the direction farthest from all positions.
-    `findings` are texts about missing data.
+    `next_up` is the direction recommended for the next position, at an angle of `next_deg` to
+    `now`, the direction of the newest sample (NaN without samples); `farthest_up` is the direction
+    farthest from all positions. `findings` are texts about missing data.
     """
 
     positions: tuple[Position, ...]
@@ -85,7 +85,7 @@ class Account:
 
 @dataclass(frozen=True)
 class _Rest:
-    """Statistics of a position's still cells, in input units, and its thermometers."""
+    """Statistics of the still cells of a position, in input units, and of its thermometers."""
 
     surveys: Surveys
     mean: Floats = field(default_factory=lambda: np.full(3, np.nan))
@@ -96,7 +96,7 @@ class _Rest:
 
 
 class Acquisition:
-    """A running test; `soak_s` is the wanted length of a rest, `offset` the reading at 0 g."""
+    """A test that is running; `soak_s` is the wanted rest [s], `offset` the reading at 0 g."""
 
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset
@@ -108,13 +108,14 @@ class Acquisition:
     def _start(self) -> None:
         """Restart the search; the next samples may have another clock."""
         self._accumulator = CellAccumulator(_CELL_S, None)
-        # Samples kept until there are enough to choose the length of a cell.
+        # Samples held until they suffice to choose the length of a cell; then None.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
         #: Earliest stamp at which the next position can begin [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
-        # Mean sample of the first rest of a position; after a quieter rest the search misses it.
+        # Mean sample of the first rest of a position, kept because a later search, with the noise
+        # of a quieter rest, misses the first rest.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
@@ -126,7 +127,7 @@ class Acquisition:
         begins: list[int] = []
         stamp_ns, samples = block.accel_stamp_ns, block.accel - self._offset
         if self._newest_ns - int(stamp_ns[0]) > _STEP_BACK_NS:
-            # The driver restarted, with another clock.
+            # The stamps go back: the driver has restarted.
             self.begin()
             begins.append(int(stamp_ns[0]))
         self._newest_ns = int(stamp_ns[-1])
@@ -155,20 +156,20 @@ class Acquisition:
         self._start()
 
     def _cells(self) -> Cells:
-        """Return the cells of the position."""
-        cells = self._accumulator.finish()
+        """Return the cells of the present position."""
+        cells = self._accumulator.cells()
         begin_s = (self._begin_ns - cells.start_ns) * 1e-9
         return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 
     def _next_position_ns(self, cells: Cells) -> int | None:
-        """Find the stamp at which the sensor first rests in another direction [ns]."""
+        """Return the stamp at which a rest in another direction begins [ns], or None."""
         # Search only the new cells and the last `_LOOKED_BACK` earlier cells.
         n_looked, self._n_looked = self._n_looked, len(cells.count)
         cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest for a further rest, by the noise of these cells.
+        # Search the cells after the last rest once more, relative to the noise of these cells.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [
@@ -201,7 +202,7 @@ class Acquisition:
         self._centre = coverage.rough_centre(means)
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
-        """Combine the rests of the position, up to the next position."""
+        """Combine the rests of the position that end before `end_ns`."""
         by_name = {
             name: survey_thermometer([_part(part, _FIRST_NS, end_ns) for part in parts])
             for name, parts in self._readings.items()
@@ -272,7 +273,7 @@ class Acquisition:
         )
 
     def _reason(self, rest: _Rest, up: Floats, noise: float, before: Sequence[Position]) -> str:
-        """Return why a position is not good; '' if it is good."""
+        """Return why a position does not count; '' if it counts."""
         if not rest.n_rests:
             return 'not at rest yet'
         if np.isnan(up).any():
@@ -296,7 +297,7 @@ class Acquisition:
             return np.full(3, np.nan), False
         cells = cells.part(slice(-_LOOKED_BACK, None))
         ranges = still_intervals(cells, 0.0)
-        # The last cell is incomplete, and the previous cell may be adjacent to a motion.
+        # The last cell is incomplete, so the previous cell decides rest and direction.
         is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
         last = cells.mean[-2:-1] if len(cells.count) > 1 else cells.mean
         return self._directions(last)[0], is_still
@@ -317,7 +318,7 @@ def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
 
 
 def _combined_surveys(surveys: Sequence[Surveys]) -> Surveys:
-    """Combine the surveys of each thermometer in several positions."""
+    """Combine the surveys of each thermometer over several positions."""
     by_name: dict[str, list[ThermometerSurvey]] = {}
     for name, survey in (item for position in surveys for item in position.items()):
         by_name.setdefault(name, []).append(survey)

@@ -4,8 +4,8 @@
 Owns the entry point of the command line: its commands and exit codes.
 
 Exit code 0: done; 1: the data or the result is bad; 2: the command line is wrong; 3: an update
-gains nothing; 70: a bug of this program, whose traceback goes into a file. Every error is one line
-on stderr.
+gains nothing; 70: a bug of thermo_comp, whose traceback is saved in a file. An error is printed as
+a line on stderr.
 
 Heavy libraries are imported by the commands when they run, so that ``--help`` is fast.
 """
@@ -25,13 +25,13 @@ from ..text import hold_standard_streams
 from . import bags, convert, field, fit, fleet, judge, output, record, simulate
 from .shared_options import expanded, option
 
-# Base class of all errors in a command line, which typer does not export.
+# Base class of all errors of a command line; typer does not export this class.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]
 
-#: Typer's message for an option whose value is not a number: option names, kind of number.
+#: Matches typer's message for a value that is not a number: option names, kind of number.
 _NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
 
-# Print the bounds of a number on a separate line: otherwise long option names are cut.
+# Print the bounds of a number on a separate line: otherwise `--help` cuts long option names.
 rich_utils.RANGE_STRING = '\n[{}]'
 
 app = typer.Typer(
@@ -73,7 +73,7 @@ app.add_typer(_fleet)
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and leave the process with its exit code."""
     hold_standard_streams()
-    # One BLAS thread: with several, small matrices take up to 16 times longer on busy cores.
+    # Use one BLAS thread: with several threads on busy cores small matrices take 16 times longer.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
@@ -116,9 +116,9 @@ def run(arguments: list[str]) -> int:
 
 
 def _plain(message: str, arguments: list[str]) -> str:
-    """Rewrite a message of typer about a value, and add the value."""
+    """Rewrite a message of typer in plain words; for a number, add the value that was given."""
     message = message.replace('Value error, ', '').replace('Input should be', 'must be')
-    message = message.removeprefix('Invalid value: ')  # the message itself names the option
+    message = message.removeprefix('Invalid value: ')  # the rest of the message names the option
     option = _NO_NUMBER.search(message)
     if option is None:
         return message
@@ -133,7 +133,7 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Split arguments into the command's and ROS' (from ``--ros-args`` up to ``--``)."""
+    """Split arguments into those of the command and of ROS (from ``--ros-args`` up to ``--``)."""
     for_command: list[str] = []
     for_ros: list[str] = []
     target = for_command

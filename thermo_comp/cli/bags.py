@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from ..unit.calibration import Calibration
 
 _BAG = argument('Recording: rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
-#: Reasons for which a sample is left out, by the counters of the compensator.
+#: Texts for the counters of the compensator: why samples are left out.
 _LEFT_OUT = {
     'n_not_finite': 'samples that are not finite',
     'n_saturated': 'samples at the full scale of the calibration',
-    'n_out_of_order': 'samples with a stamp not later than that of the sample before',
+    'n_out_of_order': 'samples with a stamp not later than the sample before',
     'n_no_temperature': 'samples before the first board temperature',
     'n_stale': 'samples with a board temperature older than --temperature-timeout',
     'n_stuck': 'samples that repeat one reading, or are 0 on all axes',
@@ -148,7 +148,7 @@ def _calibration(out: Output, path: Path) -> None:
 
 
 def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
-    """Print the nonlinear terms, if rests of a fit were not all at 1 g."""
+    """Print the nonlinear terms of a fit to rests of which some were not at 1 g."""
     from ..unit.prediction import nonlinear_coefficients
 
     if calibration.nonlinearity is None:
@@ -202,7 +202,7 @@ def replay(
     out: Output = options.out,
 ) -> None:
     """
-    Correct a whole bag offline, with the values of the live node.
+    Correct a whole bag offline; the output equals that of the live node.
 
     Writes imu/data_raw (sensor_msgs/Imu), regime/dynamic (std_msgs/Bool)
     and regime/stamped (the same with its stamp); the log time of each
@@ -267,7 +267,7 @@ def play(
     context: typer.Context,
     bag: Path = _BAG,
     rate: float = option(
-        'Speed relative to real time; 0 = as fast as subscribers take it.', 1.0, min=0.0
+        'Speed relative to real time; 0: as fast as subscribers read.', 1.0, min=0.0
     ),
     wait: float = option('Longest wait for a subscriber on every topic, in s.', 10.0, min=0.0),
     topics: Any = options.reading,
@@ -286,7 +286,7 @@ def play(
       thermo_comp play chamber.mcap --ros-args -r __ns:=/imu0
     """
     if not rate < float('inf'):
-        raise options.usage('--rate must be finite; 0 is as fast as subscribers take it')
+        raise options.usage('--rate must be finite; 0 is as fast as subscribers read')
     options.require_ros()
     from ..ros.player import play as run
 

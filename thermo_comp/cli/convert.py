@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``convert`` (logs into bags), and ``export`` and ``import`` of calibrations."""
+"""Owns the commands ``convert`` (logs to bags), ``export`` and ``import`` (calibrations)."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
-#: Texts of the findings of a conversion.
+#: Texts of the findings of a conversion, before the number of rows.
 _FINDINGS = {
     'short_rows': 'rows left out, fewer cells than columns needed',
     'non_numeric': 'rows left out, a time or a sample is not a finite number',
@@ -26,8 +26,8 @@ _FINDINGS = {
     'clipped': 'rows with an axis at or beyond the limits `clip` of the column map, kept',
     'impossible': 'temperatures left out, below -90 or above 200 degC',
     'continued': 'rows at which a 32-bit time overflowed to 0, times continued',
-    'backwards': 'rows whose time goes back, kept',
-    'repeated': 'rows whose time stands still, kept',
+    'backwards': 'rows with an earlier time than the row before, kept',
+    'repeated': 'rows with the time of the row before, kept',
 }
 # Largest parameter file [bytes]; all parameters of a vehicle are about 60 kB.
 _LIMIT = 4 << 20
@@ -46,7 +46,7 @@ def convert(
     allow_compensated: bool = option(
         'Accept samples that INS_TCAL or TC_A has corrected.', False, '--allow-compensated'
     ),
-    names: dict[str, str] = options.names,
+    names: dict[str, str] = options.named_topics,
     unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of the Imu topic of a bag.', 'm/s^2'),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -55,9 +55,9 @@ def convert(
     Convert a table of numbers, an autopilot's log or a bag.
 
     A column map names the columns and their units; the readings at rest must
-    agree with it. config/columns has examples. If no map is given, it is
-    guessed from the headings and printed; a table whose columns are, in this
-    order, t ax ay az wx wy wz, or the same without t or without wx wy wz,
+    be gravity in the stated unit. config/columns has examples. Without a map,
+    convert guesses a map from the headings and prints it; a table with the
+    columns t ax ay az wx wy wz, in this order, or without t or wx wy wz,
     needs no headings. The board temperature is the IMU's in a PX4 or
     ArduPilot log, and the reading of the thermometer in the Imu topic's
     namespace in a bag; the case temperature is that of the barometer.
@@ -90,7 +90,7 @@ def convert(
     n_messages = {f'{name}_messages': further.pop(name) for name in ('accel', 'board', 'case')}
     out.end(
         output=output,
-        **picked(report, 'rows rate_hz duration_s believed stillness'),
+        **picked(report, 'rows rate_hz duration_s inferred_unit stillness'),
         **picked(written, 'input unit missing chosen hint not_used'),
         source=written.path,
         start_ns=int(written.stamp_ns[0]),
@@ -112,11 +112,11 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
     out.line(f'{output}:')
     for name, count in report.messages.items():
         out.line(f'  {count:8} {accel if name == "accel" else thermometer(name)}')
-    out.line(f'unit: {log.unit}; {report.believed}')
+    out.line(f'unit: {log.unit}; {report.inferred_unit}')
     if report.rate_hz < SLOW_HZ:
         out.line(
-            f'{report.rate_hz:.3g} Hz: good for soaks of minutes; too slow for short rests by '
-            'hand, and for detecting vibration or a knock between two samples'
+            f'{report.rate_hz:.3g} Hz: sufficient for soaks of minutes, too slow for short rests '
+            'by hand, and to detect vibration or a knock between two samples'
         )
     if log.hint:
         out.line(log.hint)
@@ -135,8 +135,8 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
 
 def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     """
-    Print a guessed column map and the unused columns of a table. A map or a list of columns that
-    `shown` contains already is not printed again.
+    Print a guessed column map and the unused columns of a table, unless `shown` contains the same
+    map or list of columns from another table.
     """
     _print_map(out, log, shown)
     not_used = f'not used: {", ".join(log.not_used)}'
@@ -150,7 +150,7 @@ def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
 
     if log.guessed is None:
         return
-    if log.guessed.format is None:  # map guessed from known headings
+    if log.guessed.format is None:  # the map was guessed from headings
         lines = map_lines(log.guessed)
         first = shown.setdefault('\n'.join(lines), log.path)
         if first != log.path:
@@ -162,7 +162,7 @@ def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
         for line in lines:
             out.line(f'  {line}')
     else:
-        out.line(f'{log.path}: guessed {column_map_text(log.guessed)}; --columns overrides it')
+        out.line(f'{log.path}: guessed {column_map_text(log.guessed)}; else give --columns')
 
 
 def export(
@@ -235,7 +235,7 @@ def import_(
     Thermal parameters of PX4 and ArduPilot give the bias over temperature; the files of imu_tk,
     imu_calib and Kalibr give bias, scale and misalignment. The static and the dynamic regime get
     the same set. The calibration's input unit is that of the file: m/s^2 (node: input:=imu), or
-    counts. Parts that the file lacks need a fit to bags of a thermal test.
+    counts. Parameters that the file lacks need a fit to bags of a thermal test.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

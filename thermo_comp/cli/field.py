@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the commands for a calibration in use: ``update``, and ``evaluate`` on a rest log."""
+"""Owns the commands for rest logs of a unit in use: ``update``, and ``evaluate`` on a rest log."""
 
 from datetime import datetime, timezone
 from pathlib import Path
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..field.ageing import Ageing
     from ..field.update import Update
 
-#: Exit code of an update whose gain is not above one standard error.
+#: Exit code of an update that gains no more than one standard error on days left out.
 NOTHING_GAINED = 3
 
 
@@ -25,7 +25,7 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days until the next update, by which the uncertainty is aged.', 1.0, min=0.0, max=3650.0
+        'Days until the next update; the uncertainty grows with them.', 1.0, min=0.0, max=3650.0
     ),
     allow: list[str] | None = option('Name of a conclusion to override, as in its message.'),
     force: bool = options.FORCE,
@@ -34,10 +34,11 @@ def update(
     """
     Update a calibration in the field, by rests that the node has logged.
 
-    The calibration is the prior, aged as far as the rests show; rests may
-    be in any attitude. Old and new calibration are compared on days left out
-    of the update. The new calibration is written only if its gain is above one standard error;
-    otherwise the exit code is 3, and the present uncertainty of each axis is printed.
+    The calibration is the prior; the ageing since the fit is estimated from
+    the rests, which may be in any attitude. Old and new calibration are
+    compared on days left out of the update. The new calibration is written only
+    if its gain is above one standard error; otherwise the exit code is 3, and
+    the present uncertainty of each axis is printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -110,7 +111,7 @@ def _overrides(allow: list[str] | None, names: tuple[str, ...]) -> list[str]:
 
 
 def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
-    """Return the ageing for JSON: standard deviations, and the relative sd of the lags."""
+    """Return the ageing for JSON: standard deviations [m/s^2], and the relative sd of the lags."""
     values = vars(ageing).copy() if ageing else {}
     share = values.pop('lags', None)
     return {'ageing_m_s2': values or None, 'lags_at_start': share}

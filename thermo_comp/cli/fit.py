@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``fit`` (bags to a calibration) and ``prior`` (calibrations to a prior)."""
+"""Owns the commands ``fit`` (bags to a calibration) and ``prior`` (calibrations to a prior)."""
 
 import re
 import time
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: Largest width of a model's name in a table [characters].
 _MODEL_WIDTH = 46
-#: Properties of a gyroscope that are printed.
+#: Attributes of a gyroscope that are printed.
 _RATES = 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
 Curve = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
@@ -44,7 +44,7 @@ def fit(
         metavar='CURVE',
     ),
     dynamic_curve: Curve | None = option(
-        'Curve of the dynamic set alone, of the same choices.', metavar='CURVE'
+        'Curve of the dynamic set alone; choices as for --static-curve.', metavar='CURVE'
     ),
     groups: str | None = option('Groups of columns allowed in the fit.', metavar='A,B'),
     force_groups: str = option('Groups kept regardless of the evidence.', '', metavar='A,B'),
@@ -241,7 +241,7 @@ def _behind_s(parts: Sequence['Part']) -> list[float]:
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Describe the lags of the axes' parts behind the board, or a temperature that leads it."""
+    """Describe the lags of the axes' parts, and of which temperature the parts lag."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):
@@ -284,11 +284,11 @@ def _print_groups(out: Output, calibration: 'Calibration', has_prior: bool) -> N
                 )
                 for group in calibration.evidence
             ],
-            title=f'groups kept; log evidence: its loss if the group {instead}',
+            title=f'groups kept; log evidence: loss if the group {instead}',
         )
     white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
     walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
-    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), walk {walk} ug/sqrt(h)')
+    out.line(f'noise of x y z: white {white} ug/sqrt(Hz), random walk {walk} ug/sqrt(h)')
 
 
 def _print_residuals(out: Output, result: 'FitResult', n_positions: int) -> None:
@@ -300,7 +300,7 @@ def _print_residuals(out: Output, result: 'FitResult', n_positions: int) -> None
         title='|f| - g at rest, RMS in ug',
     )
     if not result.residuals[-1].left_out.n:
-        out.line('left out: no error, as the fit needs all of the data')
+        out.line('left out: no error is known, as the fit needs all of the data')
     elif n_positions == 1:
         out.line('left out: drift of an axis in parts of the program that took no part in the fit')
     else:
@@ -321,12 +321,12 @@ def _print_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> No
     )
     out.line(
         f'angular rate of x y z: bias {bias} mdeg/s, white {white} mdeg/s/sqrt(Hz), '
-        f'walk {walk} mdeg/s/sqrt(h)'
+        f'random walk {walk} mdeg/s/sqrt(h)'
     )
 
 
 def _print_models(out: Output, trials: Sequence['Trial']) -> None:
-    """Print the error of each model on data left out of its fit, and explain the columns."""
+    """Print the error of each model on data left out of the fit, and explain the columns."""
     columns = {
         'positions': 'drift of an axis in a position left out',
         'sections': 'drift of an axis in a part of the program left out',
@@ -348,11 +348,11 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')
-    out.line('*: chosen, ~: as good within the noise; +: groups beside the curve')
+    out.line('*: chosen model, ~: as good within the noise; +: groups beside the curve')
 
 
 def _named(groups: tuple[str, ...]) -> str:
-    """Name a model by its groups other than the curve, which every model but the smallest has."""
+    """Name a model by its groups without the curve, which all models but the smallest have."""
     if len(groups) < 2 or groups[0] != 'curve':
         return '+'.join(groups) or 'constants'
     return ''.join(f'+{group}' for group in groups[1:])
@@ -382,7 +382,7 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Return the residual of each section after each step of the model, and on data left out."""
+    """Return the residuals of each section after each step of the model, and on left-out data."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows

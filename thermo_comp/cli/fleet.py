@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``fleet fit``: the calibrations of many units, with their table and statistics."""
+"""Owns the command ``fleet fit``: fits many units, and prints their table and statistics."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,7 +43,7 @@ def fleet_fit(
     Fit every unit below a folder.
 
     Each folder of bags is a thermal test of a unit; bags directly in DIR are
-    sorted by the serial they hold. Results go to OUT/units, the table to
+    sorted by the serial in them. Results go to OUT/units, the table to
     OUT/fleet.parquet and .csv, its statistics to OUT/fleet.html, the prior of
     the valid units (as by `thermo_comp prior`) to OUT/prior.yaml. A second
     run fits only tests that are missing or have changed. Exit code 1 if a unit
@@ -109,7 +109,7 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     )
     out.sources((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        # Reservations name the bags left out: print these bags if there are no reservations.
+        # Reservations name the bags left out; without reservations, print the bags left out.
         text = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {problem}' for problem in text if problem)
     out.points(
@@ -144,6 +144,6 @@ def _micro(value: object) -> str | None:
 
 
 def _short(name: object) -> str:
-    """Keep the end of a long name, which differs most, so that the table fits 80 columns."""
+    """Shorten a long name to its end, which differs most, so that the table fits 80 columns."""
     clean = one_line(str(name))
     return clean if len(clean) <= 22 else f'~{clean[-21:]}'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``evaluate`` and ``report``: the residuals of a calibration, as table and page."""
+"""Owns the commands ``evaluate`` and ``report``, which judge a calibration on new bags."""
 
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
@@ -38,12 +38,12 @@ def evaluate(
     """
     Judge a calibration on new bags: |f| - g at rest, raw and corrected.
 
-    The verdict compares the RMS residual with your --tolerance or, without
-    one, with the uncertainty that the calibration claims for the same
+    The verdict compares the RMS residual with --tolerance or, without
+    --tolerance, with the uncertainty that the calibration claims for the same
     windows; six positions or more show which axis has shifted. Exit code 0
     only if the calibration is shown to be valid. Rest logs of the node
-    instead of bags show the drift over the days, and when it exceeds the
-    claimed uncertainty.
+    instead of bags show the drift over the days, and the day from which it
+    exceeds the claimed uncertainty.
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
@@ -103,7 +103,7 @@ def evaluate(
 
 
 def _print_axes(out: Output, judged: 'Judgement') -> None:
-    """Print the thermal drift of each axis and, if determined, the shift since the fit."""
+    """Print the thermal drift of each axis and, if determined, the axis's shift since the fit."""
     columns = ['axis', 'static ug', 'dynamic ug']
     title = 'thermal drift of each axis at rest (RMS of its windows)'
     if judged.shifts:
@@ -117,7 +117,7 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_levels(out: Output, judged: 'Judgement') -> None:
-    """Print the residuals by |f|, if |f| was not gravity in all windows."""
+    """Print the residuals for each value of |f|, if |f| was not gravity in all windows."""
     if judged.by_force:
         out.table(
             ('|f| g', 'windows', 'raw ug', 'RMS ug', 'mean ug', 'claimed ug'),
@@ -133,7 +133,7 @@ def _print_levels(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
-    """Print the changes from each calibration to the next."""
+    """Print the changes of the constants from each calibration to the next."""
     if drifts:
         out.table(
             ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
@@ -161,7 +161,7 @@ def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
 def _sections(
     judgements: Mapping[str, Any], shown: Callable[[float], str | None]
 ) -> list[tuple[Cell, ...]]:
-    """Return table rows: per section the raw residuals, then those of each calibration."""
+    """Return a table row per section: raw residuals, then the residuals of each calibration."""
     from ..judging.verdicts import SECTIONS
 
     rows: list[tuple[Cell, ...]] = []
@@ -196,9 +196,9 @@ def report(
     """
     Write the certificate of a unit: one HTML page, no network needed.
 
-    Shows temperatures, regime, |f| before and after, the functions of
-    temperature with their uncertainty, and the verdict of evaluate, with
-    its exit code. `fit --report` writes the report of the fit itself.
+    Shows temperatures, regime, |f| before and after the correction, the
+    functions of temperature with their uncertainty, and the verdict of
+    evaluate, with the same exit code. `fit --report` reports the fit itself.
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the output of the command line: tables, JSON, progress, and one line per error.
+Owns the output of the command line: tables, JSON, progress, and errors of a line each.
 
 Results go to stdout, everything about the run (progress, notes, errors) to stderr, so that a pipe
 carries results only. All output goes through `_print`: text from outside (serials, topics,
@@ -33,24 +33,24 @@ _NUMBER = re.compile(r'-|[-+]?\d+\.?\d*(e[-+]\d+)?')
 
 
 class Output:
-    """The output of a command: tables and sentences, or one JSON object, or only errors."""
+    """The output of a command: tables and sentences, or a JSON object, or nothing but errors."""
 
     def __init__(self, as_json: bool = False, quiet: bool = False) -> None:
         self.as_json, self.quiet = as_json, quiet
         self._is_torn = False
 
     def line(self, text: str = '') -> None:
-        """Print one sentence of the result."""
+        """Print a sentence of the result."""
         if not (self.as_json or self.quiet):
             _print(text, sys.stdout)
 
     def note(self, text: str) -> None:
-        """Print one sentence about the run, on stderr."""
+        """Print a sentence about the run on stderr, unless `quiet`."""
         if not self.quiet:
             _print(f'thermo_comp: {text}', sys.stderr)
 
     def sources(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
-        """Print the topics chosen in bags, once for equal choices, and the missing parts."""
+        """Print notes on topics chosen in bags, equal notes once, and the missing parts."""
         alike: dict[str, list[object]] = {}
         for bag, chosen, missing in bags:
             if chosen:
@@ -64,7 +64,7 @@ class Output:
             self.note(f'{names[0]}{more}: {chosen}')
 
     def recordings(self, bags: Sequence[ReducedBag]) -> None:
-        """Print the topics chosen in bags, the missing parts, and which bags were joined."""
+        """Print notes on topics chosen in bags, missing parts, and which bags were joined."""
         self.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in bags)
         for bag in bags:
             if bag.parts:
@@ -83,7 +83,7 @@ class Output:
             self.line(f'- {finding}')
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = '') -> None:
-        """Print a table of aligned columns, numbers flush right; a None is printed as a dash."""
+        """Print a table of aligned columns, numbers flush right; None is printed as a dash."""
         if not (self.as_json or self.quiet):
             for line in aligned(head, rows, title):
                 _print(line, sys.stdout)
@@ -138,7 +138,7 @@ def _print(text: str, stream: TextIO) -> None:
 
 
 def _shown(text: str, file: TextIO) -> str:
-    """Replace characters that the stream cannot encode."""
+    """Replace characters that a stream cannot encode."""
     encoding = file.encoding or 'utf-8'
     return one_line(text).encode(encoding, 'backslashreplace').decode(encoding)
 
@@ -161,12 +161,12 @@ def micro(value: float) -> str:
 
 
 def micro_g(value: float) -> str | None:
-    """Return a residual [m/s^2] in micro-g as the tables show it, None where it is no number."""
+    """Return a residual [m/s^2] in micro-g as the tables show it, None if it is not finite."""
     return micro(value / MICRO_G) if math.isfinite(value) else None
 
 
 def millidegrees(value: float) -> str | None:
-    """Return an angular rate [rad/s] in mdeg/s, None where it is no number."""
+    """Return an angular rate [rad/s] in mdeg/s as the tables show it, None if not finite."""
     return f'{1e3 * math.degrees(value):.3g}' if math.isfinite(value) else None
 
 

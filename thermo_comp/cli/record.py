@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``thermo_comp record``: records a test by positions, and reports missing data."""
+"""Owns the command ``record``: records a test position by position, and shows missing data."""
 
 import re
 import shlex
@@ -71,7 +71,7 @@ def record(
     over = threading.Event()
     problems: Callable[[], Sequence[str]] = tuple
     collected: dict[str, str] = {}
-    # A second signal ends the process at once.
+    # A second SIGINT or SIGTERM ends the process at once.
     with SignalWatch() as signals, closing(bags), ExitStack() as stack:
         signals.on_signal(over.set)
         if bag is not None:
@@ -99,7 +99,7 @@ def record(
 def _read_earlier(
     out: Output, known: Sequence[Path], serial: str | None, test: 'Acquisition'
 ) -> str | None:
-    """Read the bags of earlier runs, each a position; return the serial of their unit."""
+    """Add the bags of earlier runs, each of a position, to the test; return the unit's serial."""
     from ..recording.reader import open_recording
 
     with out.progress('reading the existing bags', total=len(known)) as done:
@@ -180,7 +180,7 @@ def _print_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
 
     for path, number in growing.leftovers(folder).items():
         if not is_finishing:
-            out.note(f'{path} is bag {number} of a run that crashed; --finish completes it')
+            out.note(f'{path} is bag {number} of a run that crashed; --finish completes the bag')
             continue
         try:
             made = growing.finish(path, number)
@@ -208,7 +208,7 @@ def _print_account(
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
-    # Ignore the accelerometer reading after the semicolon, which changes with the noise.
+    # The direction after the semicolon changes with the noise: it is not compared.
     new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
     for name, text in new.items():
         last[name] = text.partition(';')[0]

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the options that several commands share, and their conversion to library arguments.
+Owns the options that several commands share, and their conversion to arguments of the library.
 
 The default of a command's parameter is an option, or a function that builds the parameter from
-several options; `expanded` passes all options to typer.
+several options; `expanded` replaces such a parameter by its options, for typer.
 """
 
 import inspect
@@ -26,8 +26,8 @@ from ..text import valid_serial
 from ..unit.gravity import parse_acceleration
 from .output import Output
 
-# Placeholder of an option's value in `--help`, by its type: short, so that a terminal of 80
-# columns has room for the longest name.
+# Placeholder of an option's value in `--help`, by the type of the value: short, so that a terminal
+# of 80 columns has room for the longest name.
 _VALUES: dict[Any, str] = {
     bool: ' ',
     **dict.fromkeys((int, int | None), 'N'),
@@ -36,7 +36,7 @@ _VALUES: dict[Any, str] = {
     **dict.fromkeys((Path, Path | None, list[Path], list[Path] | None), 'PATH'),
 }
 
-#: Options whose name differs from that of the library's argument.
+#: Options whose name differs from the name of the library's argument, by argument.
 _FLAGS = {
     'case_timeout_s': '--case-timeout',
     'forced': '--force-groups',
@@ -47,21 +47,21 @@ _FLAGS = {
     'transition_time_s': '--transition-time',
 }
 
-usage = typer.BadParameter  # error in the command line: exit code 2
+usage = typer.BadParameter  # error in the command line, with exit code 2
 
 
 def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:
-    """Describe an option: help text, flags (default: its name), bounds."""
+    """Return a typer option with its help text, default, flags (default: from its name), rules."""
     return typer.Option(default, *flags, help=text, **rules)
 
 
 def argument(text: str, default: Any = ..., **rules: Any) -> Any:
-    """Describe an argument without a flag."""
+    """Return a typer argument, which has no flag, with its help text, default and rules."""
     return typer.Argument(default, help=text, **rules)
 
 
 def expanded(command: Callable[..., Any]) -> Any:
-    """Turn a command with parameters built from options into a function of the options."""
+    """Turn a command, whose parameters are built from options, into a function of the options."""
     makers: dict[str, Callable[..., Any]] = {}
     options: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
@@ -90,8 +90,8 @@ def expanded(command: Callable[..., Any]) -> Any:
 @contextmanager
 def usage_of(what: str = '', **flags: str) -> Iterator[None]:
     """
-    Turn a ValueError of a `with` block into a usage error, which begins with `what` or names the
-    options of the command, not the library's arguments; `flags`: options of some arguments.
+    Turn a ValueError of a `with` block into a usage error. Its text begins with `what`, or else
+    names options instead of the library's arguments; `flags` gives the options of some arguments.
     """
     try:
         yield
@@ -106,7 +106,7 @@ def usage_of(what: str = '', **flags: str) -> Iterator[None]:
 
 
 def check_serial(serial: str | None) -> str | None:
-    """Refuse an invalid serial; an empty serial is passed on."""
+    """Refuse an invalid serial; return the serial, also if it is empty."""
     if serial:
         with usage_of(serial='the serial'):
             valid_serial(serial)
@@ -114,7 +114,7 @@ def check_serial(serial: str | None) -> str | None:
 
 
 def check_rate(rate_hz: float | None) -> float | None:
-    """Refuse a sampling rate above 1 MHz, beyond that of any accelerometer."""
+    """Refuse a sample rate above 1 MHz, which no accelerometer has."""
     if rate_hz is not None and rate_hz > 1e6:
         raise usage(f'expected at most 1e6 Hz, got {rate_hz:g} Hz')
     return rate_hz
@@ -136,7 +136,7 @@ OFFSET = option(
     metavar='COUNTS',
 )
 INPUT = option(
-    'Input to read from the bag: counts, imu, or auto (whichever it holds).',
+    'Input to read from the bag: counts, imu, or auto (counts, else imu).',
     'auto',
     '--input',
     metavar='KIND',
@@ -154,13 +154,13 @@ def out(
 
 
 @expanded
-def names(
+def named_topics(
     topic: list[str] | None = option(
         'Topic of an input: counts, imu, board, case, temperature/NAME.', metavar='INPUT=TOPIC'
     ),
     topics: Path | None = option('File of topics, a line INPUT: TOPIC for each.', metavar='YAML'),
 ) -> dict[str, str]:
-    """Collect the topics of `--topic` and, for inputs not named there, of the topics file."""
+    """Return topics by input, from `--topic` and else from the file of `--topics`."""
     from ..recording.topics import parse_name, read_names
 
     named = {} if topics is None else read_names(topics)
@@ -171,7 +171,7 @@ def names(
 
 def _reading(
     input_: Input = INPUT,
-    names: dict[str, str] = names,
+    names: dict[str, str] = named_topics,
     begin: float | None = option(
         'Begin of the part to read: seconds from the first sample, or a stamp (seconds since '
         '1970).',
@@ -195,12 +195,12 @@ reading_part = expanded(_reading)
 
 
 @expanded
-def reading(input_: Input = INPUT, names: dict[str, str] = names) -> Any:
-    """Build the topics of the inputs in a bag."""
+def reading(input_: Input = INPUT, names: dict[str, str] = named_topics) -> Any:
+    """Build `Topics`, the topics of the inputs in a bag, for the whole bag."""
     return _reading(input_, names, None, None)
 
 
-#: Sd of the difference between gravity in mountains and on the ellipsoid [m/s^2]: some 50 mGal
+#: Sd of the difference between local gravity and normal gravity in mountains [m/s^2]: some 50 mGal
 #: (EGM2008, Pavlis et al., Journal of Geophysical Research 117 (2012): anomalies of 30 mGal RMS).
 NORMAL_GRAVITY_SD = 5e-4
 
@@ -211,7 +211,7 @@ def place(
     latitude: float | None = option('Latitude in degrees, with --height.'),
     height: float | None = option('Height above the ellipsoid in m.'),
 ) -> tuple[float | None, float]:
-    """Return local gravity, None if not stated, and its usual standard deviation."""
+    """Return local gravity, or None if not stated, and its default standard deviation [m/s^2]."""
     if gravity is not None and not (latitude is None and height is None):
         raise usage('give --gravity, or --latitude and --height, not both')
     if latitude is None and height is None:
@@ -231,7 +231,7 @@ def site(
         'Standard uncertainty of gravity, e.g. 5ug; default: 0 for --gravity, 50ug for --latitude.'
     ),
 ) -> dict[str, float]:
-    """Return local gravity and its standard deviation; a usage error if not stated."""
+    """Return local gravity and its standard deviation; usage error if gravity is not stated."""
     gravity, usual_sd = where
     if gravity is None:
         raise usage('give --gravity, or --latitude and --height')
@@ -248,7 +248,7 @@ def judging(
     tolerance: str | None = option('Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
-    """Return the options for judging a calibration, as keywords of `evaluation.evaluate`."""
+    """Return the keywords of `evaluation.evaluate`, which judges a calibration."""
     return {
         'gravity': where[0],
         'window_s': window_s,
@@ -275,7 +275,7 @@ def force(
         'Standard deviation of --radius, in m: the radius is then estimated.', min=0.0
     ),
 ) -> Any:
-    """Build the statement of the user about |f|."""
+    """Build what the user states about |f| in rests that are not at 1 g."""
     from ..fitting.known_force import ForceOptions
 
     with usage_of():
@@ -286,7 +286,7 @@ def force(
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
-        "response: two sets and thermal response; golovach: the paper's two sets alone.",
+        "response: two sets and thermal response; golovach: two sets, as in Golovach's paper.",
         'response',
         metavar='MODEL',
     ),
@@ -304,7 +304,7 @@ def fitting(
         show_default=False,
     ),
     still_sd: str = option(
-        "Largest scatter of samples at rest: a few times the sensor's noise.", '50mg'
+        "Largest sd of samples at rest: a few times the sensor's noise.", '50mg'
     ),
     mounting_sd: str | None = option(
         'Repeatability of mounting and turn-on (sd of the bias), e.g. 30ug; default: estimated '
@@ -320,7 +320,7 @@ def fitting(
     ),
     allow: list[str] | None = option('Name of a refusal to override, as in its message.'),
 ) -> dict[str, Any]:
-    """Return the keywords of FitOptions."""
+    """Return keywords of `FitOptions`."""
     given = locals()
     if fault := QUANTITIES['temperature'].fault(reference_temperature):
         raise usage(f'--reference-temperature: {fault} degC, got {reference_temperature:g}')

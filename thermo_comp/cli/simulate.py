@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns ``simulate``: bags of a test with known truth."""
+"""Owns the command ``simulate``: writes bags of a thermal test with known truth."""
 
 import json
 from collections import Counter
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..simulation.spin import Spin
     from ..simulation.unit import UnitModel
 
-#: Topic of the rotation rate, its interval [s], and sd of the stated radius [m].
+#: Topic of a rate table's rotation rate, interval between its messages [s], sd of the radius [m].
 _RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
 
@@ -141,7 +141,7 @@ def simulate(
 def _metadata(
     unit: 'UnitModel', station: 'Position', truth: dict[str, Any], gravity: float, is_known: bool
 ) -> dict[str, str]:
-    """Return the metadata of a bag: serial, truth, and for a rotation the source of |f|."""
+    """Return the metadata of a bag: serial, truth, and for a rotation how |f| is known."""
     from .. import __version__
     from ..fitting import known_force
 
@@ -183,7 +183,7 @@ def _write_rate(writer: 'BagWriter', spin: 'Spin', duration_s: float) -> None:
 def _write(
     writer: 'BagWriter', runs: Iterator['SimulatedRun'], unit: 'UnitModel', is_imu: bool
 ) -> Iterator[dict[str, int]]:
-    """Write a run block by block, temperatures first; yield the numbers of messages."""
+    """Write a run block by block; yield the number of messages written with each block."""
     import numpy as np
 
     from ..recording.blocks import ImuColumns
@@ -198,7 +198,7 @@ def _write(
             ]
             start_ns = max(first) if len(first) == 2 else 0
         keep = run.accel_stamp_ns >= start_ns
-        # Write temperatures first: at equal stamps a temperature precedes the sample.
+        # Write temperatures first, so that at equal stamps a temperature precedes the sample.
         writer.write_temperature(topics.board, run.board_stamp_ns, run.board)
         writer.write_temperature(topics.case, run.case_stamp_ns, run.case)
         stamp_ns, counts = run.accel_stamp_ns[keep], run.counts[keep]

@@ -1,23 +1,23 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the logs of autopilots, by the extras ``px4`` and ``ardupilot``: one IMU and one barometer are
-read from a log.
+Owns the reading of an IMU and a barometer from logs of autopilots, by the optional dependencies
+``px4`` and ``ardupilot``.
 
 An IMU's thermometer lags the surroundings: its readings become the board temperature. The readings
-of the barometer's thermometer follow the surroundings: they become the case temperature, and the
-board's if the IMU has no thermometer. A simulator's log is refused: without noise the fit cannot
-weight its samples.
+of the barometer's thermometer follow the surroundings: they become the case temperature, or the
+board temperature if the IMU has no thermometer. A simulator's log is refused: without noise the
+fit cannot weight its samples.
 
 PX4's ULog (``.ulg``): ``sensor_accel`` holds the driver's samples before PX4's corrections, with
 the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher rate. If
-``sensor_accel`` is missing, ``sensor_combined`` is used: after PX4's calibration, and without a
-temperature.
+``sensor_accel`` is missing, ``sensor_combined`` is read: its samples are corrected by PX4's
+calibration, and it has no temperature.
 
-ArduPilot's DataFlash (``.BIN``): a message type per IMU in old logs (``IMU``, ``IMU2``), a type
-with an instance number ``I`` in new logs; the IMU's temperature is ``T`` or ``Temp``. Samples
-logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already corrected.
-While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets
+ArduPilot's DataFlash (``.BIN``): old logs have a message type per IMU (``IMU``, ``IMU2``), new
+logs a message type with an instance number ``I``; the IMU's temperature is ``T`` or ``Temp``.
+Samples logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already
+corrected. While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets
 ``INS_TCALn_ENABLE`` to 1 after learning.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
@@ -39,13 +39,13 @@ from ..errors import RecordingError
 from ..files import open_regular
 from ..recording.blocks import Readings
 from ..typing import Floats, Ints
-from .log import NO_STAMP, SLOW_HZ, ForeignLog, find_stillness, library
+from .log import NO_STAMP, SLOW_HZ, ForeignLog, find_stillness, import_extra
 
 T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects drift: times, values, and advice."""
+    """A parameter that is 1 while thermal drift is corrected, its values by time, and advice."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -53,12 +53,12 @@ class _Correction(NamedTuple):
     advice: str
 
 
-#: Content of a log by instance: IMUs, barometers, thermal corrections of the IMUs.
+#: Content of a log: IMUs, barometers and the thermal corrections of the IMUs, by instance number.
 _Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, _Correction]]
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
-_NO_NOISE = 1e-6  # smaller noise is rounding, as in a simulator's log [g]
+_NO_NOISE = 1e-6  # largest sd at rest that is rounding, as in a simulator's log [g]
 _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}
@@ -72,8 +72,8 @@ def read_autopilot(
     path: Path, imu: int | None = None, baro: int | None = None, allow_compensated: bool = False
 ) -> ForeignLog:
     """
-    Read an IMU and a barometer of a PX4 (``.ulg``) or ArduPilot log, by default the lowest
-    instances. ArduPilot's IMUs are counted from 0: the old type ``IMU2`` is 1.
+    Read an IMU and a barometer of a PX4 (``.ulg``) or ArduPilot log, by default those with the
+    lowest numbers. ArduPilot's IMUs are counted from 0: the old type ``IMU2`` has the number 1.
     """
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     try:
@@ -81,7 +81,7 @@ def read_autopilot(
         with np.errstate(invalid='ignore', over='ignore'):
             imus, baros, compensated = read(path)
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
-        # The message formats declared in the file contradict its messages.
+        # The messages of a damaged file do not have the declared formats.
         raise RecordingError(f'damaged: {failure}', path=path) from failure
     rows = _instance(imus, imu, 'IMU', path)
     correction = compensated.get(min(imus, default=0) if imu is None else imu)
@@ -135,7 +135,7 @@ def _ulog(path: Path) -> _Held:
         log = _read('pyulog', 'ULog', 'px4', 'a ULog file', path, file, list(_TOPICS))
     by_topic: dict[str, dict[int, _Columns]] = {topic: {} for topic in _TOPICS}
     for data in log.data_list:
-        if len(data.data.get('timestamp', ())):  # a damaged format may have lost its time stamp
+        if len(data.data.get('timestamp', ())):  # in a damaged file the time stamps may be missing
             by_topic[data.name][int(data.multi_id)] = data.data
     baros = {
         number: Readings(_stamps(columns), _column(columns, name))
@@ -151,7 +151,7 @@ def _ulog(path: Path) -> _Held:
         both = {number: _combined(pair) for number, pair in by_topic['sensor_combined'].items()}
         accels, gyros = ({number: pair[part] for number, pair in both.items()} for part in (0, 1))
         hint = (
-            'the log has no sensor_accel: its samples are those of sensor_combined, which PX4 has '
+            'the log has no sensor_accel: the samples are those of sensor_combined, which PX4 has '
             f'corrected by CAL_ACC*; to record raw samples, {_PROFILE}'
         )
         name = 'TC_A_ENABLE'
@@ -185,7 +185,7 @@ def _combined(columns: _Columns) -> list[_Columns]:
     relative = _column(columns, 'accelerometer_timestamp_relative')
     rows = np.flatnonzero(np.isfinite(relative) & (relative != _NOT_THERE))
     stamp_us = columns['timestamp'][rows].astype(np.int64) + relative[rows].astype(np.int64)
-    # A message that is new only for the gyroscope repeats the last accelerometer sample.
+    # A message with a new rate alone repeats the last accelerometer sample and its stamp.
     is_new = np.diff(stamp_us, prepend=stamp_us[:1] - 1) != 0
     names = [f'{name}[{i}]' for name in ('accelerometer_m_s2', 'gyro_rad') for i in range(3)]
     parts = _vectors(columns, names)[rows[is_new]].T.reshape(2, 3, -1)
@@ -194,8 +194,8 @@ def _combined(columns: _Columns) -> list[_Columns]:
 
 
 def _stamps(columns: _Columns) -> Ints:
-    """Return stamps from microseconds since boot; `NO_STAMP` if negative or over a century."""
-    # The time of the sample if logged; older logs only have the time of publication.
+    """Return stamps from times since boot [us]; `NO_STAMP` if negative or over a century."""
+    # New logs have the time of the sample, old logs only the time of its publication.
     micros = columns['timestamp_sample' if 'timestamp_sample' in columns else 'timestamp']
     size = micros.astype(np.float64)
     is_time = (size >= 0.0) & (size < _CENTURY_US)
@@ -212,7 +212,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the angular rate to the accelerometer's stamps; None if rates are too few."""
+    """Interpolate the angular rate to the accelerometer's stamps; None if it is not sufficient."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -252,7 +252,7 @@ def _dataflash(path: Path) -> _Held:
                     title = label.decode('ascii', 'replace')
                     changes.setdefault(title, []).append((int(at) * 1000, float(value)))
                 continue
-            # In old logs the first IMU has the type IMU, the second IMU2.
+            # In old logs the first IMU has the type IMU, the second IMU has the type IMU2.
             old = int(name[-1]) - 1 if name[-1].isdigit() else 0
             table |= {'timestamp': stamp_us, 'I': table.get('I', np.full(len(stamp_us), old))}
             for number in np.unique(table['I'][: len(stamp_us)]).tolist():
@@ -287,7 +287,7 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     """Read a message type: its columns, and the number of truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
-    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes: as in `struct`
+    codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes of module `struct`
     kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
     if len({*layout.columns}) < len(layout.columns):
         raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)
@@ -308,10 +308,10 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
 
 
 def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments: Any) -> Any:
-    """Read a file with `module`, the optional library that the extra `extra` installs."""
-    read = getattr(library(module, extra, what, path), name)
+    """Read a file with class `name` of a library that is an optional dependency."""
+    read = getattr(import_extra(module, extra, what, path), name)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        # On damaged files the libraries raise any exception.
+        # On damaged files the libraries raise any type of exception.
         try:
             return read(*arguments)
         except Exception as failure:
@@ -329,7 +329,7 @@ def _instance(present: Mapping[int, T], wanted: int | None, what: str, path: Pat
 
 
 def _reported(readings: Readings) -> Readings:
-    """Drop NaN, and the zeros of a sensor without thermometer."""
+    """Drop invalid readings, and all readings if all are 0: the sensor has no thermometer."""
     use = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
     use &= bool(readings.celsius[use].any())
     return readings.take(use)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reading of bags with other topics and units, ROS 1 and 2.
+Owns the reading of bags, of ROS 1 and 2, with topics and units other than those of thermo_comp.
 
 Drivers choose their topic names, and some drivers do not publish m/s^2. The Imu topic is found by
-its type. The thermometer in the Imu's namespace is the board's, a thermometer in a barometer's
-namespace the case's. At rest the samples must read gravity in the stated unit.
+its type. The thermometer in the namespace of the Imu becomes the board's, a thermometer in the
+namespace of a barometer the case's. The norm of samples at rest must be gravity in their unit.
 """
 
 from pathlib import Path, PurePosixPath
@@ -32,7 +32,7 @@ def bag_log(
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
-    """Read a bag; topics that are None are searched; `unit` is the unit of the Imu topic."""
+    """Read a bag; search the topics that are None; `unit` is the unit of the Imu topic."""
     present = inspect_recording(path).topics
     with translated(path):
         inputs = find_topics(present, imu, board, case)
@@ -41,7 +41,7 @@ def bag_log(
         among = 'only' if role == 'imu' else 'nearest'
         usual = given or getattr(Topics(), role)
         chosen.append(choice_note(name, role, usual, among) if name else '')
-    # '/none', which no topic has, stands for a missing thermometer.
+    # '/none', which is no topic's name, stands for a missing thermometer.
     names = {role: name or '/none' for role, name in inputs.items()}
     recording = read_recording(path, Topics.named(names, input='imu'), require=('accel',))
     columns = recording.columns
@@ -94,7 +94,7 @@ def _of_type(present: Present, kind: str) -> list[str]:
 
 
 def _shared(name: str, others: list[str]) -> int:
-    """Largest number of leading namespaces that a topic shares with any of the other topics."""
+    """Return the largest number of leading namespaces that a topic shares with another topic."""
     namespaces, *theirs = (
         {*PurePosixPath('/', topic.strip('/')).parents} for topic in (name, *others)
     )

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns tables with a column map: the content and unit of each column, and the message it becomes.
+Owns column maps of tables: the content and unit of each column, and the message that it becomes.
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
-by their headings (see `headings`). The map of a table of numbers alone, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: times rise from row to row, and readings at rest are gravity,
-which gives their unit. An angular rate is in deg/s if its numbers in rad/s were faster than any
-turn by hand.
+by their headings (see `headings`). The map of a table without headings, ``[t] ax ay az [wx wy
+wz]`` as for imu_tk, is guessed: times rise from row to row, and the norm of readings at rest is
+gravity, which gives their unit. An angular rate is taken to be in deg/s if its numbers, as rad/s,
+would be faster than a turn by hand.
 """
 
 from collections.abc import Sequence
@@ -25,30 +25,30 @@ from ..recording.topics import is_thermometer
 from ..typing import Floats, Ints
 from ..unit.schema import SchemaError, build
 from .headings import Headings, read_headings
-from .log import NO_STAMP, PLAUSIBLE_CELSIUS, ForeignLog, Unit, find_stillness, inferred_unit
+from .log import NO_STAMP, PLAUSIBLE_CELSIUS, ForeignLog, Unit, find_stillness, infer_unit
 from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, TimeUnit, read_parquet, read_text
 
 Triple = tuple[Column, Column, Column]
 
-#: Slope and offset from a table's reading to degC.
+#: Slope and offset that convert a temperature of each unit to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
-#: Range of plausible sample intervals [s], which decides the unit of the times.
+#: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
-#: A turn by `_TURN` rad between successive blocks of `_BLOCK` still samples (scatter below
-#: `_QUIET` g) excludes times in ms; intervals are then plausible up to `_SLOW_S` s.
+#: A turn by over `_TURN` rad within two blocks of `_BLOCK` samples, between still blocks (sd below
+#: `_QUIET` g), excludes times in ms; intervals of up to `_SLOW_S` s are then plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
-_FASTEST_RAD_S = 20.0  # largest rate of a gyroscope that is turned by hand [rad/s]
-#: Range of stamps since 1970 [s], 2000 to 2038, and their largest interval; a count of us since
-#: power-up may be in this range, but its intervals are longer.
+_FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
+#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up
+#: may be in this range, but its steps are larger than this interval.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
-#: Upper limit of the range of temperatures in a log divided by the log's length [K/s]: a hair
+#: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.
 _FASTEST_K_S = 0.5
-# Largest share of rows in which a temperature in whole degrees changes. A column of board or
-# sensor numbers alternates from row to row, so a larger share of its rows changes.
+# Largest share of rows in which a temperature in whole degrees changes. The numbers of boards or
+# sensors in a column alternate from row to row, so they change in a larger share of the rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
-#: Share of a counter's range at each end: a step from the upper to the lower end is an overflow.
+#: A step from the uppermost to the lowest tenth of a counter's range is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
 _GIVE_MAP = f'give {_A_MAP}'
@@ -57,7 +57,7 @@ _GIVE_MAP = f'give {_A_MAP}'
 @dataclass(frozen=True)
 class Accel:
     """
-    The accelerometer's three columns, which become `output`: ``counts`` or ``imu`` (m/s^2).
+    The accelerometer's three columns; `output` is the message written, counts or Imu (m/s^2).
 
     `clip`: lowest and highest reading, at which the sensor is saturated, in the table's unit;
     `offset`: reading at zero force, which is subtracted, such as 32768 in offset binary.
@@ -85,7 +85,7 @@ class Accel:
 
 @dataclass(frozen=True)
 class Gyro:
-    """The gyroscope's three columns, which are part of the Imu message."""
+    """The gyroscope's three columns, which become the angular rate in the Imu message."""
 
     columns: Triple
     unit: Literal['rad/s', 'deg/s']
@@ -93,7 +93,7 @@ class Gyro:
 
 @dataclass(frozen=True)
 class Thermometer:
-    """One temperature column; unit raw: ``degC = reading * degc_per_count + degc_at_zero``."""
+    """A temperature column; unit raw: ``degC = reading * degc_per_count + degc_at_zero``."""
 
     column: Column
     unit: Literal['degC', 'K', 'degF', 'raw'] = 'degC'
@@ -138,7 +138,7 @@ class ColumnMap:
 
     def __post_init__(self) -> None:
         if len({thermometer.name for thermometer in self.further}) < len(self.further):
-            raise ValueError('`further` has two thermometers of one name')
+            raise ValueError('`further` has two thermometers with the same name')
         given = [*self.accel.columns, *(self.gyro.columns if self.gyro else ())]
         given += [sensor.column for sensor in (self.board, self.case, *self.further) if sensor]
         if twice := {str(name) for name in given if given.count(name) > 1}:
@@ -151,7 +151,7 @@ class ColumnMap:
 
 
 def load_column_map(path: Path) -> ColumnMap:
-    """Read a column map; RecordingError, with the key, for an invalid map."""
+    """Read a column map from YAML; RecordingError with the key if the map is invalid."""
     data = read_plain_yaml(path)
     try:
         if not isinstance(data, dict):
@@ -162,7 +162,7 @@ def load_column_map(path: Path) -> ColumnMap:
 
 
 def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
-    """Read all rows of a table by its column map; repeated temperatures are thinned."""
+    """Read all rows of a table by its column map; drop repeated temperatures."""
     accel, gyro = columns.accel, columns.gyro
     thermometers = {'board': columns.board, 'case': columns.case}
     thermometers |= {thermometer.name: thermometer for thermometer in columns.further}
@@ -202,8 +202,8 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 
 def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
     """
-    Continue the times of a counter of 32 bits that begins again at 0, as Arduino's micros() after
-    71.6 min; return the stamps and the lines at which the counter begins again.
+    Continue the times of a 32-bit counter that overflows, as Arduino's micros() does after
+    71.6 min; return the stamps and the lines after an overflow.
     """
     stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
     if unit not in ('ms', 'us') or not len(rows):
@@ -225,7 +225,7 @@ def _read(
 
 
 def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
-    """Guess the columns of a table, by headings if any; `rate_hz` is for a table without times."""
+    """Guess the column map of a table; `rate_hz` is the sample rate of a table without times."""
     table = _read(path, None, Stamp(rate_hz=1.0))
     place = {name: number for number, name in reversed(list(enumerate(table.headings)))}
 
@@ -247,9 +247,9 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
-        # Any rising times will do: finding rests depends only on the order of the samples.
+        # Rests are found without the true times: one second between samples is assumed.
         still = find_stillness(np.arange(len(accel)) * 10**9, accel)
-        unit, reason = inferred_unit(still.magnitude)
+        unit, reason = infer_unit(still.magnitude)
         if unit == 'unknown':
             raise RecordingError(
                 f'the unit of the accelerometer cannot be guessed, {reason}: {_GIVE_MAP}',
@@ -283,7 +283,7 @@ def _unnamed(path: Path, width: int) -> Headings:
     if width not in (3, 4, 6, 7):
         raise RecordingError(
             f'{width} columns without headings cannot be identified, only 3, 4, 6 or 7 columns '
-            f'[t] ax ay az [wx wy wz] can: {_GIVE_MAP}',
+            f'[t] ax ay az [wx wy wz]: {_GIVE_MAP}',
             path=path,
         )
     x = int(width in (4, 7))
@@ -292,7 +292,7 @@ def _unnamed(path: Path, width: int) -> Headings:
 
 
 def column_map_text(columns: ColumnMap) -> str:
-    """Describe a column map in a line."""
+    """Describe the units of a column map in a line."""
     stamp = columns.stamp
     parts = [f'{stamp.rate_hz:g} Hz' if stamp.column is None else f'time [{stamp.unit}]']
     parts.append(f'x y z [{columns.accel.unit}]')
@@ -304,7 +304,7 @@ def column_map_text(columns: ColumnMap) -> str:
 def _reads_temperature(values: Floats, unit: str) -> bool:
     """
     Whether the values of a column can be temperatures: most values are in the plausible range.
-    Whole numbers, which may number boards or tests, must change, but only in few rows.
+    Whole numbers, which may number boards or tests, must change, but in few rows only.
     """
     slope, offset = _CELSIUS[unit]
     celsius = values[np.isfinite(values)] * slope + offset
@@ -318,7 +318,7 @@ def _reads_temperature(values: Floats, unit: str) -> bool:
 
 
 def _span(values: Floats) -> float:
-    """Return the range of most of a column's values; a few may be invalid."""
+    """Return the range of a column's values without the lowest and highest 2 %."""
     low, high = np.nanquantile(values, (0.02, 0.98)) if np.isfinite(values).any() else (0.0, 0.0)
     return float(high - low)
 
@@ -331,7 +331,7 @@ def _stamp(
     accel: Floats,
     span: float,
 ) -> Stamp:
-    """Guess the unit of the times by their heading, or else by their size and interval."""
+    """Guess the unit of the times by the heading, or else by the size and interval of times."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     if rate_hz is not None:
@@ -353,11 +353,10 @@ def _stamp(
     steps = np.diff(times)
     if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
         step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # Shortest possible log [s]: no board changes its temperature faster than `_FASTEST_K_S`.
+        # Shortest possible duration of the log [s], as boards change by at most `_FASTEST_K_S`.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
-        # Take the largest unit with a plausible interval of samples: 5 ms is plausible, 5 s is
-        # not.
+        # Take the largest unit with a plausible interval between samples: 5 ms is, 5 s is not.
         for unit, exponent in STAMP_EXPONENTS.items():
             size = 10.0 ** (exponent - 9)
             begin, step_s = first * size, step * size
@@ -385,7 +384,7 @@ def _no_time(column: Column | None, steps: Floats) -> str:
 
 
 def _turns_at_once(accel: Floats) -> bool:
-    """Whether the unit turns between still blocks faster than possible if times were in ms."""
+    """Whether the unit turns between still blocks, faster than possible with times in ms."""
     blocks = accel[: len(accel) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, 3)
     mean = blocks.mean(axis=1)
     size = np.linalg.norm(mean, axis=1, keepdims=True)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the exchange with other tools: calibrations to the content of their files, and back.
+Owns the export of calibrations to the files of other tools, and the import of such files.
 
 All tools correct a reading N by ``a = A (N - b)``. In autopilots b depends on temperature
 and A is 1; in tools for tumble tests b and A are constant. The notes of an export name the parts
@@ -24,12 +24,12 @@ from ..unit.gravity import MICRO_G, STANDARD_GRAVITY, ug_text
 from ..unit.prediction import bias_and_scale, ramp_states
 from ..unit.provenance import Provenance
 from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
-from .tools import TOOLS, Content, ql, turned
+from .tools import TOOLS, Content, ql, rotation_notes
 
 _GRID = 257
 #: White noise assumed for an imported gyroscope [rad/s/sqrt(Hz)].
 _RATE_NOISE = 1e-4
-#: Largest factor between 1 and the scale factor of readings in m/s^2.
+#: Readings are in m/s^2 if all scale factors are below this number and above its inverse.
 _NEAR_ONE = 2.0
 
 
@@ -42,12 +42,12 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write the constants and curves of a soak as the file of one of `TOOLS`: its `text`, and `notes`
-    on the parts of the calibration that are lost.
+    Write the constants and the curves of soaks in the format of one of `TOOLS`: return `text`, and
+    `notes` on the parts of the calibration that are lost.
 
-    `number` is the number of the set or IMU, if the file numbers them; PX4 matches the sensor by
-    `device_id`. With `up`, the attitude as a unit vector, the drift of the scale times gravity is
-    added to the offset.
+    `number` is the number of the parameter set or IMU, if the file numbers them; PX4 matches the
+    sensor by `device_id`. With `up`, the attitude as a unit vector, the error by scale times
+    gravity is added to the offset of an autopilot.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
@@ -79,7 +79,7 @@ def export_calibration(
     content = replace(content, notes=notes, noise=noise)
     text = tool.write(content, number, device_id)
     title = f'Thermal calibration of unit {calibration.unit.serial}, by thermo_comp'
-    # Write each note as a comment line; none for imu_tk, whose reader knows no comments.
+    # Write each note as a comment line; the reader of imu_tk does not accept comments.
     head = [] if to == 'imu_tk' else [f'# {one_line(line)}\n' for line in (title, *content.notes)]
     return replace(content, text=''.join(head) + text)
 
@@ -89,13 +89,13 @@ class _Curves(NamedTuple):
 
     temperature: Floats
     K: Floats
-    level: Floats  # in input units
+    level: Floats  # bias at the reference temperature, in input units, shape (3,)
     bias: Floats  # [m/s^2], shape (3, n)
-    scale: Floats  # relative, shape (3, n)
+    scale: Floats  # relative change of the scale factor, shape (3, n)
 
     @property
     def scale_drift(self) -> float:
-        """Largest relative change of a scale factor over the range of temperatures."""
+        """Largest relative change of a scale factor within the range of temperatures."""
         return float(np.max(np.abs(self.scale)))
 
 
@@ -117,14 +117,14 @@ def _thermal(
 ) -> Content:
     """Return each axis' offset over temperature as a cubic, for an autopilot."""
     d, notes = curves.temperature - reference_c, []
-    # Counts are divided by K before the tool's correction, readings in m/s^2 are not.
+    # The driver divides counts by K before the tool's correction; it leaves m/s^2 unchanged.
     gain = curves.K if calibration.unit.input == 'm/s^2' else np.ones(3)
     loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
     offset = (curves.level / curves.K)[:, None] + curves.bias + loads[:, None] * curves.scale
     offset = gain[:, None] * offset + ((gain - 1.0) * loads)[:, None]
     cubics, misfit = _cubics(d, offset)
     if misfit > 0.01 * MICRO_G:
-        notes.append(f'the bias functions are replaced by cubics: error up to {ug_text(misfit)}')
+        notes.append(f'cubics replace the bias functions: error up to {ug_text(misfit)}')
     folded = 'folded into the offset at one attitude'
     if curves.scale_drift > 1e-8:
         lost = f'{_millionths(curves.scale_drift)} ppm'
@@ -141,7 +141,7 @@ def _thermal(
         triad = rate_triad(calibration)
         rate, _ = bias_and_scale(triad, ramp_states(triad, curves.temperature))
         rate_bias, misfit = _cubics(d, rate.T)
-        off = f'bias functions replaced by cubics: error up to {misfit / MILLIDEGREE:.2g} mdeg/s'
+        off = f'cubics replace the bias functions: error up to {misfit / MILLIDEGREE:.2g} mdeg/s'
         of_rate = [*[off] * (misfit > 1e-3 * MILLIDEGREE), *_losses(triad)]
         notes += [f'angular rate: {note}' for note in of_rate]
     range_c = calibration.static.temperature_range_c
@@ -155,7 +155,7 @@ def _millionths(part: float) -> str:
 
 
 def _constant(calibration: Calibration, curves: _Curves) -> Content:
-    """Return bias, scale and misalignment at the reference temperature, as of a tumble test."""
+    """Return bias, scale and misalignment at the reference temperature, for a tumble test tool."""
     drift = 'the calibration has no correction for temperature'
     if calibration.needs_temperature:
         drift = (
@@ -173,7 +173,7 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
 
 
 def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
-    """Fit a cubic to the offset of each axis; return the cubics and their largest error."""
+    """Fit a cubic to the offset of each axis; return the cubics and the largest residual."""
     cubics = polynomial.polyfit(d, offset.T, 3)
     return cubics.T, float(np.max(np.abs(polynomial.polyval(d, cubics) - offset)))
 
@@ -211,8 +211,9 @@ def import_calibration(
     noise_density: float = 200.0 * MICRO_G,
 ) -> Calibration:
     """
-    Read the file of one of `TOOLS`, recognised by its content; both regimes get the same set.
-    `number` chooses a set or IMU of the file, None the only set; `full_scale` of readings [m/s^2].
+    Read the file of one of `TOOLS`, recognised by its content; both regimes get the same curves.
+    `number` chooses a parameter set or IMU, None takes the only set in use; `full_scale` is in
+    m/s^2.
     """
     readings = (tool.read(text, number) for tool in TOOLS.values())
     content = next((reading for reading in readings if reading is not None), None)
@@ -235,7 +236,7 @@ def import_calibration(
         )
     (_, _, _), (yx, _, _), (zx, zy, _) = (matrix * K).tolist()
     if not is_si:
-        # Samples with an offset, such as 32768, may exceed the offset by the full scale.
+        # Counts around an offset, such as 32768, reach the offset plus the full scale.
         full_scale = full_scale * float(K.max()) + float(np.abs(content.bias[:, 0]).max())
     unity = Polynomial((1.0,))
     x_set, y_set, z_set = (unit.AxisSet(curve, unity) for curve in _curves(content.bias))
@@ -256,11 +257,13 @@ def import_calibration(
         dynamic=regime,
         noise_density_m_s2_sqrt_hz=(noise_density,) * 3,
         misalignment=((1.0, 0.0, 0.0), (yx, 1.0, 0.0), (zx, zy, 1.0)),
-        provenance=Provenance(model=content.source, notes=(*content.notes, *turned(rotation))),
+        provenance=Provenance(
+            model=content.source, notes=(*content.notes, *rotation_notes(rotation))
+        ),
         gyroscope=gyroscope,
     )
 
 
 def _curves(bias: Floats) -> list[Polynomial]:
-    """Return each axis' cubic without its constant."""
+    """Return the cubic of each axis without the constant term."""
     return [Polynomial((0.0, *row[1:])) for row in bias.tolist()]

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the recognition of headings: time, triads, thermometers, and their units.
+Owns the recognition of headings of tables: time, triads, thermometers, and their units.
 
-A guess is printed as a column map, for the user to keep or to edit.
+The recognised columns are printed as a column map, which the user may keep and edit.
 """
 
 import re
@@ -24,7 +24,7 @@ _TIMES = {
     **dict.fromkeys(('us', 'µs', 'μs', 'usec', 'micros', 'microseconds'), 'us'),
     **dict.fromkeys(('ns', 'nsec', 'nanos', 'nanoseconds'), 'ns'),
 }
-# Units of time that no column map has: a table with times in such a unit is refused.
+# Units of time that a column map cannot state: a table with times in such a unit is refused.
 _LONG_TIMES = {
     **dict.fromkeys(('min', 'mins', 'minute', 'minutes'), 'min'),
     **dict.fromkeys(('h', 'hr', 'hrs', 'hour', 'hours'), 'h'),
@@ -32,23 +32,23 @@ _LONG_TIMES = {
 }
 _ACCEL = re.compile('acc|force|(^|_)ac?(_|$)')
 _GYRO = re.compile('gyr|omega|rot|rate|angular|(^|_)(g|gy|w)(_|$)')
-# `linear_acceleration` is the specific force in sensor_msgs/Imu, but the acceleration without
-# gravity on phones, which the check of |f| at rest refuses.
+# `linear_acceleration` is the specific force in sensor_msgs/Imu, but on phones the acceleration
+# without gravity, which the check of |f| at rest refuses.
 _ROS_ACCEL = re.compile('(^|_)linear_acceleration$')
-# Words in headings of triads that are neither accelerometer nor gyroscope.
+# Words in the headings of triads of columns that are neither accelerometer nor gyroscope.
 _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|vel(?!ocity)')
 _TEMPERATURE = re.compile(
     'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
 )
 _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
-# Unit of a temperature at the end of a heading, and words of columns that are not temperatures.
+# Unit of a temperature at the end of a heading; words in headings that are not of a temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
 _NO_READING = re.compile('(^|_)(raw|adc|counts?|lsb|id|rev|status|valid|voltage|volts?|mv)(_|$)')
-# A heading that ends in a letter for the unit, or names only a place, is taken for that of a
-# thermometer only if the column's values can be temperatures.
+# A heading that ends in a letter for the unit, or only names a place, is taken for the heading of
+# a thermometer only if the values in the column can be temperatures.
 _LETTER = re.compile('_[ck]$|^(board|case|imu|die|chip)_f$')
 _PLACE = re.compile('board|case|imu|die|chip')
-# Units as they stand in brackets or, in lower case with underscores, at the end of a heading.
+# Units as written in the brackets of a heading or, with underscores, at the end of a heading.
 _ACCELS = {
     'g': 'g',
     'mg': 'mg',
@@ -70,7 +70,7 @@ Columns = tuple[Column, Column, Column]
 
 @dataclass(frozen=True)
 class Headings:
-    """The recognised columns, by heading or number, with their stated units; '' if not stated."""
+    """The recognised columns, by heading or number, with units; '' if the heading has no unit."""
 
     time: Column | None
     time_unit: str  # a unit of a column map, or min, h, days
@@ -85,13 +85,13 @@ def read_headings(
     headings: Sequence[str], is_plausible: Callable[[str, str], bool] = lambda *_: False
 ) -> Headings | None:
     """
-    Find the columns by their names; None if no accelerometer is among the columns.
+    Recognise columns by their headings; None if no accelerometer is among the columns.
 
-    `is_plausible`: whether the values of a column, in a unit, can be those of a thermometer
+    `is_plausible`: whether the values of a column, taken in a unit, can be temperatures
     """
     names = {_plain(heading): heading for heading in reversed(headings)}
     times = [text for name, text in names.items() if _TIME.search(name) and not _is_warm(text)]
-    # A heading like `T_magnet_C` names the times only if no other heading does.
+    # A heading like `T_magnet_C` is taken for the times only if no other heading names a time.
     times.sort(key=lambda text: _LETTER.search(_plain(text)) is None)
     found = dict(_triads(names))
     triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
@@ -119,14 +119,14 @@ def _thermometers(
     headings: Sequence[str], names: Container[str], is_plausible: Callable[[str, str], bool]
 ) -> dict[str, tuple[str, str]]:
     """
-    Return column and unit by thermometer. A place alone, like `board`, names a thermometer unless
-    another column is that thermometer. `names`: all headings, see `_plain`
+    Return column and unit by thermometer. A heading like `board` alone is taken for a thermometer
+    unless another column is the board thermometer. `names`: all headings, as `_plain` returns them
     """
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
     warm, places = [], []
     for heading, unit in units.items():
         name = _plain(heading)
-        # The last letters of `phase_a`, `phase_b`, `phase_c` are not units.
+        # The last letters of headings like `phase_a`, `phase_b`, `phase_c` are not units.
         is_letter = _LETTER.search(name) is not None and f'{name[:-1]}b' not in names
         if _is_warm(heading) or (is_letter and is_plausible(heading, unit)):
             warm.append(heading)
@@ -142,12 +142,12 @@ def _thermometers(
 
 
 def _is_outside(heading: str) -> bool:
-    """Whether a thermometer's heading names a place outside the board."""
+    """Whether the heading of a thermometer names a place that is not on the board."""
     return _OUTSIDE.search(_plain(heading)) is not None
 
 
 def map_lines(columns: Any) -> list[str]:
-    """Return the lines of a column map's file."""
+    """Return the lines of the YAML file of a column map."""
     text: str = yaml.safe_dump(
         _given(columns), sort_keys=False, default_flow_style=None, allow_unicode=True, width=10_000
     )
@@ -155,7 +155,7 @@ def map_lines(columns: Any) -> list[str]:
 
 
 def _given(value: Any) -> Any:
-    """Turn dataclasses into mappings of the keys that differ from their defaults, and `unit`."""
+    """Turn a dataclass into a mapping of `unit` and of the keys that differ from the default."""
     if is_dataclass(value):
         pairs = ((field, getattr(value, field.name)) for field in fields(value))
         return {f.name: _given(x) for f, x in pairs if x != f.default or f.name == 'unit'}
@@ -163,7 +163,7 @@ def _given(value: Any) -> Any:
 
 
 def _is_warm(heading: str) -> bool:
-    """Whether a heading is that of a temperature, by its words or by its unit."""
+    """Whether a heading names a temperature, by its words or by its unit."""
     unit, name = _UNIT.search(heading), _plain(heading)
     is_unit = unit is not None and unit[1].strip().lower() in {*_DEGREES, *_CELSIUS}
     if is_unit or _DEGREES_END.search(name):
@@ -187,7 +187,7 @@ def _stated(heading: str, units: dict[str, str]) -> str:
 
 
 def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]:
-    """Find three names that differ only in x, y, z; yield their common part and the columns."""
+    """Find triads of headings that differ in x, y, z alone; yield the common part and columns."""
     for name in reversed(names):
         for at in (match.start() for match in re.finditer('x', name)):
             three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the conversion of a foreign log to a bag: checks, thinning, and a report on every row.
+Owns the conversion of a log of any format to a bag: checks, and a report on the rows left out.
 
-At rest the specific force is gravity in any attitude. A log whose column map contradicts gravity
-is refused, because an unnoticed factor of 9.8 would end in a calibration.
+At rest the norm of the specific force is gravity in any attitude. A log whose stated unit
+contradicts gravity is refused: otherwise a factor of 9.8 would remain in the calibration.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,26 +31,26 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 Unit = Literal['m/s^2', 'g', 'mg', 'counts']
 
-# |a| of a still sensor in each unit. The tolerance of |a|, 20 %, exceeds the errors of bias and
-# scale of cheap sensors, even in a chamber, and is far below the ratios of m/s^2, g and mg.
+# |a| at rest in each unit, and its relative tolerance, which exceeds the errors of bias and scale
+# of cheap sensors, even in a chamber, and is far below the ratios of m/s^2, g and mg.
 PER_G: dict[Unit, float] = {'g': 1.0, 'm/s^2': STANDARD_GRAVITY, 'mg': 1000.0}
 _TOLERANCE = 0.2
 # Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12
-# Ratio of a cell's scatter to the quiet level, above which the unit is handled: the sd of a cell
-# of 12 noise samples stays within a factor of 2 of its mean.
+# Ratio of the sd of a cell's samples to the quiet level above which the unit is handled: the sd of
+# 12 samples of noise stays within a factor of 2 of the mean sd.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
-NO_STAMP = np.iinfo(np.int64).min  # the stamp of a row without a stamp
-#: Range of temperatures on a circuit board [degC]; kelvins and raw counts are outside.
+NO_STAMP = np.iinfo(np.int64).min  # stands for the stamp of a row without a stamp
+#: Range of plausible temperatures [degC]; readings in kelvins or in raw counts are mostly outside.
 PLAUSIBLE_CELSIUS = (-90.0, 200.0)
-_RUN_ROWS = 100_000  # number of rows processed at a time, to bound the memory
+_RUN_ROWS = 100_000  # number of rows processed at a time, to limit the memory
 _EXAMPLES = 5
 _RESTART_NS = 10**9  # a larger backward step of stamps is a restart of the clock [ns]
-SLOW_HZ = 5.0  # logs with a lower sample rate are only good for soaks
+SLOW_HZ = 5.0  # sample rate below which a log has no short rests, only soaks
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class ForeignLog:
     accel: Floats  # samples in the stated unit, NaN if no number, shape (n, 3)
     gyro: Floats | None = None  # [rad/s], shape (n, 3)
     temperatures: Mapping[str, Readings] = field(default_factory=dict)
-    line: Ints | None = None  # line of each row in the file, shape (n,); None: the row's number
+    line: Ints | None = None  # line of each row in the file, shape (n,); None: numbers from 1
     input: Literal['counts', 'imu'] = 'imu'  # type of the messages to write
     unit: Unit = 'm/s^2'
     counts_per_g: float | None = None
@@ -70,28 +70,28 @@ class ForeignLog:
     frame_id: str = 'imu_link'
     serial: str = ''
     n_short: int = 0  # number of rows dropped for missing cells
-    not_used: tuple[str, ...] = ()  # columns of a table that are in no message
-    continued: tuple[int, ...] = ()  # lines where a 32-bit counter began again, and was continued
+    not_used: tuple[str, ...] = ()  # columns of a table that are not written to the bag
+    continued: tuple[int, ...] = ()  # lines after an overflow of a 32-bit counter of time
     metadata: Mapping[str, str] = field(default_factory=dict)
     missing: str | None = None  # description of unreadable parts
-    chosen: str | None = None  # note on topics chosen by type
+    chosen: str | None = None  # note on topics chosen by type, or on samples left out
     guessed: Any = None  # column map, if it was guessed
-    hint: str = ''  # advice how to log more
+    hint: str = ''  # advice on how to log better data
 
 
 @dataclass(frozen=True)
 class Stillness:
-    """Rests of a log, and its samples at rest in the unit of the log, NaN without a rest."""
+    """Rests and movements of a log; `magnitude` and `noise` in its unit, NaN for few samples."""
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells
     still_s: float
-    moving_ns: tuple[tuple[int, int], ...]  # begin and end of each movement
+    moving_ns: tuple[tuple[int, int], ...]  # stamps of begin and end of each movement
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Number of rows of a log with some property, and the line numbers of the first few rows."""
+    """Number of rows of a log with a property, and the line numbers of the first five rows."""
 
     count: int
     lines: tuple[int, ...] = ()
@@ -107,12 +107,12 @@ class ConversionReport:
     rate_hz: float
     duration_s: float
     findings: dict[str, Finding]
-    believed: str  # unit inferred from the readings at rest
+    inferred_unit: str  # which unit follows from the readings at rest, and why
     stillness: Stillness
 
 
-def library(module: str, extra: str, what: str, path: Path) -> Any:
-    """Import the module of an extra."""
+def import_extra(module: str, extra: str, what: str, path: Path) -> Any:
+    """Import a module of the optional dependency `extra`; RecordingError if it is missing."""
     try:
         return import_module(module)
     except ImportError as failure:
@@ -180,7 +180,7 @@ def write_log(
             'backwards': _finding(np.diff(stamp_ns, prepend=stamp_ns[0]) < 0, line),
             'repeated': _finding(np.diff(stamp_ns, prepend=stamp_ns[0] - 1) == 0, line),
         },
-        believed=inferred_unit(stillness.magnitude)[1],
+        inferred_unit=infer_unit(stillness.magnitude)[1],
         stillness=stillness,
     )
 
@@ -222,8 +222,8 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
-    Return log times that never decrease, and the shift added after each restart of the clock. For
-    a thermometer the `shifts` of the samples are given: its readings stay among the samples.
+    Return log times that never decrease, and the shift added after each restart of the clock [ns].
+    For readings of a thermometer, give the `shifts` of the samples to shift both alike.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():
@@ -237,7 +237,7 @@ def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
 
 
 def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
-    """Leave out single impossible readings, such as -127 degC of a DS18B20 without contact."""
+    """Leave out impossible temperatures, as -127 degC of a DS18B20 without contact; count them."""
     low, high = PLAUSIBLE_CELSIUS
     kept, n = {}, 0
     for name, readings in log.temperatures.items():
@@ -248,7 +248,7 @@ def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
 
 
 def _write(log: ForeignLog, output: Path, force: bool, progress: Callable[[float], None]) -> None:
-    """Write the messages; log times never go back, so backward stamps keep their order."""
+    """Write the messages with log times that never decrease, which keeps the order of rows."""
     topics, n = Topics(), len(log.stamp_ns)
     newest, shifts = _log_times(log.stamp_ns)
     per_g = PER_G.get(log.unit, log.counts_per_g or 1.0)
@@ -288,19 +288,19 @@ def _write(log: ForeignLog, output: Path, force: bool, progress: Callable[[float
 
 
 def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
-    """Find the rests of a recording (n, 3) of any length by their noise."""
+    """Find the rests and movements in samples, shape (n, 3), by their scatter."""
     reduced = CellAccumulator(_CELL_S, None, least=_MIN_SAMPLES)
     for first in range(0, len(accel), _RUN_ROWS):
         run = slice(first, first + _RUN_ROWS)
         reduced.add(stamp_ns[run], accel[run])
-    cells = reduced.finish()
+    cells = reduced.cells()
     usual = float(np.median(cells.count)) if len(cells.count) else 0.0
     full = cells.count >= max(_MIN_SAMPLES, 0.5 * usual)
     if not full.any():
         return Stillness(float('nan'), float('nan'), 0.0, ())
     sd = np.sqrt(cells.variance[full].mean(axis=1))
     # The quiet level is the lower quartile of the cells' sd, since a unit may be handled for most
-    # of a log, and is at least a quantum, since noise below the quantum is not visible.
+    # of a log, and at least a quantum, since noise below the quantum is not visible.
     is_quiet = sd <= _MOVING_RATIO * max(np.quantile(sd, 0.25), cells.quantum.max())
     cell_ns = round(cells.cell_s * 1e9)
     moving: list[tuple[int, int]] = []
@@ -315,10 +315,10 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
     )
 
 
-def inferred_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
-    """Infer the unit (or ``counts``, ``unknown``) from |a| at rest; return it and the reason."""
+def infer_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
+    """Return the unit of samples (or ``unknown``) that follows from |a| at rest, and why."""
     if not np.isfinite(magnitude):
-        return 'unknown', 'the sensor never rests, so its readings do not show their unit'
+        return 'unknown', 'the sensor never rests, so its readings do not show the unit'
     reading = f'|a| at rest is {magnitude:.4g}'
     for unit, gravity in PER_G.items():
         if abs(magnitude / gravity - 1.0) <= _TOLERANCE:
@@ -332,15 +332,15 @@ def inferred_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
 
 
 def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> str | None:
-    """Return why a stated unit cannot be true; None if the unit can be true."""
+    """Return why a stated unit is false, given |a| at rest; None if it can be true."""
     if not np.isfinite(magnitude):
         return None
-    believed, reason = inferred_unit(magnitude)
-    if stated != 'counts' and believed == 'unknown':
+    inferred, reason = infer_unit(magnitude)
+    if stated != 'counts' and inferred == 'unknown':
         return reason
     if stated != 'counts':
-        return None if believed == stated else f'{reason}: that looks like {believed}'
+        return None if inferred == stated else f'{reason}: that looks like {inferred}'
     if counts_per_g is not None and abs(magnitude / counts_per_g - 1.0) > _TOLERANCE:
         text = f'|a| at rest is {magnitude:.4g} counts, {counts_per_g:g} per g are stated'
         return f'{text}: is there an `offset`?' if magnitude > 2.0 * counts_per_g else text
-    return f'{reason}: that looks like {believed}' if magnitude < 50.0 else None
+    return f'{reason}: that looks like {inferred}' if magnitude < 50.0 else None

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from . import autopilot, bag, column_map
 from .log import ForeignLog, write_log
 
-#: For each kind of file, the keywords that `read_log` takes.
+#: Keywords that `read_log` takes for each kind of file.
 KEYWORDS: dict[str, tuple[str, ...]] = {
     'table': ('columns', 'rate_hz'),
     'log': ('imu', 'baro', 'allow_compensated'),
@@ -33,9 +33,9 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
     Read a table, a PX4 or ArduPilot log, or a bag with other topics.
 
     Table: `columns` is the path of a table's column map (default: guessed), `rate_hz` the sample
-    rate of a table without times. Log: `imu` and `baro` count from 0, `allow_compensated` accepts
-    samples that the autopilot has corrected. Bag: `topic` names ``imu``, ``board`` and ``case``,
-    `unit` is the unit of the Imu topic.
+    rate of a table without times. Log: `imu` and `baro` are numbers from 0, `allow_compensated`
+    accepts samples that the autopilot has corrected. Bag: `topic` maps ``imu``, ``board`` and
+    ``case`` to topics, `unit` is the unit of the Imu topic.
 
     Raises ValueError for a keyword that does not apply to this kind of file, RecordingError if the
     file cannot be read.
@@ -69,7 +69,7 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
 def as_bags(
     paths: Sequence[Path], on_log: Callable[[ForeignLog], None] = lambda _: None, **given: Any
 ) -> Iterator[list[Path]]:
-    """Convert tables and logs to temporary bags; `on_log` is called with each log."""
+    """Convert tables and logs to temporary bags, and keep bags; `on_log` gets each log."""
     others = [path for path in paths if path.is_file() and kind_of(path) != 'bag']
     if any(given.values()) and not others:
         flags = ' and '.join(f'`{name}`' for name in given)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns tables of numbers: CSV, TSV, blank-separated or Parquet -> named columns of float64.
+Owns the reading of tables (CSV, TSV, blank-separated, Parquet) into named columns of float64.
 
-A cell that is not a number becomes NaN, and its row is counted. Stamps are read exactly, by their
-decimal digits, because a float does not resolve nanoseconds since 1970.
+A cell that is not a number becomes NaN. Stamps are read exactly, by their decimal digits, because
+a float does not resolve nanoseconds since 1970.
 """
 
 import csv
@@ -30,19 +30,19 @@ from ..files import open_regular
 from ..quantities import NotNegative, Positive
 from ..typing import Floats, Ints
 from .headings import read_headings
-from .log import NO_STAMP, library
+from .log import NO_STAMP, import_extra
 
 Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 
 _SNIFF_BYTES = 65536
-_LAYOUT_ROWS = 50  # rows at the end of the sniffed text that decide the layout
-_PREAMBLE_ROWS = 1000  # longest preamble of a logger
+_LAYOUT_ROWS = 50  # number of rows, the last of the first 64 KiB, that decide the layout
+_PREAMBLE_ROWS = 1000  # largest number of rows before the table, as some loggers write
 _ROWS_AT_ONCE = 4096  # number of rows whose cells are read together
-_MOST_ROWS_PER_BYTE = 4  # largest number of rows per byte of a Parquet file with measurements
+_MOST_ROWS_PER_BYTE = 4  # more rows per byte of a Parquet file are not measurements
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
-#: ISO 8601, optionally followed by the name of a zone, as in some logs; the default is UTC.
+#: Date of ISO 8601, in UTC unless an offset is given; the name of a zone may follow in brackets.
 _ISO = re.compile(
     r'(\d{4})-(\d\d)-(\d\d)[T ](\d\d):(\d\d)(?::(\d\d)(?:[.,](\d{1,9})\d*)?)?'
     r'\s*(?:(Z|UTC)|([+-])(\d\d):?(\d\d)?)?(?:\s*\[[^\]]*\])?'
@@ -55,7 +55,7 @@ _Rows = Iterator[tuple[int, list[str]]]  # line number and cells of each row
 
 @dataclass(frozen=True)
 class Format:
-    """Layout of a table of text; an attribute that is None is detected."""
+    """Layout of a text table; an attribute that is None is detected from the text."""
 
     delimiter: Literal[',', ';', '|', 'tab', 'blank'] | None = None
     header: bool | None = None
@@ -63,12 +63,12 @@ class Format:
 
 @dataclass(frozen=True)
 class Stamp:
-    """A column of time stamps, or a fixed rate."""
+    """The source of stamps: a column of times, or a fixed sample rate."""
 
     column: Column | None = None
     unit: TimeUnit | None = None
     rate_hz: Positive | None = None
-    start_s: NotNegative = 1.0  # above 0, as ROS takes a zero stamp for "no time yet"
+    start_s: NotNegative = 1.0  # stamp of the first row; in ROS the stamp 0 means "no time yet"
 
     def __post_init__(self) -> None:
         if (self.column is None) == (self.rate_hz is None):
@@ -77,7 +77,7 @@ class Stamp:
             raise ValueError('`unit` must be s, ms, us, ns or iso if `column` is given')
 
     def ticks(self, n: int) -> Ints:
-        """Return stamps of rows at the fixed rate, shape (n,); rounding does not accumulate."""
+        """Return stamps of n rows at the fixed rate [ns]; rounding errors do not accumulate."""
         steps: Ints = np.rint(np.arange(n) * (1e9 / (self.rate_hz or 1.0))).astype(np.int64)
         return steps + round(self.start_s * 1e9)
 
@@ -86,7 +86,7 @@ class Stamp:
 class Table:
     """Columns of a table, in file order, shape (n,)."""
 
-    line: Ints  # line of each row in the file, from 1; in Parquet the row's number
+    line: Ints  # line of each row in the file, from 1; in Parquet the number of the row
     values: dict[Column, Floats]  # NaN if a cell is not a number
     stamp_ns: Ints  # `NO_STAMP` if a cell is not a number
     n_short: int = 0  # number of dropped rows with too few cells, such as a cut row
@@ -97,7 +97,7 @@ class Table:
 def read_text(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, style: Format | None = None
 ) -> Table:
-    """Read columns of a table of text, by headings or numbers from 0; all if `columns` is None."""
+    """Read columns of a text table, by headings or numbers from 0; all if `columns` is None."""
     try:
         with TextIOWrapper(
             open_regular(path), encoding='utf-8-sig', errors='replace', newline=''
@@ -124,19 +124,18 @@ def read_text(
 def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     Return the delimiter of a text table and the number of cells per row: the delimiter that splits
-    most lines into the same number of cells (a blank is any run of white space). Only the last
-    lines of `head` count, because a logger's preamble may come first; the very last line may be
-    cut.
+    most lines into the same number of cells (a blank is any run of white space). Only the last 50
+    lines of `head` count, because a preamble may come first; the very last line, which may be cut,
+    does not count.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = lines[:-1] if len(lines) > 2 else lines
     candidates: list[tuple[int, str, int]] = []
-    # The comma is tried late, because it may be the decimal sign of a table with another
-    # delimiter.
+    # The comma is tried late: it may be the decimal sign in a table with another delimiter.
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # Most rows lack the columns of a slower thermometer at their end: use a whole row.
+        # Most rows may lack last cells, of a slower thermometer: take the width of whole rows.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -158,13 +157,13 @@ def _n_cells(row: Sequence[str]) -> int:
 
 
 def _rows(file: Iterable[str], delimiter: str) -> _Rows:
-    """Yield (line number, cells) of every line that is neither empty nor a comment."""
+    """Yield line number and cells of every line that is neither empty nor a comment."""
     if delimiter == ' ':
         cells: Iterable[list[str]] = (line.split() for line in file)
     else:
         cells = csv.reader(file, delimiter=delimiter)
     for number, row in enumerate(cells, 1):
-        # A row that begins with a digit, as nearly all do, is no comment and not empty.
+        # A row that begins with a digit, as nearly all rows do, is no comment and not empty.
         if row and (
             row[0][:1].isdigit() or (not _is_comment(row[0]) and any(map(str.strip, row)))
         ):
@@ -174,13 +173,13 @@ def _rows(file: Iterable[str], delimiter: str) -> _Rows:
 def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str], _Rows]:
     """
     Skip the preamble; return the headings, if any, and the rows of a table. A row has `width`
-    cells, apart from blank cells at its end. Rows directly before the first row of numbers belong
-    to the table, and the first of these rows has the headings.
+    cells, of which the last may be blank. Rows of this width directly before the first row of
+    numbers belong to the table, and the first of these rows has the headings.
     """
     first = list(islice(rows, _PREAMBLE_ROWS))
     is_row = [_n_cells(row) <= width <= len(row) for _, row in first]
     n_numbers = [sum(_number(cell) is not None for cell in row) for _, row in first]
-    is_first = [one and 2 * n > width for one, n in zip(is_row, n_numbers, strict=True)]
+    is_first = [fits and 2 * n > width for fits, n in zip(is_row, n_numbers, strict=True)]
     if not any(is_first):
         is_first, has_header = is_row, has_header is not False
     begin = is_first.index(True) if any(is_first) else 0
@@ -193,7 +192,7 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
 
 
 def _commented(head: str, delimiter: str, width: int) -> list[str]:
-    """Return the headings in the last comment before a table, as numpy.savetxt writes them."""
+    """Return headings from the last comment before a table, where numpy.savetxt writes them."""
     comments = list(
         takewhile(lambda line: not line.strip() or _is_comment(line), head.splitlines())
     )
@@ -234,7 +233,8 @@ def _collect(
     needed = 1 + max([*places.values(), -1 if at is None else at])
     for name, place in places.items():
         if re.fullmatch(r'\s*[+-]?[0-9]+,[0-9]+\s*', first[1][place]):
-            why = f'column {name!r} has decimal commas, as in {first[1][place]}: use points'
+            why = f'column {name!r} has decimal commas, it begins with {first[1][place].strip()}: '
+            why += 'write decimal points'
             raise RecordingError(why, path=path)
 
     line, stamps, n_short = array('q'), array('q'), 0
@@ -250,8 +250,8 @@ def _collect(
             stamps.extend(exact_ns(row[at], stamp.unit) for _, row in whole)
     if at is not None and stamp.unit == 'iso' and stamps and max(stamps) == NO_STAMP:
         raise RecordingError(
-            f'no cell of its column {stamp.column!r} is a date of ISO 8601, as '
-            f'2026-03-29T01:30:00.5Z; the first is {first[1][at].strip()!r}',
+            f'no cell of its column {stamp.column!r} is a date of ISO 8601, like '
+            f'2026-03-29T01:30:00.5Z; the first cell is {first[1][at].strip()!r}',
             path=path,
         )
     return Table(
@@ -269,7 +269,7 @@ def _place(path: Path, name: Column, headings: Sequence[str], width: int) -> int
     if isinstance(name, int):
         if 0 <= name < width:
             return name
-        why = f'no column {name}: the table has {width}, 0 to {width - 1}'
+        why = f'no column {name}: the table has {width} columns, 0 to {width - 1}'
     elif not headings:
         why = f'no column {name!r}: the table has no headings, give numbers from 0'
     elif headings.count(name) > 1:
@@ -317,11 +317,11 @@ def read_parquet(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
 ) -> Table:
     """
-    Read columns of a Parquet file like `read_text`; Parquet's timestamps state their unit.
+    Read columns of a Parquet file as `read_text` does; timestamps of Parquet state their unit.
 
-    If `columns` is None all columns are read; columns without numbers become NaN.
+    If `columns` is None all columns are read, and columns without numbers become NaN.
     """
-    pq = library('pyarrow.parquet', 'parquet', 'a Parquet file', path)
+    pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file', path)
     import pyarrow as pa
 
     try:
@@ -329,7 +329,7 @@ def read_parquet(
             parquet = pq.ParquetFile(file)
             if parquet.metadata.num_rows > _MOST_ROWS_PER_BYTE * os.fstat(file.fileno()).st_size:
                 raise RecordingError(
-                    f'too small for its {parquet.metadata.num_rows} rows', path=path
+                    f'the file is too small for {parquet.metadata.num_rows} rows', path=path
                 )
             headings = list(parquet.schema_arrow.names)
             wanted = range(len(headings)) if columns is None else columns
@@ -338,7 +338,7 @@ def read_parquet(
             table = parquet.read(columns=[headings[i] for i in sorted(set(places.values()))])
     except RecordingError:
         raise
-    except Exception as failure:  # a damaged file may raise any exception
+    except Exception as failure:  # a damaged file may raise any type of exception
         reason = ' '.join(str(failure).split())
         raise RecordingError(f'not a readable Parquet file ({reason})', path=path) from failure
     if not table.num_rows:

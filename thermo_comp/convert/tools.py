@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the files of other tools: `TOOLS` writes and reads the file of each tool.
+Owns the files of other calibration tools: `TOOLS` writes and reads the file of each tool.
 
-Autopilots only correct each axis' bias, by a cubic of the sensor's temperature held at the edges
-of a range, in m/s^2 or, for a gyroscope, in rad/s; ``raw`` is in m/s^2, scaled by the driver::
+Autopilots only correct the bias of each axis, by a cubic of the sensor's temperature, which is
+held at the edges of a range; ``raw`` and a are in m/s^2 or, for a gyroscope, in rad/s::
 
     PX4        a = raw - (X0 + X1 d + X2 d^2 + X3 d^3),        d = T - TREF
     ArduPilot  a = raw - 1e-6 (p(T) - p(CALTEMP)),  p(T) = ACC1 d + ACC2 d^2 + ACC3 d^3, d = T - 35
 
-For a gyroscope ``TC_Gn`` replaces ``TC_An``, and ``GYR`` replaces ``ACC``. Other tools calibrate a
-triad at one temperature; with the reading N and the specific force a::
+For a gyroscope ``TC_Gn`` replaces ``TC_An``, and ``GYR`` replaces ``ACC``. The other tools
+calibrate a triad at one temperature; with the reading N and the specific force a::
 
     imu_tk      a = T K (N - B)      T upper triangular, unit diagonal; K diagonal    (.calib)
     imu_calib   a = SM N - bias      SM any matrix                                    (YAML)
     Kalibr      N = M a + b          M lower triangular                               (YAML)
     thermo_comp a = M K^-1 (N - b)   M lower triangular, unit diagonal; K diagonal
 
-A tool whose matrix is not lower triangular has a frame that is rotated relative to that of
-thermo_comp.
+If the matrix of a tool is not lower triangular, the frame of the tool is rotated relative to the
+frame of thermo_comp.
 """
 
 import re
@@ -51,22 +51,22 @@ _HEADING = re.compile(r'\s*(#|Misalignment Matrix|Scale Matrix|Bias Vector)')
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a file: ``a = matrix (N - bias)``, the bias a cubic of temperature."""
+    """The content of a file: ``a = matrix (N - bias)``, the bias is a cubic of temperature."""
 
     matrix: Floats  # shape (3, 3); the identity in an autopilot's file
-    bias: Floats  # coefficients of each axis, in units of N, shape (3, 4)
-    reference_c: float  # temperature at the origin of the cubics
+    bias: Floats  # coefficients of the cubic of each axis, in units of N, shape (3, 4)
+    reference_c: float  # temperature at which the argument of the cubics is 0
     range_c: tuple[float, float]
-    notes: list[str]  # lost or missing parts
-    source: str = ''  # the tool and the set that was read
-    # For export: white noise [m/s^2/sqrt(Hz)], bias walk [m/s^2/sqrt(h)], samples per second.
+    notes: list[str]  # parts of the calibration that are lost or missing
+    source: str = ''  # the tool and the parameter set that was read
+    # For export: white noise [m/s^2/sqrt(Hz)], random walk [m/s^2/sqrt(h)], samples per second.
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate_bias: Floats | None = None  # like `bias`, for the angular rate [rad/s]
     text: str = ''  # the written file
 
 
 def _write_px4(content: Content, number: int | None, device_id: int) -> str:
-    """Write PX4 parameters in QGroundControl's format; n in ``TC_An`` counts from 0."""
+    """Write PX4 parameters in QGroundControl's format; the n of ``TC_An`` counts from 0."""
     instance = _within(number, 0)
     lower, upper = content.range_c
     lines = ['# Vehicle-Id Component-Id Name Value Type']
@@ -87,7 +87,7 @@ def _write_px4(content: Content, number: int | None, device_id: int) -> str:
 
 
 def _write_ardupilot(content: Content, number: int | None, _device_id: int) -> str:
-    """Write ArduPilot parameters; n in ``INS_TCALn`` counts from 1."""
+    """Write ArduPilot parameters; the n of ``INS_TCALn`` counts from 1."""
     imu = _within(number, 1)
     lower, upper = content.range_c
     content.notes.append(
@@ -112,7 +112,7 @@ def _within(number: int | None, lowest: int) -> int:
 
 
 def _read_px4(text: str, number: int | None) -> Content | None:
-    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for another tool's."""
+    """Read PX4 parameters (QGroundControl's format or ``NAME=VALUE``); None for another tool."""
     values = _Parameters(text)
     numbers = {int(name[4]) for name in values if re.match(r'TC_A\d_X1_', name)}
     if not numbers:
@@ -140,7 +140,7 @@ def _read_px4(text: str, number: int | None) -> Content | None:
 
 
 def _read_ardupilot(text: str, number: int | None) -> Content | None:
-    """Read ArduPilot parameters (Mission Planner, MAVProxy); None for another tool's text."""
+    """Read ArduPilot parameters (Mission Planner, MAVProxy); None for another tool."""
     values = _Parameters(text)
     numbers = {int(name[8]) for name in values if name.startswith('INS_TCAL')}
     if not numbers:
@@ -153,14 +153,14 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
     def cubics(sensor: str) -> Floats:
         names = [[f'{prefix}{sensor}{power}_{axis}' for power in (1, 2, 3)] for axis in _AXES]
         slopes = np.array([[values[name] for name in row] for row in names]) / _ARDUPILOT_SCALE
-        # The correction is 0 at the temperature of the offset calibration.
+        # The correction is 0 at the temperature of ArduPilot's offset calibration.
         calibrated = values.get(f'INS_{sensor}{number}_CALTEMP', _NO_TEMPERATURE)
         held = min(max(calibrated, values[f'{prefix}TMIN']), values[f'{prefix}TMAX'])
         powers = (held - _ARDUPILOT_REFERENCE_C) ** np.arange(1, 4)
         return np.column_stack((-slopes @ powers, slopes))
 
     bias, range_c = cubics('ACC'), (values[f'{prefix}TMIN'], values[f'{prefix}TMAX'])
-    # The parameters of a gyroscope are zeros if it has no thermal calibration.
+    # The parameters of a gyroscope without a thermal calibration are zeros.
     rate_bias = cubics('GYR') if values.has(f'{prefix}GYR') else None
     source, notes = f'ArduPilot {prefix}*', [_THERMAL_NOTE]
     reference = _ARDUPILOT_REFERENCE_C
@@ -168,7 +168,7 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
 
 
 class _Parameters(dict[str, float]):
-    """Thermal parameters in a text, by name; a missing parameter is an error."""
+    """Thermal parameters in a text, by name; CalibrationError for a missing parameter."""
 
     def __init__(self, text: str) -> None:
         for line in text.splitlines():
@@ -189,17 +189,17 @@ class _Parameters(dict[str, float]):
 
 
 def _choose(numbers: set[int], number: int | None, is_in_use: Callable[[int], bool]) -> int:
-    """Choose the parameter set `number`, or the only set in use."""
+    """Return the number of the parameter set, by default of the only set in use."""
     if number is None:
         live = [n for n in sorted(numbers) if is_in_use(n)] or sorted(numbers)
         if len(live) > 1:
             raise CalibrationError(
-                f'several sets of parameters, numbers {live}: choose one with --number'
+                f'the file has several sets of parameters, {live}: choose a set with --number'
             )
         return live[0]
     if number not in numbers:
         raise CalibrationError(
-            f'no set of parameters {number} (--number); the file has the numbers {sorted(numbers)}'
+            f'no set of parameters {number} (--number); the file has the sets {sorted(numbers)}'
         )
     return number
 
@@ -217,10 +217,8 @@ def _qr(matrix: Floats) -> tuple[Floats, Floats]:
     return rotation @ signs, signs @ upper
 
 
-def turned(rotation: Floats) -> list[str]:
-    """
-    Describe the rotation from a tool's frame to thermo_comp's, for tf; empty if the frames agree.
-    """
+def rotation_notes(rotation: Floats) -> list[str]:
+    """Describe the rotation from a tool's frame to thermo_comp's; empty without a rotation."""
     if np.abs(rotation - np.eye(3)).max() < 1e-9:
         return []
     roll = np.arctan2(rotation[2, 1], rotation[2, 2])
@@ -237,7 +235,7 @@ def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str
     """Write the three blocks of imu_tk's ``.calib``; imu_tk's reader accepts no comments."""
     rotation, upper = _qr(content.matrix)
     scale = np.diag(upper)
-    content.notes.extend(turned(rotation.T))
+    content.notes.extend(rotation_notes(rotation.T))
     return ''.join(
         ''.join(' '.join(map(repr, row)) + '\n' for row in block.tolist()) + '\n'
         for block in (upper / scale, np.diag(scale), content.bias[:, :1])
@@ -251,11 +249,11 @@ def _write_imu_calib(content: Content, _number: int | None, _device_id: int) -> 
 
 
 def _write_kalibr(content: Content, number: int | None, _device_id: int) -> str:
-    """Write the accelerometer's part of an IMU in Kalibr's YAML."""
+    """Write Kalibr's YAML of an IMU, without topic and gyroscope."""
     white, walk, rate = content.noise
     rows = ''.join(f'    - {row}\n' for row in np.linalg.inv(content.matrix).tolist())
-    content.notes.append('Kalibr estimates the bias each time and ignores the key `bias`')
-    content.notes.append('the file lacks rostopic and gyroscope of the IMU: add them for Kalibr')
+    content.notes.append('Kalibr estimates the bias in each run and ignores the key `bias`')
+    content.notes.append('the file lacks rostopic and gyroscope of the IMU: add these for Kalibr')
     return (
         f'imu{number or 0}:\n  model: scale-misalignment\n  update_rate: {rate:.9g}\n'
         f'  accelerometer_noise_density: {white!r}\n'
@@ -288,7 +286,7 @@ def _read_imu_calib(text: str, _number: int | None) -> Content | None:
 
 
 def _read_kalibr(text: str, number: int | None) -> Content | None:
-    """Read an IMU of Kalibr's YAML, by its number; None if no IMU has a matrix."""
+    """Read an IMU of Kalibr's YAML, by the number of the IMU; None if no IMU has a matrix."""
     imus = {
         str(name): _dictionary(_dictionary(part).get('accelerometers'))
         for name, part in _mapping(text).items()
@@ -298,13 +296,11 @@ def _read_kalibr(text: str, number: int | None) -> Content | None:
         return None
     name = next(iter(imus)) if number is None else f'imu{number}'
     if name not in imus or (number is None and len(imus) > 1):
-        raise CalibrationError(
-            f'choose one of the IMUs with --number: there are {", ".join(imus)}'
-        )
+        raise CalibrationError(f'choose an IMU with --number: the file has {", ".join(imus)}')
     part = imus[name]
     matrix = _regular(_array(part['M'], f'{name}.accelerometers.M', 9).reshape(3, 3))
     bias = _array(part.get('bias', [0, 0, 0]), f'{name}.accelerometers.bias', 3)
-    lacks = '' if 'bias' in part else '; Kalibr keeps no bias: it is 0 here'
+    lacks = '' if 'bias' in part else '; the file of Kalibr has no bias: 0 is used'
     return _triad(f'Kalibr {name}', np.asarray(np.linalg.inv(matrix), np.float64), bias, lacks)
 
 
@@ -345,10 +341,10 @@ def _array(value: object, key: str, size: int) -> Floats:
 
 @dataclass(frozen=True)
 class Tool:
-    """The file of a tool: a bias over temperature, or scale and misalignment."""
+    """Functions for the file of a tool, which has a bias over temperature or a constant triad."""
 
     write: Callable[[Content, int | None, int], str]
-    read: Callable[[str, int | None], Content | None]  # None for another tool's text
+    read: Callable[[str, int | None], Content | None]  # returns None for the file of another tool
     is_thermal: bool = False
     reference_c: float | None = None  # the fixed reference temperature of an autopilot
 

@@ -103,7 +103,7 @@ class Watch:
             how = f'again within its claim since {since}' if since else 'within its claim'
             text = f'the unit is {how} up to {self.last} ({week}); '
             if self.forecast:
-                when = 'on any day' if self.forecast[1] < 1.0 else f'about {self._date(1)}'
+                when = 'on any day' if self.forecast[1] < 1.0 else self._date(1, 'about ')
                 text += f'forecast: it will leave its claim {when}'
                 text += f' (10 to 90 %: {self._date(0)} .. {self._date(2)})'
             else:
@@ -113,11 +113,11 @@ class Watch:
             text += f'; recalibration interval {middle} days (10 to 90 %: {low} .. {high})'
         return text
 
-    def _date(self, k: int) -> str:
+    def _date(self, k: int, front: str = '') -> str:
         days = self.forecast[k]
         if not np.isfinite(days):
-            return 'later than ten years from now'
-        return str(np.datetime64(self.last, 'D') + np.timedelta64(int(days), 'D'))
+            return 'in more than ten years'
+        return f'{front}{np.datetime64(self.last, "D") + np.timedelta64(int(days), "D")}'
 
 
 def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:

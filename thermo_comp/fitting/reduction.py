@@ -159,7 +159,7 @@ class _Pass:
                 if len(new.stamp_ns):
                     earlier.append(new)
             self.n_samples += len(block.accel_stamp_ns)
-        self.cells = accumulator.finish()
+        self.cells = accumulator.cells()
         self.temperatures = {
             name: Readings(*map(np.concatenate, zip(*parts, strict=True)))
             for name, parts in readings.items()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a run over a fleet: fits the tests without a result.json, which a finished fit writes."""
+"""Owns a run over a fleet: fits the tests without a valid result, and stores the results."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from .work import FleetOptions, UnitOutcome, connected, run, sha256
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
 _FORMAT = 3
 _LONGEST_NAME = 100
-# Largest number of rows listed on the page; the table has all rows.
+# Largest number of units listed on the page; the table has all units.
 _MOST_ROWS = 60
-# Verdicts of a fit on its bags that contradict the fit: more data would not change them.
+# Verdicts on the bags of a fit that contradict the fit: more data would not change these verdicts.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )
@@ -43,7 +43,7 @@ CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'resu
 
 @dataclass(frozen=True)
 class FleetResult:
-    """The result of a fleet: rows by name, summary, files."""
+    """The result of a run over a fleet: rows sorted by name, statistics, files."""
 
     rows: tuple[Row, ...]
     summary: Summary
@@ -79,10 +79,10 @@ def fit_fleet(
     progress: Callable[[int, int, Row | None], None] = lambda *_: None,
 ) -> FleetResult:
     """
-    Fit all units without results; ThermoCompError or OutputError if no unit can be fitted.
+    Fit all units without a stored result; ThermoCompError or OutputError if no unit can be fitted.
 
-    `progress` gets the numbers of finished and of all tests, and None before the first fit, or the
-    row of the last fit.
+    `progress` gets the number of finished tests, the number of all tests, and the row of the last
+    finished test, or None before the first fit.
     """
     _require_packages()
     storage = Storage(url)
@@ -136,13 +136,13 @@ def _require_packages() -> None:
 
 
 def _in_prior(row: Row) -> bool:
-    """Whether a unit may contribute to the prior: data complete, calibration valid."""
+    """Whether a unit may contribute to the prior: complete data and a valid calibration."""
     return is_valid(row) and row['is_whole'] == 1
 
 
 def lacks_data(row: Row) -> bool:
     """
-    Whether a unit's data are incomplete, so that the prior of the type replaces missing data.
+    Whether a unit's data are incomplete, so that a fit with the prior of the type makes sense.
 
     Data that contradict themselves or the fit are not incomplete: a prior would hide the fault.
     """
@@ -151,8 +151,8 @@ def lacks_data(row: Row) -> bool:
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
-    """Build the prior from the valid units; otherwise return the reason why there is none."""
-    # If a unit was tested twice, only the later test is used.
+    """Build the prior from the valid units; without a prior, return the reason."""
+    # If a unit was tested several times, only the last test is used.
     tests = sorted((row for row in rows if _in_prior(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
@@ -186,15 +186,16 @@ def render_fleet(
         'residuals',
         'How large are the residuals of |f| in the fleet?',
         'Share of the units whose residual at rest is below the value: raw (constants at the '
-        'reference temperature), and with each unit’s calibration. A steep curve: '
-        'the units are alike; a tail to the right: units to inspect.',
+        'reference temperature), and with each unit’s calibration. If a curve is steep, the '
+        'units are alike; inspect the units in a tail to the right.',
         partial(draw_shares, curves),
     )
     distances = ReportFigure(
         'distances',
         'Which units stand out, and in what?',
-        'Each stroke is a unit: its distance from the fleet’s median in standard deviations of '
-        'the units and of its own fit. Diamonds beyond the lines are the units listed above.',
+        'Each stroke is a unit, at its distance from the fleet’s median, divided by the root of '
+        'the sum of the variances of the units and of the unit’s own fit. Diamonds beyond the '
+        'lines are the outliers in the table.',
         partial(
             draw_distances,
             [spread.quantity.label for spread in summary.spreads],
@@ -202,7 +203,7 @@ def render_fleet(
             [spread.limit for spread in summary.spreads],
         ),
     )
-    # Outliers are not sought with fewer than eight units: all limits are infinite.
+    # With fewer than eight units no outliers are sought: all limits are infinite.
     is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
     return render(
         'fleet.html',
@@ -220,7 +221,7 @@ def render_fleet(
 
 
 class Results:
-    """The folder of results, created if missing; ThermoCompError if the creation fails."""
+    """The folder of results, created if missing; ThermoCompError if this is impossible."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -230,7 +231,7 @@ class Results:
             raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files, which is always inside the folder of results."""
+        """Return the folder of a unit's files, inside the folder of results for any name."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 
@@ -240,7 +241,7 @@ class Results:
         return path.relative_to(self.folder).as_posix() if path.is_file() else ''
 
     def look_up(self, unit: FoundUnit, options: FleetOptions) -> Row | None:
-        """Find the row of a finished earlier run of the same bags and options, or None."""
+        """Return the stored row of a fit to the same bags with the same options, or None."""
         folder = self.folder_of(unit.name, options.fit.prior)
         try:
             record = json.loads((folder / RESULT).read_bytes())
@@ -257,15 +258,15 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """Write an outcome and return its row; a failure keeps an earlier calibration."""
+        """Store an outcome and return the row; a failed fit keeps an earlier calibration."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):
             texts = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
             return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, texts)))})
         if outcome.calibration:
-            # Write the record last: while its hash differs from the calibration's, the unit counts
-            # as missing.
+            # The record is written last: until then the hash in the old record does not fit the
+            # calibration, and the unit counts as not fitted.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             (folder / CERTIFICATE).unlink(missing_ok=True)
@@ -279,13 +280,13 @@ class Results:
 
 
 def _key(unit: FoundUnit, options: FleetOptions) -> dict[str, Any]:
-    """Return everything that a result depends on, for JSON."""
+    """Return everything that a unit's result depends on, for JSON."""
     files = [list(file) for bag in unit.bags.values() for file in bag]
     return {'format': _FORMAT, 'options': options.digest(), 'files': files}
 
 
 def _safe(part: str) -> str:
-    """Turn any name into the name of a single file."""
+    """Turn any name into a valid file name."""
     name = quote(part, safe=" +,=@()'")
     if name.strip('.') and len(name) <= _LONGEST_NAME:
         return name

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the statistics of a fleet table: robust spreads, outliers, drift."""
+"""Owns the statistics of a fleet: robust spreads of the units, outliers, drift between tests."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -18,24 +18,24 @@ from ..typing import Bools, Floats
 from .table import COLUMNS, Column, Row, is_fitted
 
 _FALSE_ALARMS = 0.05
-# Smallest number of units for which outliers are sought.
+# Smallest number of units among which outliers are sought.
 _UNITS_NEEDED = 8
-# Efficiency of the median absolute deviation for a normal spread, relative to the sample sd.
+# Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# Largest ratio of own sd to spread over the units, for a unit whose data determine the quantity;
-# with a larger ratio the value is about that of the prior of the fit.
+# Largest ratio of a unit's own sd to the spread over the units; with a larger ratio the data do
+# not determine the quantity, and the value is about that of the prior of the fit.
 _LARGEST_SD = 5.0
-# Smallest size of a residual or noise, so that its logarithm is finite.
+# Smaller residuals and noises are replaced by this number, so that their logarithms are finite.
 _LEAST = 1e-12
-#: The columns in which units are compared.
+#: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
-#: The columns whose changes between two tests are drift.
+#: Columns of the constants, whose changes between two tests of a unit are drift.
 _CONSTANTS = tuple(column for column in QUANTITIES if column.sd and '_slope_' not in column.name)
 
 
 class Spread(NamedTuple):
     """
-    Spread of a quantity about its median, and each unit's distance in standard deviations.
+    Spread of a quantity over the units about its median, and the distance `z` of each unit.
 
     Only units whose data determine the quantity (`is_counted`) enter `middle`, `sd` and `limit`.
     A distance is divided by the root of the sum of squares of `sd` and of the unit's own sd.
@@ -46,7 +46,7 @@ class Spread(NamedTuple):
     values: Floats
     is_counted: Bools
     middle: float
-    sd: float  # 1.4826 times the median absolute deviation (of the logarithm for sizes)
+    sd: float  # 1.4826 times the median absolute deviation (of logarithms: times `middle`)
     z: Floats
     limit: float = float('inf')  # smallest distance of an outlier; infinite with too few units
 
@@ -72,7 +72,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Retest:
-    """Changes between two tests of a unit, and whether they are significant."""
+    """Changes of the constants between two tests of a unit, and whether any is significant."""
 
     serial: str
     earlier: str
@@ -83,13 +83,13 @@ class Retest:
 
     @property
     def worst(self) -> Drift:
-        """The most significant change."""
+        """The change that is the largest in standard deviations."""
         return max(self.changes, key=_sds)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of a fleet: units by verdict; outliers and drifts, most significant first."""
+    """Statistics of a fleet: number of units by verdict; outliers and drifts, largest first."""
 
     verdicts: dict[str, int]
     spreads: tuple[Spread, ...]
@@ -98,7 +98,7 @@ class Summary:
 
 
 def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
-    """Compute the statistics of a fleet; drifts are changes since the rows of earlier tables."""
+    """Compute the statistics of a fleet; `earlier` are rows of earlier tables, for the drift."""
     fitted = [row for row in rows if is_fitted(row)]
     measured = [spread for quantity in QUANTITIES if (spread := spread_of(quantity, fitted))]
     n_comparisons = sum(len(spread.names) for spread in measured)
@@ -155,11 +155,11 @@ def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
 def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
     """
     Choose the units whose data determine a quantity: units are added in the order of their own sd,
-    until an own sd exceeds five times the spread of the units so far.
+    until the own sd of a unit exceeds five times the spread of the units chosen with it.
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)
-    # The first spread is that of eight units or, in a small fleet, of more than half of the units.
+    # Begin with eight units or, in a small fleet, with just over half of the units.
     first = min(_UNITS_NEEDED, n // 2 + 1)
     n_counted = 0
     for k in range(first, n + 1):
@@ -174,7 +174,7 @@ def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
 
 
 def _deviations(quantity: Column, values: Floats, middle: float) -> Floats:
-    """Return the distances of values from the median: by value, in ppm, or by logarithm."""
+    """Return the differences of values from the median: of values, in ppm, or of logarithms."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':
@@ -187,7 +187,7 @@ def _robust_sd(deviations: Floats) -> float:
 
 
 def outlier_limit(n_units: int, n_comparisons: int) -> float:
-    """Return the limit by Student's t for a spread of `n_units`; infinite below eight units."""
+    """Return the smallest distance of an outlier, by Student's t; infinite below eight units."""
     from scipy.stats import t
 
     if n_units < _UNITS_NEEDED or not n_comparisons:

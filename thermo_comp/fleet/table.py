@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the table of units: its columns, the cells of a fit, and its files."""
+"""Owns the table of a fleet, a row per unit: the columns, the cells of a fit, and the files."""
 
 import csv
 import io
@@ -30,21 +30,21 @@ from ..unit.prediction import in_a_soak
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
 
-#: Values of the column `verdict` for tests that were not judged.
+#: Values of the column `verdict` for tests without a verdict of `evaluate`.
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
-# First characters of a spreadsheet formula.
+# Characters with which a formula in a spreadsheet begins.
 _FORMULA = ('=', '+', '-', '@')
-# Findings of a fit to incomplete data, whose calibration partly follows from the prior.
+# Names of findings that show incomplete data: the calibration partly follows from the prior.
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
 class Column(NamedTuple):
-    """A column: heading with the unit of measurement, kind of value, meaning."""
+    """A column of the table: name with the unit of measurement, kind of value, meaning."""
 
     name: str
     kind: str  # text, whole, number
     meaning: str
-    label: str = ''  # text for a compared quantity, see `_COMPARED`
+    label: str = ''  # name of a compared quantity, '' if not compared; see `_COMPARED`
     unit: str = ''
     by: str = 'value'
     sd: str = ''  # name of the column with the standard deviation of a compared quantity
@@ -73,20 +73,20 @@ _TABLE = (
     ('start', 'text', 'UTC of the first sample'),
     ('hours', 'number', 'total length of the bags'),
     ('gravity_m_s2', 'number', 'local gravity used'),
-    ('reference_temperature_c', 'number', 'T_ref'),
+    ('reference_temperature_c', 'number', 'T_ref: reference temperature of the constants'),
     ('lowest_c', 'number', 'lower end of the calibrated range'),
     ('highest_c', 'number', 'upper end of the calibrated range'),
-    ('cooling_k_min', 'number', 'fastest fall of the board temperature calibrated'),
-    ('heating_k_min', 'number', 'fastest rise of the board temperature calibrated'),
+    ('cooling_k_min', 'number', 'fastest calibrated fall of the board temperature, negative'),
+    ('heating_k_min', 'number', 'fastest calibrated rise of the board temperature'),
     ('scale_{0}', 'number', '{1}: scale factor at T_ref, input units per m/s^2'),
     ('scale_sd_{0}_ppm', 'number', '{1}: standard deviation of the scale factor'),
     ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the static scale at T_ref'),
-    ('scale_slope_sd_{0}_ppm_k', 'number', '{1}: its standard deviation; empty: not determined'),
+    ('scale_slope_sd_{0}_ppm_k', 'number', '{1}: sd of the scale slope; empty: not determined'),
     ('bias_{0}_ug', 'number', '{1}: bias in a soak at T_ref'),
     ('bias_sd_{0}_ug', 'number', '{1}: standard deviation of the bias'),
     ('bias_slope_{0}_ug_k', 'number', '{1}: slope of the static bias at T_ref'),
-    ('bias_slope_sd_{0}_ug_k', 'number', '{1}: its standard deviation; empty: not determined'),
-    ('m_{0}_urad', 'number', '`{1}`'),
+    ('bias_slope_sd_{0}_ug_k', 'number', '{1}: sd of the bias slope; empty: not determined'),
+    ('m_{0}_urad', 'number', 'element `{1}` of the misalignment matrix'),
     ('m_sd_{0}_urad', 'number', 'standard deviation of `{1}`'),
     ('noise_{0}_ug_sqrt_hz', 'number', '{1}: white noise'),
     (
@@ -95,7 +95,7 @@ _TABLE = (
         'lag of the board behind the case in ramps; negative: the board leads',
     ),
     ('window_s', 'number', 'length of the windows at rest'),
-    ('raw_ug', 'number', '|f| - g at rest, RMS, constants at T_ref only'),
+    ('raw_ug', 'number', '|f| - g at rest, RMS, corrected by the constants at T_ref alone'),
     ('static_ug', 'number', '|f| - g at rest, RMS, static regime'),
     ('dynamic_ug', 'number', '|f| - g at rest, RMS, dynamic regime'),
     ('all_ug', 'number', '|f| - g at rest, RMS'),
@@ -106,7 +106,7 @@ _TABLE = (
     ('tool_version', 'text', 'version of thermo_comp that fitted the unit'),
     ('calibration_sha256', 'text', 'SHA-256 of calibration.yaml'),
 )
-# Quantities compared between units: by value, in ppm of the median, or by logarithm.
+# Quantities compared between units: label, unit, how (values, ppm of the median, logarithms), sd.
 _COMPARED = {
     'scale_{0}': ('scale factor {1}', 'ppm', 'ppm', 'scale_sd_{0}_ppm'),
     'scale_slope_{0}_ppm_k': ('slope of scale {1}', 'ppm/K', 'value', 'scale_slope_sd_{0}_ppm_k'),
@@ -121,7 +121,7 @@ _COMPARED = {
 
 
 def _places(name: str) -> dict[str, str]:
-    """Return the replacements of {0} and {1} in a name: axes, or elements of M."""
+    """Return the replacements of {0} and {1} in the name of a column: axes, or elements of M."""
     if '{0}' not in name:
         return {'': ''}
     if name.startswith('m_'):
@@ -137,7 +137,7 @@ COLUMNS = tuple(
 
 
 def row_of(**known: Any) -> dict[str, Cell]:
-    """Build a row from the known cells; other texts are empty, other numbers None."""
+    """Build a row from the given cells; other texts are empty, other numbers None."""
     row: dict[str, Cell] = {col.name: '' if col.kind == 'text' else None for col in COLUMNS}
     strange = known.keys() - row.keys()
     if strange:
@@ -180,7 +180,7 @@ def fitted_cells(
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
-    # Too few positions do not separate the slopes of bias and scale without a prior: no sd.
+    # Without a prior, too few positions do not separate the slopes of bias and scale: no sd.
     is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
     for quantity, unit, slope, sd in _slopes(calibration):
         parts[f'{quantity}_slope_{{0}}_{unit}'] = slope
@@ -224,9 +224,9 @@ def fitted_cells(
 
 def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats]]:
     """
-    Yield quantity, unit, slopes of the static curves of a quantity at T_ref and sd, shapes (3,).
+    Yield bias, then scale: name, unit, slopes of the static curves at T_ref and sd, shapes (3,).
 
-    The sd is NaN where the fit has left out the curve of an axis: its slope of 0 is the prior's.
+    The sd is NaN for an axis whose curve the fit has left out: its slope of 0 is not measured.
     """
     layout, posterior = parameter_layout(calibration), calibration.posterior
     K = np.array([axis.scale_factor for axis in calibration.axes])
@@ -251,7 +251,7 @@ def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats
 
 
 def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
-    """Write the table, as Parquet with the columns' meaning, and as CSV with all digits."""
+    """Write the table as Parquet, with the meanings of the columns, and as CSV with all digits."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -265,7 +265,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
     writer = csv.DictWriter(text, [column.name for column in COLUMNS], lineterminator='\n')
     writer.writeheader()
     for row in rows:
-        # Quote texts that a spreadsheet would run as a formula.
+        # Quote texts that a spreadsheet would evaluate as a formula.
         armed = [k for k, v in row.items() if isinstance(v, str) and v.startswith(_FORMULA)]
         writer.writerow({**row, **{name: f"'{row[name]}" for name in armed}})
     paths = folder / 'fleet.parquet', folder / 'fleet.csv'
@@ -275,7 +275,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read an earlier run's table, missing columns empty; ThermoCompError for another file."""
+    """Read a table of an earlier run; missing columns are empty. Else ThermoCompError."""
     from pyarrow import ArrowException, parquet
 
     try:

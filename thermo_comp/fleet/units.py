@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the search for a fleet's bags on any file system of fsspec, and their units."""
+"""Owns the search for the bags of a fleet, by unit, on any file system that fsspec can read."""
 
 import errno
 import os
@@ -16,7 +16,7 @@ from ..errors import RecordingError, ThermoCompError
 from ..recording.reader import open_recording
 from ..text import one_line
 
-# Attributes of a listing that change with a file's content, the most reliable first.
+# Attributes in a listing of files that change with the content, the most reliable first.
 _STAMPS = (
     *('ETag', 'etag', 'md5Hash', 'content_md5', 'generation', 'version_id'),
     *('mtime', 'LastModified', 'last_modified', 'updated', 'created'),
@@ -24,14 +24,14 @@ _STAMPS = (
 
 
 class StoredFile(NamedTuple):
-    """A file in a listing; `stamp` (ETag or time) changes with its content."""
+    """A file in a listing; `stamp` (ETag or time) changes with the file's content."""
 
     name: str
     size: int
     stamp: str
 
 
-#: Files of each bag by the bag's path relative to the fleet's folder; several for a rosbag2 bag.
+#: Files of each bag, several for a rosbag2 bag, by the path of the bag in the fleet's folder.
 Bags = dict[str, list[StoredFile]]
 
 
@@ -57,7 +57,7 @@ class Storage:
             raise ThermoCompError(f'{url}: {words(error)}') from error
         self._root = str(root).rstrip('/')
         self._is_local = 'file' in self._fs.protocol
-        # Address of the folder, valid in any process, whatever the working directory.
+        # The absolute path or the URL, which is valid whatever the working directory is.
         self.address = self._root if self._is_local else url
         self.name = self._root.rpartition('/')[2]
 
@@ -65,7 +65,7 @@ class Storage:
         """List all files below the folder except hidden ones, sorted by name."""
         try:
             if self._is_local:
-                listing = {path: self._fs.info(path) for path in _walk(self._root)}
+                listing = {path: self._fs.info(path) for path in _scan(self._root)}
             else:
                 listing = self._fs.find(self._root, detail=True)
             if not listing and not self._fs.isdir(self._root):
@@ -82,7 +82,7 @@ class Storage:
 
     @contextmanager
     def here(self, name: str, files: Sequence[StoredFile]) -> Iterator[Path]:
-        """Yield a local path of a bag, a copy if it is remote; raises OSError."""
+        """Yield the local path of a bag, or of a copy of a remote bag; raises OSError."""
         if self._is_local:
             yield Path(self._root, name)
             return
@@ -97,17 +97,17 @@ class Storage:
             yield Path(scratch, name)
 
 
-def _walk(root: str) -> Iterator[str]:
-    """Yield the files of a local tree; links are followed, unlike by fsspec."""
+def _scan(root: str) -> Iterator[str]:
+    """Yield the files of a local tree; links, which fsspec does not follow, are followed."""
     for folder, folders, names in os.walk(root, followlinks=True):
         here = Path(folder).resolve()
-        # Skip links to a containing folder: the walk would never end.
+        # Skip links to a containing folder: the scan would never end.
         folders[:] = [n for n in folders if Path(folder, n).resolve() not in (here, *here.parents)]
         yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
 
 
 def words(error: Exception) -> str:
-    """Return the text of an error on one line."""
+    """Return the text of an error on a single line."""
     text = getattr(error, 'strerror', None) or ' '.join(str(error).split())
     return text or type(error).__name__
 
@@ -133,7 +133,7 @@ def find_units(storage: Storage) -> list[FoundUnit]:
 
 
 def folders_of_tables(storage: Storage) -> tuple[str, ...]:
-    """Name the folders that hold tables, which `convert` reads, and no bag."""
+    """Return the folders with tables, which `convert` reads, and without a bag."""
     stored = storage.files()
     with_bags = [f'{_folder(name)}/' for name in group_files(stored)]
     # fleet.csv, the result of an earlier run, is not a table to convert.
@@ -167,7 +167,7 @@ def group_files(files: Sequence[StoredFile]) -> Bags:
 
 
 def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
-    """Whether a folder is a rosbag2 directory, even without metadata (recorder killed)."""
+    """Whether a folder is a rosbag2 bag, also without metadata, as after a killed recorder."""
     stems = [file.name.rpartition('.')[0].rpartition('_') for file in stored]
     usual = f'{folder}/{folder.rpartition("/")[2]}'
     return any(file.name == f'{folder}/metadata.yaml' for file in inside) or all(
@@ -180,10 +180,10 @@ def _folder(name: str) -> str:
 
 
 def _serial(storage: Storage, name: str, files: Sequence[StoredFile]) -> str:
-    """Read the serial from a bag directly in the fleet's folder."""
+    """Return the serial in the metadata of a bag that lies directly in the fleet's folder."""
     try:
         with storage.here(name, files) as path, open_recording(path, require=()) as reader:
             return reader.info.metadata.get('serial') or storage.name
     except (RecordingError, OSError):
-        # Without a serial the bag becomes a unit, whose row shows the problem.
+        # A bag that cannot be read becomes a unit of its own, whose row shows the problem.
         return name

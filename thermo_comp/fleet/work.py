@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the work on a unit (reading and fitting its bags), and its distribution by Dask."""
+"""Owns the work on a unit (reading and fitting its bags), and the distribution of work by Dask."""
 
 import hashlib
 import json
@@ -28,13 +28,13 @@ _UNIT_OF: dict[str | None, Literal['counts', 'm/s^2']] = {'counts': 'counts', 'i
 
 
 def sha256(content: str | bytes) -> str:
-    """Hash a text or a file."""
+    """Return the SHA-256 of a text or of the bytes of a file."""
     return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()
 
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """Options for all units; serial and input unit come from the bags."""
+    """Options of the fits of all units; serial and input unit come from the bags."""
 
     fit: FitOptions
     topics: Topics | None = None
@@ -42,11 +42,11 @@ class FleetOptions:
 
     @property
     def prior_sha256(self) -> str:
-        """Hash of the prior of the fits; empty without a prior."""
+        """SHA-256 of the prior of the fits, '' without a prior."""
         return '' if self.fit.prior is None else sha256(dump_calibration(self.fit.prior))
 
     def digest(self) -> str:
-        """Hash everything that a result depends on besides its bags."""
+        """Return the SHA-256 of everything except the bags that a result depends on."""
         plain = replace(self, fit=replace(self.fit, prior=None))
         content = {'version': __version__, 'prior': self.prior_sha256, **asdict(plain)}
         return sha256(json.dumps(content, sort_keys=True, default=repr))
@@ -54,17 +54,17 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class UnitOutcome:
-    """The result of a unit, small enough to send between processes."""
+    """The result of the work on a unit, small enough to send between processes."""
 
     row: dict[str, Cell]
     hashes: dict[str, str]  # SHA-256 of each bag
-    is_final: bool  # False if the file system failed, so that a repetition may succeed
+    is_final: bool  # False if a file system or worker failed: a repetition may succeed
     calibration: str = ''
     certificate: str = ''
 
 
 def _started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
-    """Build the row of a unit from its files and the cells given."""
+    """Build the row of a unit from its list of files and the given cells."""
     started = {
         'name': unit.name,
         'serial': unit.name.rpartition('/')[2],
@@ -77,11 +77,11 @@ def _started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
 
 
 def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcome:
-    """Read and fit a unit; a bad bag does not stop the unit's fit, nor a bad unit the fleet's."""
+    """Read and fit a unit; a bad bag does not stop the fit, a bad unit does not stop the fleet."""
     began = time.process_time()
     storage = Storage(url)
     hashes = dict.fromkeys(unit.bags, '')
-    # Only the sufficient statistics of a bag are kept, some kilobytes per hour.
+    # Of each bag only the statistics of its cells are kept, some kilobytes per hour.
     bags: dict[str, ReducedBag] = {}
     problems = []
     is_final = True
@@ -127,7 +127,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         how = replace(options.fit, input=next(iter(kinds)), serial=serial)
         row, calibration, page = _fitted(row, list(bags.values()), how, options.certificates)
     except FitError as refusal:
-        # Missing data, unlike contradictory data, can be replaced by a prior.
+        # A prior can replace missing data, but not contradictory data.
         is_whole = 0 if isinstance(refusal, UndeterminedError) else None
         row.update(verdict=REFUSED, problem=one_line(str(refusal)), is_whole=is_whole)
     except ThermoCompError as failure:
@@ -139,7 +139,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
 def _fitted(
     row: dict[str, Cell], bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
 ) -> tuple[dict[str, Cell], str, str]:
-    """Fit bags; return the whole row, the calibration and the certificate."""
+    """Fit bags; return the whole row, the calibration file and the certificate as texts."""
     from ..report.evidence import evidence_of_fit
     from ..report.page import render_report
 
@@ -160,13 +160,13 @@ def _fitted(
 
 
 def dask_setup(_worker: object) -> None:
-    """Silence the log of a worker (preload of Dask)."""
+    """Silence the log of a worker; Dask calls this function when it starts the worker."""
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
 
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Hide Ctrl-C, which a terminal sends to all processes, from workers; raise it afterwards."""
+    """Let workers that start in the context ignore Ctrl-C; afterwards raise KeyboardInterrupt."""
     heard: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -182,7 +182,7 @@ def _uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def connected(scheduler: str | None = None, n_workers: int | None = None) -> Iterator[Any]:
-    """Yield a client of a running cluster with workers of this version, or of a local cluster."""
+    """Yield a client of a running cluster, with this version on all workers, or of a new one."""
     import dask
     from distributed import Client
     from distributed.utils import get_mp_context
@@ -213,7 +213,7 @@ def connected(scheduler: str | None = None, n_workers: int | None = None) -> Ite
             client.wait_for_workers(1, timeout=_WAIT_S)
             problem = f'a worker lacks thermo_comp {__version__}'
             versions = client.run(version)
-        except Exception as error:  # an import on a worker may raise any exception
+        except Exception as error:  # an import on a worker may raise any type of exception
             raise ThermoCompError(f'{scheduler}: {problem}') from error
         for worker, answer in versions.items():
             if answer != __version__:
@@ -230,7 +230,7 @@ def version() -> str:
 def run(
     client: Any, url: str, units: Sequence[FoundUnit], options: FleetOptions
 ) -> Iterator[tuple[FoundUnit, UnitOutcome]]:
-    """Process units and yield each when done; a failed task yields the reason."""
+    """Process units; yield each unit when done, with its outcome or the reason of a failure."""
     from distributed import as_completed
 
     futures = client.map(process_unit, units, url=url, options=options, pure=False, batch_size=256)
@@ -244,7 +244,7 @@ def run(
 
 
 def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
-    """Return a task's result, or the reason of its failure; a later run repeats the task."""
+    """Return a task's outcome; if the task failed, an outcome that a later run replaces."""
     from distributed import KilledWorker
 
     if future.status == 'finished':

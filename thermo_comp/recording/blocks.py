@@ -4,7 +4,7 @@
 Owns blocks of columns on one clock, and the description of a bag.
 
 A column is a numpy array with one row per message. All times are integer nanoseconds: ``stamp`` is
-the stamp in the message's header, ``log`` the time when the recorder received it.
+the stamp in a message's header, ``log`` the time when the recorder received the message.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ ROLES: tuple[Role, ...] = ('accel', 'board', 'case')
 #: Messages per block; large enough that the per-block overhead is negligible.
 BLOCK_MESSAGES = 1 << 15
 
-#: Stamp of a message without stamp: before any real stamp, and within the range of a header.
+#: Stands for the stamp of a message without a stamp: the earliest stamp that a header can hold.
 NO_STAMP_NS = -(2**31) * 10**9
 _JUMP_NS = 10**9  # a larger backward step of the stamps is a jump of time [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # a longer jump of the stamps is shortened to this [ns]
 #: Largest number of jumps in a recording with a valid clock.
 _MOST_JUMPS = 100
-# Smallest number of readings, and smallest median of their time from the samples around them [s],
-# that show a thermometer on another clock than the accelerometer.
+# A thermometer uses another clock than the accelerometer if at least this number of its readings
+# has a median distance from the stamps of the samples around them above the second number [s].
 _FEWEST_READINGS, _APART_S = 10, 10.0
-#: An unchanged reading is kept after this time [ns], so that the sensor does not seem lost.
+#: `Readings.thinned` keeps an unchanged reading after this time [ns]: the sensor is not lost.
 _REPEAT_NS = 10_000_000_000
-#: Length of a recording above which the mean interval of its messages is limited, and the limit
-#: [ns].
+#: Duration of a recording above which the mean interval between messages is limited, and the
+#: largest mean interval [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
 class Topic(NamedTuple):
-    """The topic of a channel: name, message type, encoding and number of messages."""
+    """Topic of a channel in a bag: name, message type, encoding and number of messages."""
 
     name: str
     type: str
@@ -56,8 +56,8 @@ class Topic(NamedTuple):
 
 class BagFile:
     """
-    An open file of a bag: topics by channel number, encoding and text of message types, log times,
-    and a text on missing data. Errors name the file by its `path`.
+    An open file of a bag. `topics` are by channel number; `definitions` are encoding and text by
+    message type; `truncated` describes missing data. Errors name the file by its `path`.
     """
 
     storage = 'mcap'
@@ -76,10 +76,10 @@ class BagFile:
 class RecordingInfo:
     """
     The content of a bag, known before its messages are read.
-    `topics`: message type (several joined by `` | ``) and number of messages. Start and end are
-    log times, or 0. `truncated` describes the missing part; `metadata` holds the writer's pairs of
-    key and value; `input` is the accelerometer topic that is read; `chosen` lists topics selected
-    by their type.
+    `topics`: message type (several joined by `` | ``) and number of messages by name. Start and
+    end are log times, or 0. `truncated` describes the missing part; `metadata` holds the writer's
+    pairs of key and value; `input` is the kind of accelerometer topic that is read; `chosen` has
+    notes on topics selected by their type and on stamps.
     """
 
     path: Path
@@ -113,7 +113,7 @@ class ImuColumns(NamedTuple):
 
     @classmethod
     def of_rate(cls, rate: Floats | None) -> ImuColumns:
-        """Return rates, if any, with unknown covariance and no orientation (REP 145)."""
+        """Build from angular rates, or None; covariances are unknown, no orientation (REP 145)."""
         none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
         level = np.array([0.0, 0.0, 0.0, 1.0])
         if rate is None:
@@ -133,12 +133,12 @@ class Readings(NamedTuple):
     after: Ints = np.empty(0, np.int64)
 
     def take(self, which: Ints | Bools | slice) -> Readings:
-        """Select readings, detached from their block."""
+        """Select readings; the number of samples before each reading is dropped."""
         return Readings(self.stamp_ns[which], self.celsius[which])
 
     def thinned(self) -> Readings:
-        """Keep the finite readings that changed, and a reading every ten seconds."""
-        # Readings that a table repeats at its samples' rate would look like a stuck sensor.
+        """Keep finite readings that differ from the last one kept, and a reading every 10 s."""
+        # A table repeats a reading in each row until the next; repeats look like a stuck sensor.
         kept: list[int] = []
         last_ns, last = 0, math.nan
         rows = zip(self.stamp_ns.tolist(), self.celsius.tolist(), strict=True)
@@ -156,8 +156,8 @@ class Block:
     """
     Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
     `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu; `imu`
-    holds the other fields of sensor_msgs/Imu. `temperatures` are by thermometer; `log_ns` and, if
-    requested, the serialized messages `raw` are by role.
+    holds the other fields of sensor_msgs/Imu. The keys of `temperatures` are thermometers; those
+    of `log_ns` and, if requested, of the serialized messages `raw` are roles.
     """
 
     accel_stamp_ns: Ints
@@ -210,7 +210,7 @@ class Recording(NamedTuple):
 
 
 def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Join blocks until each has `BLOCK_MESSAGES`, or the `frame_id` changes."""
+    """Join blocks to blocks of at least `BLOCK_MESSAGES` messages, each with one `frame_id`."""
     waiting: list[Block] = []
     frame_id: str | None = None
     for block in blocks:
@@ -228,7 +228,7 @@ def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
 
 
 def joined(blocks: Sequence[Block]) -> Block:
-    """Join blocks, at least one, into a block with the first sample's `frame_id`."""
+    """Join a nonempty list of blocks into a block with the `frame_id` of the first sample."""
     if len(blocks) == 1:
         return blocks[0]
     begins = np.cumsum([0, *map(len, blocks)])
@@ -252,10 +252,9 @@ def joined(blocks: Sequence[Block]) -> Block:
 
 def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
-    Give readings without a stamp the newest stamp of the samples before them (`last_ns` before the
-    block); return the block and its newest stamp. Readings before any sample are dropped.
-
-    Times of reception are not used as stamps: they depend on the speed of a playback.
+    Give a reading without a stamp the newest stamp of the samples before the reading; `last_ns` is
+    the newest stamp before the block. Return the block and its newest stamp. Readings before the
+    first sample are dropped. Log times would depend on the speed of a playback.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -282,12 +281,12 @@ def _restamp(messages: Messages, stamp_ns: Ints) -> None:
 
 
 def unstamped(stamp_ns: int) -> str:
-    """Describe samples that all have the same stamp."""
+    """Return the message for samples that all have the same stamp."""
     return f'all its samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
 
 
 def clocks_apart(block: Block) -> str:
-    """Describe samples with one stamp, or a thermometer stamped far from the samples around it."""
+    """Return a warning for samples with one stamp, or for a thermometer on another clock."""
     stamps = block.accel_stamp_ns
     if len(stamps) >= _FEWEST_READINGS and (stamps == stamps[0]).all():
         return unstamped(int(stamps[0]))
@@ -298,24 +297,24 @@ def clocks_apart(block: Block) -> str:
         apart_s = (stamp_ns - np.clip(stamp_ns, *edges)) * 1e-9
         if len(apart_s) >= _FEWEST_READINGS and abs(middle := np.median(apart_s)) > _APART_S:
             return (
-                f'{name} is stamped {middle:+.0f} s from the samples around it: are the stamps of '
-                'thermometer and accelerometer of two clocks?'
+                f'{name} readings are stamped {middle:+.0f} s from the samples around them: are '
+                'the stamps of thermometer and accelerometer of two clocks?'
             )
     return ''
 
 
 def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
-    Shorten jumps of the stamps to an hour, backward jumps too; RecordingError for invalid clocks.
-    A clock that is set while it runs leaves a gap of years, which would make any grid over time
-    huge. A gap of an hour remains: after an hour without readings the thermal state is unknown.
+    Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
+    A clock that is set during a recording leaves a gap of years, too long for a grid over time.
+    After an hour without readings the thermal state is unknown. RecordingError for invalid clocks.
     """
     last_ns: int | None = None
     offset = 0
     n_jumps = n_messages = span_ns = 0
     for block in blocks:
         thermometers = block.temperatures.values()
-        # Sort in reading order: a reading precedes the sample for which it counts.
+        # Sort readings and samples in reading order: by the number of samples before them.
         places = [*(thermometer.after for thermometer in thermometers), np.arange(len(block))]
         stamps = np.concatenate([*(part.stamp_ns for part in thermometers), block.accel_stamp_ns])
         if not len(stamps):

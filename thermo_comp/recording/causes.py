@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the likely reasons why a recording is not one of an accelerometer at rest, as messages."""
+"""Owns the messages for recordings that are not of an accelerometer at rest."""
 
 import numpy as np
 
@@ -8,16 +8,16 @@ from ..unit.gravity import STANDARD_GRAVITY
 from .blocks import Block, unstamped
 from .stillness import Cells
 
-# Share of faulty samples below which the fault is a glitch, and above which all samples are taken
-# to be faulty.
+# Largest share of samples of exactly 0 that is taken for glitches, and share of messages marked as
+# without acceleration above which the whole recording counts as without acceleration.
 _GLITCH_SHARE, _FAULT_SHARE = 0.01, 0.5
-# Ratio of |a| at rest to gravity: range if the samples contain gravity, upper limit if gravity is
-# subtracted from them.
+# Ratio of |a| at rest to gravity: range for samples with gravity, and upper limit for samples
+# from which gravity is subtracted.
 _WITH_GRAVITY, _WITHOUT_GRAVITY = (0.8, 1.25), 0.3
 
 
 class CauseCounter:
-    """Counts, block by block, the samples that a sensor at rest does not send."""
+    """Counts the samples that a working accelerometer at rest does not send, block by block."""
 
     def __init__(self) -> None:
         self._n = self._n_zero = self._n_absent = 0
@@ -25,7 +25,7 @@ class CauseCounter:
         self._stamps_ns: set[int] = set()
 
     def add(self, block: Block) -> None:
-        """Take the next samples, in file order."""
+        """Count the faults of the next block, in file order."""
         imu = getattr(block, 'imu', None)
         covariance = getattr(imu, 'linear_acceleration_covariance', None)
         self._n += len(block.accel_stamp_ns)
@@ -37,7 +37,7 @@ class CauseCounter:
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
     def cause(self, cells: Cells, still_sd: float) -> str:
-        """Describe the fault of the samples; empty if an accelerometer may have sent them."""
+        """Describe why the samples cannot be those of an accelerometer at rest; '' if they can."""
         if self._n_absent > _FAULT_SHARE * self._n:
             return (
                 'its messages say that they hold no acceleration '
@@ -56,7 +56,7 @@ class CauseCounter:
         return self._unit_of(cells, still_sd) if self._is_imu else ''
 
     def _unit_of(self, cells: Cells, still_sd: float) -> str:
-        """Infer the unit of an Imu's samples at rest, if not m/s^2."""
+        """Describe an Imu whose |a| at rest shows g, mg or subtracted gravity; '' otherwise."""
         scatter = cells.variance.max(axis=1, initial=0.0)
         quiet = (cells.count > 1) & (scatter <= np.quantile(scatter, 0.5) if len(scatter) else 0)
         if not quiet.any():
@@ -66,12 +66,12 @@ class CauseCounter:
         for unit, one_g in (('g', 1.0), ('mg', 1000.0)):
             if _WITH_GRAVITY[0] < norm / one_g < _WITH_GRAVITY[1] and sd < still_sd * one_g:
                 return (
-                    f'it reads {norm:.4g} at rest, where m/s^2 would read {STANDARD_GRAVITY:.2f}: '
+                    f'samples at rest have the norm {norm:.4g}, not {STANDARD_GRAVITY:.2f} m/s^2: '
                     f'its samples are in {unit}, make them m/s^2 with thermo_comp convert'
                 )
         if norm < _WITHOUT_GRAVITY * STANDARD_GRAVITY and sd < still_sd * STANDARD_GRAVITY:
             return (
-                f'it reads {norm:.2g} m/s^2 at rest: gravity is subtracted (a linear or free '
-                'acceleration), but the fit needs it: use another topic of the driver'
+                f'samples at rest have the norm {norm:.2g} m/s^2: gravity is subtracted (linear '
+                'or free acceleration), but the fit needs gravity: use another topic of the driver'
             )
         return ''

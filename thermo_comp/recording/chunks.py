@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the spans of a file that hold messages: unpacking within limits, and finding the messages.
+Owns the spans of an MCAP file that hold messages: decompresses them and finds their messages.
 
 The size that a chunk or frame declares is only used as an upper limit. The message index of a
 chunk is only used if its records fill the chunk without gap or overlap; otherwise the records of
@@ -30,11 +30,11 @@ from ..typing import Bytes, Ints
 from .serialized import Messages, gather, number_at
 
 PREFIX = struct.Struct('<BQ')  # opcode and length in front of each record
-HEAD_BYTES = 160  # number of bytes that contain the head of a chunk's record
+HEAD_BYTES = 160  # bytes read at the begin of a record, enough for the head of a chunk
 _CHUNK_HEAD = struct.Struct('<BQQQQII')
 _INDEX_HEAD = struct.Struct('<BQHI')
 _INDEX_ROW_BYTES = 16  # log time and offset of one message, 8 bytes each
-#: Bytes of a message record before its serialized message, with and without `PREFIX`.
+#: Number of bytes before the serialized message in a record, with and without `PREFIX`.
 MESSAGE_HEAD_BYTES = 31
 _MESSAGE_FIELDS_BYTES = MESSAGE_HEAD_BYTES - PREFIX.size
 MESSAGE = int(Opcode.MESSAGE)
@@ -47,18 +47,18 @@ MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
-_STEP_BYTES = 1 << 16  # size of a decompressed piece, the largest loss before damaged data [bytes]
+_STEP_BYTES = 1 << 16  # size of a decompressed piece: at most this is lost before a damage [bytes]
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,
 }
 
-#: Called with opcode and content of every record that is not a message.
+#: Callback for every record that is not a message, with the record's opcode and content.
 OnRecord = Callable[[int, bytes], None]
 
 
 class DamagedError(Exception):
-    """Damaged bytes; the text describes the damage."""
+    """Damaged bytes in a bag; the text of the error describes the damage."""
 
 
 @contextmanager
@@ -97,7 +97,7 @@ class Span:
 
 
 def parse_chunk_head(head: bytes, position: int) -> tuple[Span, str, int, int]:
-    """Read the head of a chunk: its span, compression, offset of the data, checksum."""
+    """Return the span of a chunk, its compression, the offset of its data and its checksum."""
     try:
         fields = _CHUNK_HEAD.unpack_from(head)
         opcode, content, start_ns, end_ns, size, checksum, n_name = fields
@@ -117,19 +117,19 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
     try:
         if span.kind == 'chunk' and max(span.size, n_bytes) > MAX_CHUNK_BYTES:
             raise DamagedError(
-                f'{n_bytes} bytes declare a content of {span.size}, limit {MAX_CHUNK_BYTES}'
+                f'{n_bytes} bytes declare a content of {span.size} bytes, limit {MAX_CHUNK_BYTES}'
             )
         record = read_at(span.position, min(n_bytes, MAX_CHUNK_BYTES))
         data = np.frombuffer(record, np.uint8)
         if span.kind == 'loose':
-            messages, reason = walk(data, on_record)
+            messages, reason = scan_records(data, on_record)
             if reason not in {'', _ZERO_OPCODE}:
                 raise DamagedError(reason)
             return messages
         head, compression, data_at, checksum = parse_chunk_head(record[:HEAD_BYTES], span.position)
         if span.kind == 'torn':
             data = inflate(compression, data[data_at:], MAX_CHUNK_BYTES, is_torn=True)
-            return walk(data, on_record)[0]
+            return scan_records(data, on_record)[0]
         if head.length != span.length or head.size != span.size:
             raise DamagedError('its size differs from the index of the file')
         data = inflate(compression, data[data_at : span.length], span.size, span.size + 1)
@@ -140,7 +140,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
         messages = locate(data, memoryview(record)[span.length :], on_record)
         log_ns = messages.log_ns
         if len(log_ns) and (np.min(log_ns) < span.start_ns or np.max(log_ns) > span.end_ns):
-            raise DamagedError('its messages are outside its declared time')
+            raise DamagedError('the chunk has messages outside its declared times')
     except DamagedError as error:
         place = 'at' if span.kind == 'loose' else 'chunk at'
         raise DamagedError(f'{place} byte {span.position}: {error}') from error
@@ -151,14 +151,14 @@ def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
     """Find all messages of a complete chunk, with the message index after it as a hint."""
     messages = _indexed(data, index)
     if messages is None:
-        messages, reason = walk(data, on_record)
+        messages, reason = scan_records(data, on_record)
         if reason:
             raise DamagedError(reason)
     return messages
 
 
 def _indexed(data: Bytes, index: memoryview) -> Messages | None:
-    """Find the messages by the index; None if the messages do not fill the chunk exactly."""
+    """Find messages by a chunk's message index; None if they do not fill the chunk exactly."""
     columns: list[Ints] = []
     begin = 0
     while begin + _INDEX_HEAD.size <= len(index):
@@ -167,7 +167,7 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
         is_sound = opcode == Opcode.MESSAGE_INDEX and content == length + 6
         if not is_sound or length % _INDEX_ROW_BYTES or begin + length > len(index):
             return None
-        # An offset above 2^63 becomes negative; `is_inside` refuses negative offsets.
+        # An unsigned offset above 2^63 becomes negative: `is_inside` refuses negative offsets.
         columns.append(np.frombuffer(index, '<i8', length // 8, begin)[1::2])
         begin += length
     at = np.sort(np.concatenate(columns), kind='stable') if columns else np.empty(0, np.int64)
@@ -175,8 +175,8 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     if begin != len(index) or not is_inside:
         return None
     head = gather(data, at, MESSAGE_HEAD_BYTES)
-    # Record lengths are unsigned on purpose: a length that is too small wraps around to a huge
-    # number.
+    # Record lengths are unsigned: a length below `_MESSAGE_FIELDS_BYTES` becomes a huge number,
+    # which the next test refuses.
     length = number_at(head, 1, '<u8') - np.uint64(_MESSAGE_FIELDS_BYTES)
     if int(np.max(length)) > len(data) or (number_at(head, 0, 'u1') != MESSAGE).any():
         return None
@@ -187,10 +187,10 @@ def _indexed(data: Bytes, index: memoryview) -> Messages | None:
     return _messages(data, at, size, head)
 
 
-def walk(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
+def scan_records(data: Bytes, on_record: OnRecord) -> tuple[Messages, str]:
     """
-    Read complete records one by one; return the messages and the reason why reading stopped. The
-    last message before zeros is dropped, because the zeros may have replaced its last bytes.
+    Read complete records one by one; return the messages, and why reading stopped early, or ''.
+    The last message before zeros is dropped: the zeros may have replaced bytes of this message.
     """
     view = data.data
     places: list[int] = []
@@ -229,7 +229,7 @@ def _messages(data: Bytes, at: Ints, size: Ints, head: NDArray[np.void]) -> Mess
 
 
 def expand(packed: Path, target: Path) -> str | None:
-    """Decompress a ``.zstd`` file of rosbag2; return a description of the damage, or None."""
+    """Decompress a ``.zstd`` file of rosbag2; return a text on damaged data, or None."""
     with open_regular(packed) as source, target.open('wb') as file:
         limit = packed.stat().st_size * _MAX_GROWTH + _FREE_GROWTH_BYTES
         loss = None
@@ -247,7 +247,7 @@ def expand(packed: Path, target: Path) -> str | None:
 def inflate(
     compression: str, packed: Any, limit: int, step: int = _STEP_BYTES, *, is_torn: bool = False
 ) -> Bytes:
-    """Decompress bytes, or a torn piece's readable part; DamagedError for over `limit` bytes."""
+    """Decompress bytes, of a torn chunk the readable part; DamagedError for over `limit` bytes."""
     if not compression:
         return np.asarray(packed)
     pieces: list[bytes] = []
@@ -276,7 +276,7 @@ def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[by
 
 
 def _reader(compression: str, source: Any) -> Callable[[int], bytes]:
-    """Return a function that decompresses the next n bytes; empty bytes at the end."""
+    """Return a function that decompresses and returns the next n bytes, b'' at the end."""
     if compression == 'zstd':
         decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
         return decompressor.stream_reader(source, read_across_frames=True).read

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reading of a number inside messages of any type, by the type's definition.
+Owns the reading of a number inside messages of any type, by the definition of the message type.
 
-A topic is named ``TOPIC:FIELD``, as for ``ros2 topic echo --field``. In plain CDR a field begins
+A field is named ``TOPIC:FIELD``, as for ``ros2 topic echo --field``. In plain CDR a number begins
 at a multiple of its size after the encapsulation; the length of a string or sequence, a uint32,
-precedes its content. A batch of messages is read field by field, in all messages at once.
+precedes its content. A field is read in all messages of a batch at once.
 """
 
 import re
@@ -32,7 +32,7 @@ _EXTREME = re.compile('(^|_)(min|max)(_|$)')
 _HEADER = 'std_msgs/msg/Header'
 _IDL = '=' * 80 + '\nIDL: '
 
-#: Constants and fields by type; a field is a name and a description as in `rosbags`.
+#: Constants and fields of message types; a field is its name and a description as in `rosbags`.
 Definitions = Mapping[str, tuple[Any, list[tuple[str, Any]]]]
 
 
@@ -45,7 +45,7 @@ def typestore() -> Any:
 
 
 def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitions:
-    """Find the definition of a type in the bag, or else in ROS 2 Jazzy."""
+    """Return message definitions with that of `kind`, from the bag or else from ROS 2 Jazzy."""
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
     defined: dict[str, Any] = {}
@@ -65,7 +65,7 @@ def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitio
 
 
 def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[str]:
-    """List the fields of a type that are numbers named temperature, without minima and maxima."""
+    """List the number fields with `temp` in their names, without minima and maxima."""
     try:
         fields = definitions_of(kind, known)[kind][1]
     except RecordingError:
@@ -82,7 +82,7 @@ def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A number in the messages of a type, by its path; RecordingError for a path to no number."""
+    """A number in messages of a type, given its path; RecordingError if no number is there."""
 
     kind: str
     path: str
@@ -94,7 +94,7 @@ class Field:
 
     @property
     def has_stamp(self) -> bool:
-        """Whether the messages have a std_msgs/Header, alone or inside a special header."""
+        """Whether the field `header` is a std_msgs/Header, or a message that contains one."""
         return bool(self._header)
 
     @property
@@ -110,7 +110,7 @@ class Field:
         return ''
 
     def read(self, messages: Messages) -> tuple[Ints, Floats]:
-        """Read stamps [ns] (`NO_STAMP_NS` without a header) and numbers, shape (n,)."""
+        """Return stamps [ns] (`NO_STAMP_NS` without a header) and numbers, shape (n,)."""
         values = self._find(messages, self.path).astype(np.float64)
         if not self.has_stamp:
             return np.full(len(messages), NO_STAMP_NS), values
@@ -121,11 +121,11 @@ class Field:
 
     def _find(self, messages: Messages, path: str) -> Any:
         try:
-            return self._walk(messages, path)
+            return self._follow(messages, path)
         except RecursionError as error:
-            raise RecordingError(f'its type {self.kind} holds itself') from error
+            raise RecordingError(f'its type {self.kind} has a field of the same type') from error
 
-    def _walk(self, messages: Messages, path: str) -> Any:
+    def _follow(self, messages: Messages, path: str) -> Any:
         cursor, kind = _Cursor(messages, self.definitions), self.kind
         description: Any = None
         for step in path.split('.'):
@@ -154,7 +154,7 @@ _BASE, _NAME, _ARRAY = (
 
 
 class _Cursor:
-    """Positions in many messages [bytes after the encapsulation]."""
+    """A reading position in each of many messages [bytes after the encapsulation]."""
 
     def __init__(self, messages: Messages, definitions: Definitions) -> None:
         self._messages, self._definitions = messages, definitions
@@ -196,12 +196,12 @@ class _Cursor:
             raise RecordingError(f'a {content[0]} before the field is not supported')
 
     def enter(self, description: Any, place: int) -> Any:
-        """Advance to an element of an array or a sequence; return its description."""
+        """Advance to an element of an array or a sequence; return the element's description."""
         if description[0] in (_BASE, _NAME):
-            raise RecordingError(f'[{place}] of a field that is not an array')
+            raise RecordingError(f'element [{place}] of a field that is not an array')
         counts, element = self._count(description), description[1][0]
         if (counts <= place).any():
-            raise RecordingError(f'[{place}] of an array of {int(counts.min())}')
+            raise RecordingError(f'element [{place}] of an array of {int(counts.min())} elements')
         for _ in range(place):
             self.skip(element)
         return element
@@ -218,7 +218,7 @@ class _Cursor:
             raise RecordingError('damaged message: it ends inside a field')
 
     def _skip_each(self, element: Any, counts: Ints) -> None:
-        """Advance past elements of variable size."""
+        """Advance past `counts` elements of variable size in each message."""
         while (rows := np.flatnonzero(counts > 0)).size:
             some = _Cursor(self._messages.take(rows), self._definitions)
             some._at = self._at[rows]

@@ -8,26 +8,26 @@ import numpy as np
 
 from ..typing import Bools, Floats
 
-# Distance of a glitch from its neighbours, in sd of the noise; noise alone does not reach it.
+# Smallest distance of a glitch from the mean of its neighbours, in sd of the noise.
 _SDS = 25.0
-# Smallest distance of a glitch from its neighbours, relative to the norm of the samples: single
-# samples of a converter that carries its remainder flip by one count.
+# Smallest distance of a glitch from the mean of its neighbours, as a share of the norm of the
+# samples: single samples of a converter that carries its remainder flip by one count.
 _LEAST = 0.02
-# Smallest number of samples that determine the noise.
+# Smallest number of samples for which the noise is estimated; in fewer no glitch is detected.
 _FEWEST = 30
 
 
 def is_glitch(samples: Floats, quantum: Floats) -> Bools:
     """
-    Return which samples, shape (n, 3), are single errors of a transfer: far from both neighbours,
-    which agree, among samples without a motion. A glitch would end a rest, as a knock does.
+    Return which samples, shape (n, 3), are glitches: a glitch is far from both neighbours, these
+    agree, and no motion is near. A glitch that stays in the data would end a rest, like a knock.
     """
     result = np.zeros(len(samples), dtype=bool)
     if len(samples) < _FEWEST:
         return result
     is_far = np.zeros(samples.shape, dtype=bool)
     is_moving = np.zeros(len(samples), dtype=bool)
-    # About 2000 samples are sufficient to estimate the noise and the norm.
+    # Noise and norm are estimated from at most 4000 samples, to save time.
     every = slice(None, None, max(len(samples) // 2000, 1))
     least = _LEAST * float(np.median(np.linalg.norm(samples[every], axis=1)))
     for x, step, far in zip(samples.T, quantum.tolist(), is_far.T, strict=True):
@@ -38,7 +38,7 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
         far[1:-1] = bend > limit
         if far.any():
             far[1:-1] &= np.abs(x[2:] - x[:-2]) < 0.5 * bend
-    # Beyond its two neighbours, a glitch has three calm samples on each side.
+    # A glitch has three calm samples on each side, beside its two neighbours.
     at = np.flatnonzero(is_far.any(axis=1))
     beside = np.array([-4, -3, -2, 2, 3, 4])
     around = np.clip(at[:, np.newaxis] + beside, 0, len(samples) - 1)

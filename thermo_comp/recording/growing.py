@@ -5,8 +5,8 @@ Owns live recording: new messages of a bag that another program writes, and numb
 
 Each pass reads the growing bag from its beginning, so the pauses grow with the duration of a pass.
 New messages are written with the node's topic names to numbered bags, from `01.mcap` on. The end
-of a position is recognised with a delay, so the newest messages are held back until their bag is
-known.
+of a position is recognised with a delay, so the newest messages are held back until the position
+that they belong to is known.
 """
 
 import re
@@ -25,12 +25,12 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # a killed process loses a chunk: some 17 s of counts at 100 Hz
+_CHUNK_BYTES = 1 << 17  # content of a chunk, lost if the process is killed: 17 s of 100 Hz counts
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
-#: Hidden name of an unfinished bag: numbers of the bag and of the process that writes it.
+#: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
-_SHARE = 0.2  # largest share of the time in which the growing bag is read
+_SHARE = 0.2  # largest share of time spent reading the growing bag
 
 #: A new block with its serialized messages, and the bag that it comes from.
 News = tuple[Block, RecordingInfo | None]
@@ -52,7 +52,7 @@ def growing_blocks(
         try:
             reader = open_recording(path, topics, require=())
         except RecordingError:
-            # An empty or growing file is new: a recorder creates a file before it writes records.
+            # A recorder creates a file before it writes records: an empty or growing file is new.
             before, size = size, _size(path)
             if n_seen or 0 < size == before:
                 raise
@@ -97,7 +97,7 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Turn an unfinished bag into a bag with `number`, or the next free number, and delete the
+    Copy an unfinished bag to a bag with `number`, or else the next free number, and delete the
     unfinished bag; None for a bag without messages. RecordingError for an unreadable bag.
     """
     with open_recording(path, require=()) as reader:
@@ -115,7 +115,7 @@ def finish(path: Path, number: int) -> Path | None:
 
 
 class PositionBags:
-    """Writes the bags; a bag gets its number when its first message is written."""
+    """Writes a bag per position; a bag gets its number when its first message is written."""
 
     def __init__(self, folder: Path, serial: str | None, number: int | None = None) -> None:
         self._folder, self._serial = folder, serial
@@ -127,13 +127,13 @@ class PositionBags:
         self.written: list[Path] = []  # files of the bags begun so far
 
     def add(self, block: Block, info: RecordingInfo | None) -> None:
-        """Take a block with its serialized messages, and the description of its bag."""
+        """Hold a block with its serialized messages; `info` describes the bag of the block."""
         if info is not None and self._serial is None:
             self._serial = info.metadata.get('serial')
         self._held.append(block)
 
     def release(self, stamp_ns: int) -> None:
-        """Write the messages older than a stamp."""
+        """Write the held messages that are older than a stamp."""
         held, self._held = self._held, []
         try:
             for block in held:
@@ -147,7 +147,7 @@ class PositionBags:
             if self._writer is not None:
                 self._writer.flush()
         except OutputError:
-            self._writer, self._held = None, []  # after a failed write, write no more
+            self._writer, self._held = None, []  # after a failed write, write nothing else
             raise
 
     def _write(self, block: Block) -> None:

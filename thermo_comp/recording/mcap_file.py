@@ -47,15 +47,15 @@ _CUTS = {
     0: 'it is unreadable from byte {at} on',
     int(Opcode.CHUNK): 'it ends inside a chunk, of which the first {} messages are read',
     int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk, which is read whole',
-    -1: 'it ends inside a record, everything before that is read',
+    -1: 'it ends inside a record, and everything before this record is read',
 }
-#: The record types, other than messages, that are used.
+#: Record types other than messages that are read.
 _KINDS: Mapping[int, Any] = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
     Opcode.METADATA: Metadata,
 }
-#: Attributes of a chunk index, in the order of the fields of a `Span`.
+#: Returns attributes of a chunk index, in the order of the fields of a `Span`.
 _SPAN_FIELDS = attrgetter(
     *('chunk_start_offset', 'chunk_length', 'message_index_length'),
     *('uncompressed_size', 'message_start_time', 'message_end_time'),
@@ -80,7 +80,7 @@ class McapFile(BagFile):
             opened.pop_all()
 
     def read(self, channels: Collection[int]) -> Iterator[Messages]:
-        """Read the messages of channels in reading order."""
+        """Read the messages of some channels in reading order."""
         order = sorted(range(len(self.spans)), key=lambda row: self.spans[row].start_ns)
         spans = [self.spans[row] for row in order]
         loaded = map(partial(self._load, channels), spans)
@@ -137,7 +137,7 @@ class McapFile(BagFile):
         return summary
 
     def _read_summary(self, content: bytes) -> None:
-        """Read the summary; ignore it if damaged or incomplete."""
+        """Read the summary of the file; a damaged or incomplete summary is ignored."""
         records_of: dict[type, list[Any]] = {}
         try:
             reader = StreamReader(BytesIO(content), skip_magic=True, emit_chunks=True)
@@ -171,13 +171,13 @@ class McapFile(BagFile):
                 self._on_record(Opcode.METADATA, pairs)
 
     def _on_record(self, opcode: int, content: bytes) -> None:
-        """Take a record of the data section other than a message."""
+        """Store a schema, a channel or the writer's metadata; ignore other records."""
         if opcode not in _KINDS:
             return
         try:
             record = _KINDS[opcode].read(_new_stream(BytesIO(content)))
         except Exception as error:  # damaged bytes surface as nearly any exception type
-            raise DamagedError('a record is shorter than its content') from error
+            raise DamagedError('a record is shorter than the lengths in it') from error
         if opcode == Opcode.SCHEMA:
             self._schemas[record.id] = record
         elif opcode == Opcode.CHANNEL:
@@ -186,7 +186,7 @@ class McapFile(BagFile):
             self.metadata.update(record.metadata)
 
     def _scan(self, at: int, end: int | None) -> None:
-        """Read the file record by record; without an end, up to the last complete message."""
+        """Read the file record by record; if `end` is None, up to the last complete message."""
         stop = self._size if end is None else end
         words = 'it ends between two records, so more may have followed'
         spans = [Span(0, 0)]
@@ -200,8 +200,7 @@ class McapFile(BagFile):
                     raise DamagedError(f'the record at byte {at} is not whole')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
-                    # Add the zeros that follow the span: they may have replaced bytes of its last
-                    # message.
+                    # Let the span contain zeros, so that `scan_records` drops its last message.
                     kind = last.kind if last.kind == 'loose' else 'torn'
                     spans[-1] = replace(last, length=last.length + PREFIX.size, kind=kind)
                 elif opcode == Opcode.CHUNK:
@@ -231,7 +230,7 @@ class McapFile(BagFile):
             self.truncated = f'the file is cut off at byte {self._size}: {words}'
 
     def _count(self, spans: Sequence[Span], words: str, is_whole: bool) -> str:
-        """Read all messages once to get their number and times."""
+        """Read all messages once to count them and to find their first and last log times."""
         n_torn = 0
         for span in spans:
             try:
@@ -252,7 +251,7 @@ class McapFile(BagFile):
 
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
-    """Merge pieces, given with their numbers and the first log time of the next piece."""
+    """Merge numbered pieces by log time; the third item is the next piece's first log time."""
     # Messages before the first log time of the next piece are final, so only messages of chunks
     # that overlap in time are held back.
     held: dict[int, Messages] = {}
@@ -270,7 +269,7 @@ def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Me
         if sum(len(piece.data) for piece in held.values()) > _MAX_HELD_BYTES:
             raise DamagedError(
                 'too many of its chunks overlap in time to be read in bounded memory; '
-                'sort it by time with another tool'
+                'sort its messages by time with another tool'
             )
         if ready:
             yield join_messages(ready).in_order()

@@ -33,13 +33,13 @@ from .serialized import Messages, join_messages, scatter
 
 Compression = Literal['none', 'lz4', 'zstd']
 
-#: Functions that compress data, given the level of zstd.
+#: Functions that compress data; the second argument is the level of zstd.
 _COMPRESSORS: Mapping[Compression, Callable[[Any, int], Any]] = {
     'none': lambda data, _: data,
     'lz4': lambda data, _: lz4.frame.compress(data),
     'zstd': zstandard.compress,
 }
-#: Topics of which a late subscriber gets the last message; a namespace may precede the name.
+#: Transient-local topics: a late subscriber gets the last message; a namespace may precede them.
 _LATCHED = tuple(topic.name for topic in OUTPUTS if topic.is_latched)
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
 # Any callable, because the type hints differ between versions of the `mcap` library.
@@ -52,7 +52,7 @@ _INDEX_ROW = np.dtype([('log', '<u8'), ('offset', '<u8')])
 @lru_cache(maxsize=64)
 def known_definition(kind: str) -> tuple[str, str, str]:
     """
-    Look up encoding, full text (with dependencies) and hash (RIHS01) of a message type of ROS 2
+    Return encoding, full text (with dependencies) and hash (RIHS01) of a message type of ROS 2
     Jazzy; RecordingError if Jazzy does not have the type.
     """
     store = typestore()
@@ -63,7 +63,7 @@ def known_definition(kind: str) -> tuple[str, str, str]:
 
 
 class McapOutput:
-    """A new MCAP file; its metadata are at the front, so that a torn file has them, too."""
+    """A new MCAP file with the metadata at the front, so that an unfinished file has them, too."""
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ class McapOutput:
         return channel.id
 
     def append(self, batches: Sequence[Messages]) -> None:
-        """Add messages in log-time order; full chunks are written, the other messages are kept."""
+        """Add messages in log-time order; write full chunks, hold the rest for the next chunk."""
         messages = join_messages([*self._tail, *batches])
         n_old = sum(map(len, self._tail))
         order = np.argsort(messages.log_ns[n_old:], kind='stable')
@@ -146,7 +146,7 @@ class McapOutput:
         return information
 
     def _information(self) -> dict[str, Any]:
-        """Build metadata.yaml as in Jazzy."""
+        """Build the content of metadata.yaml as rosbag2 of ROS 2 Jazzy does."""
         start_ns, end_ns = self._times()
         kinds = {schema.id: kind for kind, schema in self._schemas.items()}
         counted: list[dict[str, Any]] = [
@@ -267,7 +267,7 @@ class McapOutput:
 
 
 def _offered_qos(topic: str) -> dict[str, Any]:
-    """Return the QoS profile recorded as offered: reliable, so that any reader matches."""
+    """Return the QoS profile to record as offered: reliable, so that any subscriber matches."""
     is_flag = topic.endswith(_LATCHED)
     return {
         'history': 'keep_last',

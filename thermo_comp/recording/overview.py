@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the survey of a recording before a fit: duration, rates, temperatures, rests, losses."""
+"""Owns the survey of a recording before a fit: duration, rates, temperatures, rests, gaps."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
-#: Range of readings that are probably kelvins: no board endures them in degC.
+#: Range of readings that are probably in kelvins: in degC a board would not survive them.
 KELVINS = (180.0, 480.0)
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
@@ -32,7 +32,7 @@ _NO_SAMPLES = (
 
 @dataclass(frozen=True)
 class ThermometerSurvey:
-    """A thermometer: range [degC], largest two-minute rates [K/min], smallest step [K]."""
+    """A thermometer: range [degC], largest rates of 2-min means [K/min], smallest step [K]."""
 
     n: int
     rate_hz: float
@@ -46,8 +46,8 @@ class ThermometerSurvey:
 @dataclass(frozen=True)
 class Survey:
     """
-    Summary of a recording for a fit. The rate of samples follows from their median interval; still
-    intervals last at least 3 s; findings are obstacles to a fit, with the user's next step.
+    Summary of a recording for a fit. The rate of samples is the inverse of their median interval;
+    still intervals last at least 3 s; findings describe obstacles to a fit.
     """
 
     info: RecordingInfo
@@ -63,7 +63,7 @@ class Survey:
 def thermal_findings(
     thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
 ) -> list[str]:
-    """List what the thermometers lack: topic, span, ramps, unit; `candidates`: unused topics."""
+    """List faults of thermometers; `candidates` are unused topics that may hold a temperature."""
     findings = []
     among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')
@@ -82,12 +82,12 @@ def thermal_findings(
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
                 findings.append(
-                    f'no {name} ramp: record one, else the correction in it is extrapolated'
+                    f'no {name} ramp: record one, or {name} is corrected by extrapolation'
                 )
     for name, thermometer in thermometers.items():
         reads = f'{name} reads {thermometer.lowest:.4g} .. {thermometer.highest:.4g}'
         if thermometer.lowest < COLDEST or thermometer.highest > HOTTEST:
-            findings.append(f'{reads}: that is not degC')
+            findings.append(f'{reads}: this is not in degC')
         elif KELVINS[0] < thermometer.lowest and thermometer.highest < KELVINS[1]:
             findings.append(f'temperature/{reads} degC: that looks like kelvins')
     if 'case' not in thermometers:
@@ -104,7 +104,7 @@ def unused_thermometers(reader: RecordingReader) -> list[str]:
     paths = {role: field.path for role, field in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
     for name, (kind, count) in sorted(reader.info.topics.items()):
-        # A message that holds a single number needs no field name.
+        # A Temperature, Float32 or Float64 needs no field name.
         if not count or not used.isdisjoint({(name, None), (name, PLAIN.get(kind))}):
             continue
         if kind == TEMPERATURE or (kind in PLAIN and 'temp' in name.lower()):
@@ -118,11 +118,11 @@ def unused_thermometers(reader: RecordingReader) -> list[str]:
 def survey_recording(
     path: str | Path, topics: Topics | None = None, progress: Callable[[float], None] | None = None
 ) -> Survey:
-    """Read a recording once, in bounded memory; `progress` gets the fraction read."""
+    """Read and describe a recording in bounded memory; `progress` gets the fraction read."""
     with open_recording(path, topics, require=()) as reader:
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
-        cells, causes = CellAccumulator(_CELL_S, None), CauseCounter()
+        accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
         # All temperature readings fit into memory, because a test has far fewer readings than
         # samples.
         readings: dict[str, list[Readings]] = {}
@@ -134,13 +134,13 @@ def survey_recording(
                 continue
             clock.add(block.accel_stamp_ns)
             rate = None if block.imu is None else block.imu.angular_velocity
-            cells.add(block.accel_stamp_ns, block.accel, rate)
+            accumulator.add(block.accel_stamp_ns, block.accel, rate)
             causes.add(block)
             if progress is not None and total:
                 progress(clock.n / total)
         info, candidates = reader.info, unused_thermometers(reader)
     n = clock.n
-    reduced = cells.finish()
+    reduced = accumulator.cells()
     still = still_intervals(reduced, _MIN_REST_S) if n > 1 else []
     cause = causes.cause(reduced, STILL_SD) if n > 1 else ''
     surveys = ((name, survey_thermometer(parts)) for name, parts in readings.items())
@@ -157,12 +157,12 @@ def survey_recording(
         ),
         (
             clock.n_backwards,
-            f'stamps not later than that of the sample before: {clock.n_backwards}; those samples '
-            'are left out',
+            f'samples with a stamp not later than an earlier stamp: {clock.n_backwards}; these '
+            'samples are left out',
         ),
         (
             clock.n_restarts,
-            f'the time goes back by more than an hour ({clock.n_restarts} times): a fit takes '
+            f'the stamps go back by more than an hour ({clock.n_restarts} times): a fit takes '
             'each jump for a pause of an hour',
         ),
         (
@@ -171,7 +171,7 @@ def survey_recording(
         ),
     ]
     duration_s = (clock.last_ns - clock.first_ns) * 1e-9
-    # The first and the last cell may extend beyond the samples: limit the time at rest.
+    # The last cell may extend beyond the samples: limit the time at rest to the duration.
     still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
     return Survey(
         info,
@@ -187,7 +187,7 @@ def survey_recording(
 
 @dataclass
 class _Clock:
-    """The stamps so far: their median interval, gaps, and stamps that do not rise."""
+    """Statistics of the stamps so far: median interval, gaps, stamps that do not rise."""
 
     n: int = 0
     first_ns: int = 0
@@ -206,7 +206,7 @@ class _Clock:
         later = stamp_ns[not self.n :]
         steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
-        # After a step back by an hour or less, samples are left out up to the newest stamp so far.
+        # After a step back by an hour or less, samples up to the newest stamp are left out.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):
@@ -223,7 +223,7 @@ class _Clock:
 
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:
-    """Describe a thermometer, given its readings in pieces; None without a finite reading."""
+    """Describe a thermometer by its readings, given in pieces; None without a finite reading."""
     if not readings:
         return None
     stamp_ns = np.concatenate([reading.stamp_ns for reading in readings])
@@ -232,7 +232,7 @@ def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None
     stamp_ns, celsius = stamp_ns[use], celsius[use]
     if not len(celsius):
         return None
-    # Take rates between two-minute means, so that a quantum does not look like a ramp.
+    # Rates are taken between two-minute means, so that a step by a quantum is not a ramp.
     time = (stamp_ns - stamp_ns[0]) * 1e-9
     bins = np.maximum(time // _RAMP_WINDOW_S, 0).astype(np.int64)
     _, place = np.unique(bins, return_inverse=True)

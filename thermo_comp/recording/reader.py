@@ -46,7 +46,7 @@ from .wire import Feed, decode_blocks
 
 _MAX_BYTES = 1 << 24
 _COMPRESSIONS = {'none': '', 'file': 'file', 'message': 'message'}
-#: Largest batch that is decoded at a time from a foreign file: messages, bytes, time [ns].
+#: Largest batch that is decoded at a time from a `ForeignFile`: messages, bytes, time [ns].
 _BATCH_MESSAGES = 1 << 14
 _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 
@@ -56,9 +56,9 @@ class RecordingReader(ExitStack):
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
 
     The roles in `require` must be in the bag. `info` describes the bag; after all blocks are read,
-    `info.truncated` names the missing messages. `topics` are the bag's names by role, `fields` the
-    fields read from messages that have further fields, `definitions` encoding and text of the
-    message types.
+    `info.truncated` names the missing messages. `topics` are the bag's topics by role, `fields`
+    the fields that hold the reading of a thermometer, by role, `definitions` encoding and text by
+    message type.
     Raises RecordingError if the file is not a bag, is damaged, or a topic is missing or ambiguous.
     """
 
@@ -77,7 +77,7 @@ class RecordingReader(ExitStack):
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
             bare = [role for role, field in self.fields.items() if not field.has_stamp]
-            note = f'{", ".join(bare)} without a stamp: dated by the sample before each reading'
+            note = f'no stamps in {", ".join(bare)}: dated by the sample before each reading'
             chosen = '; '.join(filter(None, (selected.chosen, note if bare else '')))
             self.info = replace(self.info, input=selected.input, chosen=chosen or None)
         except BaseException as error:
@@ -86,10 +86,10 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the part of the bag that is read [s]; set when
-        #: the first sample is read.
+        #: Time from the bag's first sample to the first sample of the selected part [s]; 0 until
+        #: this sample has been read.
         self.since_s = 0.0
-        self.apart = ''  # warning about a thermometer on another clock, if found so far
+        self.apart = ''  # warning about a clock that does not run or a second clock, if found
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
         for role, path in selected.fields.items():
@@ -204,13 +204,13 @@ class RecordingReader(ExitStack):
                     yield file.path, channels, messages
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
-        """Read the bag with shortened jumps of its clock, for uses that need a grid over time."""
+        """Read the bag with jumps of the stamps shortened to an hour, for a grid over time."""
         if self._part.is_stamped:
             return without_jumps(self.blocks(), self.info.path)
         return self._cut(without_jumps(self._blocks(), self.info.path))
 
     def _cut(self, blocks: Iterator[Block]) -> Iterator[Block]:
-        """Drop messages outside the part to be read; RecordingError if no sample is left."""
+        """Drop messages outside the selected part; RecordingError if no sample is left."""
         if self._part == WHOLE:
             yield from blocks
             return
@@ -244,7 +244,7 @@ open_recording = RecordingReader
 def read_recording(
     path: str | Path, topics: Topics | None = None, *, require: Collection[Role] = ROLES
 ) -> Recording:
-    """Read a whole bag into memory; raises as `open_recording`, also for damaged data."""
+    """Read a whole bag into memory; raises as `open_recording` does, also for damaged data."""
     with open_recording(path, topics, require=require) as reader:
         blocks = list(reader.blocks()) or decode_blocks(Messages.of([], [], []), (), ROLES)
         return Recording(reader.info, joined(blocks))
@@ -269,7 +269,7 @@ def _described(path: Path) -> _Description:
             if files:
                 if len({re.sub(r'_[0-9]+$', '', file.stem) for file in files}) > 1:
                     raise RecordingError(
-                        f'a folder of {len(files)} bags, not a bag: give *{suffix} in it', path
+                        f'a folder of several bags: give its {len(files)} *{suffix} files', path
                     )
                 note = 'metadata.yaml is missing, the recording was not finished'
                 return _Description(suffix[1:], tuple(sorted(files, key=_place_of)), note=note)
@@ -287,7 +287,7 @@ def _described(path: Path) -> _Description:
 
 @dataclass(frozen=True, slots=True)
 class _Description:
-    """The files of a bag, with compression, counts per topic and a note on missing parts."""
+    """The files of a bag, their compression, message counts by topic, a note on missing parts."""
 
     storage: str
     files: tuple[Path, ...]
@@ -298,7 +298,7 @@ class _Description:
 
 
 def _read_metadata(directory: Path) -> _Description | None:
-    """Read a bag's metadata.yaml; None without content, as after a killed recorder."""
+    """Read a bag's metadata.yaml; None if it is missing or empty, as after a killed recorder."""
     path = directory / 'metadata.yaml'
     try:
         text = read_bounded(path, _MAX_BYTES)
@@ -336,7 +336,7 @@ def _read_metadata(directory: Path) -> _Description | None:
 
 
 def _place_of(file: Path) -> tuple[int, str]:
-    """Return the sort key of a file of a split bag: the number at the end of its name."""
+    """Return the sort key of a file of a split bag: the number that ends its name, its name."""
     number = re.search(r'_([0-9]+)$', file.stem)
     return (int(number[1]) if number else 0, file.name)
 
@@ -344,13 +344,13 @@ def _place_of(file: Path) -> tuple[int, str]:
 def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
     if n_read >= n_promised:
         return None
-    return f'{shown(topic)}: {n_read} of the {n_promised} messages listed are there'
+    return f'{shown(topic)}: {n_read} of {n_promised} listed messages are in the bag'
 
 
 class ForeignFile(BagFile):
     """
-    A file other than plain MCAP (sqlite3, ROS 1), read by `rosbags` and decoded in batches;
-    `is_packed`: each message is compressed separately.
+    A file that `rosbags` reads: sqlite3, ROS 1, or MCAP with messages that are compressed one by
+    one (`is_packed`).
     """
 
     def __init__(self, path: Path, name: Path, *, is_packed: bool = False) -> None:
@@ -381,7 +381,7 @@ class ForeignFile(BagFile):
                     self.definitions[link.msgtype] = kind, link.msgdef.data
 
     def read(self, channels: Collection[int]) -> Iterator[Messages]:
-        """Read the messages of channels (the reader's connections) in reading order."""
+        """Read the messages of some channels (connections of `rosbags`) in reading order."""
         chosen = [self._reader.connections[number] for number in channels]
         known = {(link.topic, link.msgtype): n for n, link in zip(channels, chosen, strict=True)}
         batch: list[tuple[bytes, int, int]] = []

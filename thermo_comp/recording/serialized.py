@@ -15,7 +15,7 @@ from ..typing import Bools, Bytes, Ints
 
 
 def gather(buffer: Bytes, at: Ints, n_bytes: int) -> Any:
-    """Copy `n_bytes` from each position, all before the buffer's end, as rows of void."""
+    """Copy `n_bytes` from each position in a buffer into a row of type void."""
     return _everywhere(buffer, n_bytes)[at] if len(at) else np.empty(0, (np.void, n_bytes))
 
 
@@ -31,7 +31,7 @@ def _everywhere(buffer: Bytes, n_bytes: int) -> Any:
 
 
 def number_at(rows: NDArray[Any], offset: int, kind: str) -> Any:
-    """View a number in each gathered row, by its offset [bytes] and numpy type."""
+    """View the number at an offset [bytes] of each gathered row as the numpy type `kind`."""
     if len(rows) == 0:
         return np.empty(0, kind)
     return np.ndarray((len(rows),), kind, rows.data, offset=offset, strides=(rows.itemsize,))
@@ -39,7 +39,7 @@ def number_at(rows: NDArray[Any], offset: int, kind: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """Serialized messages, shape (n,): their positions and lengths in `data`."""
+    """Serialized messages, shape (n,), by their positions and lengths [bytes] in `data`."""
 
     data: Bytes
     start: Ints
@@ -65,7 +65,7 @@ class Messages:
             yield data[at : at + size]
 
     def take(self, which: Ints | Bools | slice) -> Messages:
-        """Select messages; the bytes are shared."""
+        """Select messages; the result shares `data`."""
         return Messages(
             self.data, self.start[which], self.size[which], self.channel[which], self.log_ns[which]
         )
@@ -83,13 +83,13 @@ class Messages:
         return self if len(places) == len(self) else self.take(places)
 
     def in_order(self) -> Messages:
-        """Sort by log time and, for equal times, by position."""
+        """Sort the messages by log time; messages with equal log times keep their order."""
         if (self.log_ns[1:] >= self.log_ns[:-1]).all():
             return self
         return self.take(np.argsort(self.log_ns, kind='stable'))
 
     def packed(self, room: int = 0) -> Messages:
-        """Copy the bytes, with `room` bytes before each message, to free the original."""
+        """Copy the selected bytes, so that `data` can be freed; leave `room` bytes before each."""
         ends = np.cumsum(self.size + room)
         data = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
         for each in np.unique(self.size[self.size > 0]).tolist():
@@ -99,7 +99,7 @@ class Messages:
 
 
 def join_messages(pieces: Sequence[Messages]) -> Messages:
-    """Concatenate pieces of messages, at least one piece."""
+    """Concatenate a nonempty list of batches of messages."""
     if len(pieces) == 1:
         return pieces[0]
     begins = np.cumsum([0, *(len(piece.data) for piece in pieces)])

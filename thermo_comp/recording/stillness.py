@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns still intervals: raw samples -> short cells (count, mean, variance) -> where nothing moved.
+Owns still intervals: sums samples to short cells (count, mean, variance) and finds still cells.
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
 (vibration, handling) and the step between adjacent cells (a turn, a knock). A step starts a new
-interval, because a tilt of one microradian is already one micro-g. Temperature also tilts a unit
-at rest, so a steady change over several cells, slower than the Earth rotates, is a drift and not a
-step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest: a
-sensor at rest scatters by no more than its noise, and does not rotate.
+interval, because a tilt by a microradian already changes a reading by a micro-g. Temperature also
+tilts a unit at rest, so a steady change over several cells, slower than the Earth rotates, is a
+drift and not a step. Two tests have absolute limits, because the quietest tenth of a flight is not
+a rest: the scatter of a sensor at rest is below `still_sd`, and its angular rate near a level.
 """
 
 from __future__ import annotations
@@ -20,49 +20,49 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
-from .colour import roughest_at_rest, spread_of_variances
+from .coloured_noise import roughest_at_rest, spread_of_variances
 from .glitches import is_glitch
 
-#: Largest ratio of a cell's variance (n >= 30 samples) at rest to the quiet level: noise alone
+#: Largest ratio of the variance of a cell at rest (30 samples or more) to the quiet level: noise
 #: exceeds 4 with a probability below 1e-11, and vibration that must be cut out is far above 4.
 VARIANCE_RATIO = 4.0
-#: Largest scatter at rest [g]: above the scatter of the noisiest sensors, below the scatter in
-#: most flights.
+#: Largest sd of samples at rest [g]: above the noise of the noisiest sensors, below the scatter
+#: in most flights.
 STILL_SD = 0.05
-# Largest scatter of a gyroscope within a cell at rest, and largest distance of a cell's mean rate
-# from the level [rad/s]: the median rate over `_LEVEL_S` [s], which drifts with temperature.
+# Largest sd of the angular rate within a cell at rest, and largest distance of a cell's mean rate
+# from the level [rad/s]. The level is the median rate over `_LEVEL_S` [s]: it follows the drift.
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # `without_rotation` subtracts from the angular rate its median over this time [s].
 _ROTATION_S = 10.0
-# Size of a step between cells that ends a rest, in robust sd of all steps; noise is smaller.
+# Smallest step between adjacent cells that ends a rest, in robust sd of all steps.
 _STEP_SDS = 8.0
-# Number of steps between cells whose median is the drift, and the largest drift [g/s].
+# The drift is the median of this number of steps between cells; largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
-# Number of samples searched for a quantum, and smallest number of changes that prove a quantum
-# by being whole multiples of it.
+# Number of samples searched for a quantum, and number of changes that must be whole multiples of
+# the smallest change, to prove that this is the quantum.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a cell of slow samples may last
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a cell of slow samples may fill
 _LONGEST_CELL_NS = 86400e9  # a longer cell is due to wrong stamps [ns]
 MIN_SAMPLES = 30  # smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
 _WORD = 32768.0  # middle of the range of unsigned 16-bit numbers
 _LONGER = (23, 31)  # magnitude bits of 24- and 32-bit words
-_STUCK = 0.3  # ratio of noise to quantum below which a sensor mostly repeats one number
+_STUCK = 0.3  # ratio of the noise's sd to the quantum below which most samples are equal
 
 
 @dataclass(frozen=True)
 class Cells:
     """
-    Sufficient statistics of short runs of samples, shape (n,) and (n, 3).
-    `start_ns` and `end_ns` are the stamps of the first and last sample; `time` is the mean since
-    `start_ns` [s]; `index` the cell's number on the bag's time grid.
+    Statistics of the n cells of a bag, shape (n,) or (n, 3); a cell is a short run of samples.
+    `start_ns` and `end_ns` are the stamps of the first and last sample of the bag; `time` is the
+    mean time of a cell's samples since `start_ns` [s]; `index` the cell's number on the time grid.
     Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
     `is_glitch`. `n_repeated` counts the samples with the stamp of the sample before. `quantum` is
-    the step between the samples' possible values, or 0; `middle` is 32768 for unsigned 16-bit
-    words, else 0; rates are in rad/s. `roughness` is half the mean square change from sample to
-    sample, which is the variance of white noise; `seam` the change to a cell's first sample from
-    the last sample of the cell right before it.
+    the step between the possible values of the samples, or 0; `middle` is 32768 for unsigned
+    16-bit words, else 0; rates are in rad/s. `roughness` is half the mean square change from
+    sample to sample, which equals the variance for white noise; `seam` is the change from the last
+    sample of the cell before, if adjacent, to a cell's first sample.
     """
 
     start_ns: int
@@ -93,8 +93,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer; a
-    whole number of cells fills `window_s`, or a cell lasts one of `STRETCHES` windows.
+    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
+    Whole cells fill a window of `window_s`, or `STRETCHES` windows if a cell is longer.
     """
 
     def __init__(
@@ -110,9 +110,8 @@ class CellAccumulator:
         self._last_ns: int | None = None
         self._last = np.zeros((0, 3))  # last sample of the previous block
         self._shift = np.zeros(3)
-        # Row of a cell: its number, number of samples, and sums of times, samples and their
-        # squares; change from the cell before; sum of squared changes. The last cell may get
-        # further samples.
+        # Row of a cell: its number, number of samples, sums of times, samples and their squares;
+        # change from the cell before; sum of squared changes. The last cell may get more samples.
         self._sums: list[Floats] = [np.empty((0, 15))]
         self._n_dropped = self._n_saturated = self._n_glitches = self._n_looked_at = 0
         self._n_repeated = 0
@@ -120,7 +119,7 @@ class CellAccumulator:
         self._middle, self._quantum = 0.0, np.zeros(3)
 
     def add(self, stamp_ns: Ints, samples: Floats, rate: Floats | None = None) -> None:
-        """Take the next samples, shape (n, 3), in file order, and the angular rates."""
+        """Add the next samples and angular rates, shape (n, 3), in file order, to the cells."""
         if not len(stamp_ns):
             return
         use = (np.abs(samples) < _LARGEST).all(axis=1)
@@ -159,10 +158,10 @@ class CellAccumulator:
     def forget(self, stamp_ns: int) -> None:
         """Drop the cells before a stamp."""
         first = (stamp_ns - self._start_ns) // max(self._cell_ns, 1)
-        n = int(np.searchsorted(self.finish().index, first))
+        n = int(np.searchsorted(self.cells().index, first))
         self._sums = [self._sums[0][n:]]
 
-    def finish(self) -> Cells:
+    def cells(self) -> Cells:
         """Return all cells so far, including the unfinished last cell."""
         sums = np.concatenate(self._sums)
         self._sums = [sums]  # join only once
@@ -170,7 +169,7 @@ class CellAccumulator:
         total, square = np.split(sums[:, 3:-6], 2, axis=1)
         pairs = 2.0 * np.maximum(count[:, None] - 1.0, 1.0)
         mean = total / count[:, None]
-        # The difference of two large sums has a rounding error: equal samples have no variance.
+        # Set a variance below the rounding error of the two sums to 0, as for equal samples.
         spread = square - count[:, None] * mean**2
         spread[spread < np.finfo(np.float64).eps * count[:, None] * square] = 0.0
         variance = spread / np.maximum(count[:, None] - 1.0, 1.0)
@@ -189,7 +188,7 @@ class CellAccumulator:
         )
 
     def _look_for_sign(self, samples: Floats) -> None:
-        """Detect unsigned 16-bit words: integers, never negative, beyond the signed range."""
+        """Detect unsigned 16-bit words: whole numbers, none negative, some beyond 32768."""
         self._is_negative |= bool((samples < 0.0).any())
         if not self._is_negative and np.max(samples, initial=0.0) > _WORD:
             is_word = (samples == np.rint(samples)) & (samples < 2.0 * _WORD)
@@ -200,8 +199,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # A polled buffer gives bursts of samples at a constant interval of 5 s at most, unlike
-            # the pauses of a tumble by hand; a cell contains two of these bursts.
+            # A buffer that is polled gives bursts of samples at a constant interval, 5 s at most,
+            # and a cell contains two bursts. Pauses of a tumble by hand are irregular or longer.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -241,7 +240,7 @@ class CellAccumulator:
 
 
 def widened(full_scale: float, samples: Floats) -> float:
-    """Return the full scale of 24- or 32-bit words (or means of them) if most exceed 16 bits."""
+    """Return the full scale of 24- or 32-bit words if most samples exceed 16 bits."""
     size = np.max(np.abs(samples), axis=1) if len(samples) else np.zeros(1)
     if np.median(size) < 2.0 * _WORD:
         return full_scale
@@ -249,7 +248,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Find a cell length [ns] such that whole cells fill one window, or a few windows."""
+    """Return a cell length of at least `least` [ns] such that whole cells fill 1 to 60 windows."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:
@@ -258,7 +257,7 @@ def _part_of(window_s: float, least: float) -> float:
 
 
 def _quantum_of(samples: Floats) -> Floats:
-    """Find the quantum of each axis in the changes between samples; 0 without a quantum."""
+    """Return the quantum of each axis from the changes between samples; 0 without a quantum."""
     result = np.zeros(3)
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
@@ -278,14 +277,14 @@ def _quantum_of(samples: Floats) -> Floats:
 def still_intervals(
     cells: Cells, min_rest_s: float, still_sd: float = STILL_SD
 ) -> list[tuple[int, int]]:
-    """Find the runs of still cells: half-open ranges of indices into `cells`, in order."""
+    """Return runs of still cells of at least `min_rest_s`, as half-open ranges of indices."""
     return long_enough(cells, still_runs(cells, still_sd, (VARIANCE_RATIO,))[0], min_rest_s)
 
 
 def long_enough(
     cells: Cells, runs: Sequence[tuple[int, int]], min_rest_s: float
 ) -> list[tuple[int, int]]:
-    """Select the runs of cells that last for `min_rest_s` at least."""
+    """Select the runs of cells that last at least `min_rest_s`."""
     min_cells = max(1, int(np.ceil(min_rest_s / cells.cell_s - 1e-9))) if runs else 1
     return [(start, stop) for start, stop in runs if stop - start >= min_cells]
 
@@ -294,8 +293,8 @@ def still_runs(
     cells: Cells, still_sd: float, ratios: Sequence[float]
 ) -> list[list[tuple[int, int]]]:
     """
-    Find the runs of still cells of any length, for each ratio of the largest variance of a still
-    cell to the quiet level; `still_sd` is the largest scatter at rest [g].
+    Return the runs of still cells of any length for each value of `ratios`, the largest ratio of a
+    still cell's variance to the quiet level; `still_sd` is the largest sd at rest [g].
     """
     full = _is_full(cells)
     plausible = full & is_under(cells, still_sd) & ~_is_turning(cells)
@@ -304,10 +303,10 @@ def still_runs(
     drift = _drift(cells, plausible)
     level = np.quantile(cells.variance[plausible], 0.1, axis=0)
     colour = spread_of_variances(cells, plausible, level)
-    # A sensor that repeats one number does not show its noise: toggling between two adjacent
-    # numbers has a variance of a quarter step squared. For white noise 1.3 times the tenth
-    # percentile of the variances is their mean with 60 samples a cell, and 0.9 of their mean with
-    # 32 samples.
+    # A sensor that repeats one number does not show its noise; samples that toggle between two
+    # adjacent numbers have a variance of a quarter quantum squared. For white noise 1.3 times the
+    # tenth percentile of the variances is the mean variance with 60 samples a cell, and 0.9 of the
+    # mean variance with 32 samples a cell.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
@@ -317,10 +316,10 @@ def still_runs(
         quiet = plausible & (cells.variance <= ratio * noise + by_drift).all(axis=1)
         roughest = roughest_at_rest(cells, quiet, colour > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
-        # Successive samples of noise as rough as `roughest` differ by `_STEP_SDS` sd at most.
+        # At rest the samples on both sides of a seam differ by at most `_STEP_SDS` sd of noise.
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
-        # Cells adjacent to a moving cell, or to a step, contain the edge of the motion.
+        # Exclude cells adjacent to a moving cell or to a step: the motion may extend into them.
         near = ~quiet
         near[1:] |= ~quiet[:-1] | broken
         near[:-1] |= ~quiet[1:] | broken
@@ -348,7 +347,7 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     if full.any() and not (full & under).any():
         least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
-            f'its samples scatter by at least {1e3 * least:.3g} mg, the limit at rest is '
+            f'its samples scatter by at least {1e3 * least:.3g} mg (sd), the limit at rest is '
             f'{1e3 * still_sd:.3g} mg (--still-sd): was the unit worn, driven or shaken?'
         )
     if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():
@@ -370,19 +369,19 @@ def _is_full(cells: Cells) -> Bools:
 
 
 def _one_g(cells: Cells) -> float:
-    """Typical norm of the readings, which is gravity in input units."""
+    """Return the median norm of the cells' means, which is gravity in units of the input."""
     norms = np.linalg.norm(cells.mean - cells.middle, axis=1)
     return float(np.median(norms)) if len(norms) else 0.0
 
 
 def is_under(cells: Cells, still_sd: float) -> Bools:
-    """Whether the scatter of a cell is at most that of a sensor at rest, or of rounding."""
+    """Whether the sd of a cell's samples is at most `still_sd` [g], or at most a quantum."""
     ceiling = np.maximum((still_sd * _one_g(cells)) ** 2, cells.quantum**2)
     return np.asarray((cells.variance <= ceiling).all(axis=1))
 
 
 def _is_turning(cells: Cells) -> Bools:
-    """Whether the unit shakes or turns in a cell, by the angular rate less its drifting level."""
+    """Whether the unit shakes or turns in a cell, by the angular rate less its slow level."""
     shakes = (cells.rate_variance > _STILL_RATE_SD**2).any(axis=1)
     calm = np.flatnonzero(~shakes)
     if not len(calm) or not cells.rate.any():
@@ -397,7 +396,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, plausible: Bools) -> Floats:
-    """Return the drift between successive cells, a median over neighbours, shape (n - 1, 3)."""
+    """Return the median step between cells around each pair of cells, limited, (n - 1, 3)."""
     both = plausible[1:] & plausible[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2
@@ -410,18 +409,18 @@ def _drift(cells: Cells, plausible: Bools) -> Floats:
 
 
 def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
-    """Whether cell i + 1 continues cell i, shape (n - 1,): no gap, no step besides the drift."""
+    """Whether cell i + 1 continues the rest of cell i: no gap, no step beyond the drift."""
     step = np.diff(cells.mean, axis=0) - drift
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():
         return np.zeros(len(step), dtype=bool)
-    # With many short rests most steps between cells are turns: limit the steps' spread.
+    # With many short rests most steps between cells are turns: limit the spread of the steps.
     spread = np.minimum(
         1.4826 * np.median(np.abs(step[both]), axis=0), STILL_SD / _STEP_SDS * _one_g(cells)
     )
     square = cells.variance / cells.count[:, None]
     noise = np.sqrt(np.maximum(2.0 * np.median(square[quiet], axis=0), square[1:] + square[:-1]))
-    # A sensor that mostly repeats one number moves by a whole quantum without a knock.
+    # Samples that are mostly equal change by a whole quantum without a knock.
     is_stuck = np.median(cells.variance[quiet], axis=0) < (_STUCK * cells.quantum) ** 2
     limit = np.maximum(
         _STEP_SDS * np.maximum(spread, noise), np.where(is_stuck, 1.1 * cells.quantum, 0.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the search for the inputs' topics in a bag, and the messages for missing topics."""
+"""Owns the search for the topics of the inputs in a bag, and messages for missing topics."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from ..text import one_line
 from ..topics import BOARD, CASE, COUNTS, FLAGS, IMU_IN, IMU_OUT, INPUTS, TEMPERATURE, thermometer
 from .blocks import Input, Role
 
-#: Types accepted for a thermometer without a named field, and the field read.
+#: Message types of a thermometer for which no field need be named, with the field that is read.
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
-#: Name of a driver's topic in REP 145 and of the node's output; the bag's other topics show
-#: whether driver or node has published it.
+#: Topic imu/data_raw: the driver's output in REP 145, and also the node's output. Other topics of
+#: the bag show whether the driver or the node published it.
 _RAW = IMU_OUT.name
-#: Words in the names of vector topics that are not a specific force.
+#: Parts of the names of vector topics that hold no specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 
-#: Names of further thermometers; the names of roles are reserved.
+#: Allowed names of further thermometers; `accel`, `board` and `case` are reserved.
 _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
-#: Message for a topic used for two inputs, offline and live.
+#: Message of the commands and of the node for a topic that is named for two inputs.
 TWINS = (
     'one topic for both {} and {}: a single thermometer is the board, leave the other input out'
 )
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
-_FIRST_STAMP_S = 1e8  # smallest limit of a `Part` that is a stamp [s]: 1973, longer than any bag
+_FIRST_STAMP_S = 1e8  # limits of a `Part` from here on are stamps [s]: the year 1973
 
-#: The topics of a bag with their type and number of messages.
+#: Message type and number of messages of each topic of a bag.
 Present = Mapping[str, tuple[str, int]]
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Part of a bag: seconds from its first sample, or stamps (from 1e8 on); `end` is excluded."""
+    """Part of a bag from `begin` to before `end`: times since the first sample, or stamps [s]."""
 
     begin: float | None = None
     end: float | None = None
@@ -67,7 +67,7 @@ class Part:
 
     @property
     def is_stamped(self) -> bool:
-        """Whether begin and end are stamps, not seconds from the first sample."""
+        """Whether begin and end are stamps instead of times since the first sample."""
         return max(self.begin or 0.0, self.end or 0.0) >= _FIRST_STAMP_S
 
     def limits_ns(self, first_ns: float) -> tuple[float, float]:
@@ -90,10 +90,10 @@ class Topics:
     """
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
-    namespace. If no topic has a usual name, imu/data_raw is used, or else the bag's only topic of
-    an input's type, preferably an Imu. Further thermometers are named, or found as
-    ``temperature/<name>`` in the board's namespace. A thermometer may be a field of any message,
-    ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
+    namespace. If no topic has the default name of an input, imu/data_raw is used, or else the
+    bag's only topic of the input's type, preferably an Imu. Further thermometers are given in
+    `further`, or found as ``temperature/<name>`` in the namespace of the board's topic. The
+    reading of a thermometer may be a field, ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 
     counts: str = COUNTS.name
@@ -107,8 +107,8 @@ class Topics:
     @classmethod
     def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
         """
-        Build from topics by ``counts``, ``imu``, ``board``, ``case`` or ``temperature/<name>``; if
-        only one of counts and Imu is named, this input is read.
+        Build from topics by input: ``counts``, ``imu``, ``board``, ``case``, ``temperature/NAME``.
+        If only counts or only Imu is among them, this input is read.
         """
         roles: dict[str, Any] = {}
         further = {}
@@ -138,7 +138,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Topics and fields of the roles, the input, and a note on topics chosen by type."""
+    """Topics and fields by role, the kind of accelerometer input, a note on topics by type."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]
@@ -147,10 +147,10 @@ class Selected(NamedTuple):
 
 
 def read_names(path: str | Path) -> dict[str, str]:
-    """Read a YAML file of topics by input, as in config/drivers."""
+    """Read topics by input from a YAML file, like those in config/drivers."""
     names = read_plain_yaml(path)
     if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
-        raise ThermoCompError('expected lines of INPUT: TOPIC, as board: /imu/temperature', path)
+        raise ThermoCompError('expected lines INPUT: TOPIC, like board: /imu/temperature', path)
     return names
 
 
@@ -163,7 +163,7 @@ def parse_name(text: str) -> tuple[str, str]:
 
 
 def split_field(topic: str) -> tuple[str, str]:
-    """Split a topic from the field of its messages; '' without a field."""
+    """Split ``TOPIC:FIELD`` into topic and field; the field is '' if none is given."""
     name, _, field = topic.partition(':')
     return name, field
 
@@ -174,7 +174,7 @@ def is_thermometer(name: str) -> bool:
 
 
 def shown(name: str) -> str:
-    """Make a name from a bag safe to print: no control characters, limited length."""
+    """Return a name from a bag without control characters and shortened, safe to print."""
     return one_line(name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...')
 
 
@@ -192,9 +192,9 @@ def select_topics(
     metadata: Mapping[str, str] = MappingProxyType({}),
 ) -> Selected:
     """
-    Find the topics of the roles, as far as they have messages, the input of the accelerometer, and
-    the topics chosen by type. RecordingError for a topic that is ambiguous, of another type, or
-    required and missing.
+    Find the topic of each role among the topics with messages, the kind of accelerometer input,
+    and a note on topics chosen by their type. RecordingError for a topic that is ambiguous, has
+    another type, or is required and missing.
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages')
@@ -213,7 +213,7 @@ def select_topics(
                 raise RecordingError('the topic has no messages', key=shown(name))
         elif role in require:
             raise _missing(present, {key: getattr(topics, key) for key in wanted}, corrected)
-    among = ["driver's", 'only']  # words for a topic of REP 145, or for the only topic of a type
+    among = ["driver's", 'only']  # note: topic named as in REP 145, or only topic of its type
     chosen = [
         choice_note(
             name_of[role], key, getattr(topics, key), among[not is_called(name_of[role], _RAW)]
@@ -237,7 +237,7 @@ def select_topics(
 
 
 def _check_twins(topics_of: Mapping[Role, str], fields: Mapping[Role, str]) -> None:
-    """Refuse a topic, or a field of it, for two inputs."""
+    """Refuse the same topic and field for two inputs."""
     roles: dict[tuple[str, str], Role] = {}
     for role, name in topics_of.items():
         if (twin := roles.setdefault((name, fields.get(role, '')), role)) != role:
@@ -247,7 +247,7 @@ def _check_twins(topics_of: Mapping[Role, str], fields: Mapping[Role, str]) -> N
 def _candidates(
     present: Present, topics: Topics, keys: Sequence[str], corrected: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield candidates for an input: by name, by REP 145, by type; an Imu before counts."""
+    """Yield topics for an input by its name, then by REP 145 or type, an Imu before counts."""
     for key in keys:
         if (name := _match(present, getattr(topics, key), key)) is not None:
             yield key, name
@@ -273,11 +273,11 @@ def _candidates(
         if len(only) == 1:
             yield key, only[0]
         if of_type and key == 'imu':
-            return  # several Imu topics are ambiguous
+            return  # with several Imu topics, do not choose counts instead
 
 
 def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
-    """Find the topic that the node or `replay` wrote; '' if there is none."""
+    """Return the topic of corrected data that the node or `replay` wrote; '' without one."""
     for name in present:
         front = name.removesuffix(_RAW)
         is_beside = any(front + flag.name in present for flag in FLAGS)
@@ -287,11 +287,11 @@ def _corrected(present: Present, metadata: Mapping[str, str]) -> str:
 
 
 def _text_of_corrected(name: str) -> str:
-    return f'{shown(name)} is corrected already: thermo_comp wrote it, it is not an input'
+    return f'{shown(name)} is no input: thermo_comp wrote it, its samples are corrected already'
 
 
 def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
-    """Name unread topics that may be the board's thermometer; '' without such topics."""
+    """Ask whether an unused temperature topic is the board's; '' without such topics."""
     names = [
         shown(name)
         for name, (kind, count) in present.items()
@@ -306,7 +306,7 @@ def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> st
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find further thermometers: named topics, and those in the namespace of board or case."""
+    """Find further thermometers: those in `topics.further`, and others beside board or case."""
     both = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))
@@ -338,12 +338,12 @@ def _of_type(present: Present, name: str, expected: str, wanted: str) -> str:
 
 
 def is_called(name: str, wanted: str) -> bool:
-    """Whether a bag's topic has a name, with or without a namespace."""
+    """Whether a topic of a bag has the wanted name, with or without a namespace."""
     return f'/{name.strip("/")}'.endswith(f'/{wanted.strip("/")}')
 
 
 def _match(present: Present, wanted: str, key: str) -> str | None:
-    """Find a topic by its name, or the only topic with that name in a namespace."""
+    """Return the topic with a name, or else the only topic with this name in a namespace."""
     bare = split_field(wanted)[0].strip('/')
     spaced = [name for name in present if name.strip('/') == bare][:1]
     spaced = spaced or sorted(name for name in present if name.endswith('/' + bare))
@@ -364,7 +364,7 @@ def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -
     if corrected and not {'counts', 'imu'}.isdisjoint(wanted):
         listed += f'; {_text_of_corrected(corrected)}'
     if wanted.keys() == {'imu'} and any(is_called(name, _USUAL.counts) for name in present):
-        listed += '; an Imu in m/s^2 is wanted, by the calibration or --input, not counts'
+        listed += '; the calibration or --input wants an Imu in m/s^2, not counts'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the serialized layout of stamped messages: batches of messages to blocks, and back.
+Owns the serialized layout of stamped messages: decodes batches to blocks, and encodes columns.
 
-All three input types are a std_msgs/Header followed only by float64 numbers. In CDR::
+All three input types are a std_msgs/Header followed by float64 numbers alone. In CDR::
 
     0   encapsulation: 00, endianness (0 big, 1 little), options
     4   stamp: int32 seconds, uint32 nanoseconds
     12  uint32 length of frame_id with its final NUL, then its characters
     4 + align8(12 + length)   the float64 numbers
 
-Only `frame_id` makes the size of a message vary, so messages of equal layout are gathered as rows
-of bytes, with stamps and numbers as views. ROS 1 messages are converted by `rosbags`, one by one.
+The size of a message depends on `frame_id` alone, so messages of equal layout are gathered as rows
+of bytes, with stamps and numbers as views. `rosbags` converts ROS 1 messages one by one.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -30,7 +30,7 @@ from .fields import Field, typestore
 from .serialized import Messages, gather, number_at
 from .topics import shown
 
-#: The columns of sensor_msgs/Imu among its numbers, in the order of `ImuColumns`.
+#: Places of the fields of `ImuColumns` among the 37 numbers of sensor_msgs/Imu.
 _IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
 _IMU_ACCELERATION = slice(25, 28)
 
@@ -40,7 +40,7 @@ _NS = 1_000_000_000
 
 
 class Feed(NamedTuple):
-    """The role that a channel of a bag feeds, its topic, and a field of its messages if any."""
+    """A channel of a bag, the role that it feeds, its topic, and the field to read if any."""
 
     channel: int
     role: Role
@@ -53,7 +53,7 @@ def decode_blocks(
 ) -> list[Block]:
     """
     Decode messages in their order; a block ends where the frame changes. `roles` lists the inputs
-    found in the whole bag. The reading of a field is kept as a Temperature message. Raises
+    found in the whole bag. The number of a field is kept in `raw` as a Temperature message. Raises
     RecordingError, without a path, if the bytes of a message do not fit its type.
     """
     roles = tuple(dict.fromkeys((*ROLES, *roles)))
@@ -77,10 +77,10 @@ def decode_blocks(
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
         if role == 'accel':
-            # Test quickly whether frame_id is constant.
+            # Comparing bytes is a fast test of whether frame_id is constant.
             text = frame.tobytes()
-            is_one = text == text[: frame.itemsize] * len(frame)
-            changes = [] if is_one else rank[1:][frame[1:] != frame[:-1]].tolist()
+            is_equal = text == text[: frame.itemsize] * len(frame)
+            changes = [] if is_equal else rank[1:][frame[1:] != frame[:-1]].tolist()
             if changes:
                 runs = (slice(*run) for run in pairwise([0, *changes, len(messages)]))
                 pieces = (messages.take(run) for run in runs)
@@ -106,7 +106,7 @@ def decode_blocks(
 
 
 def _as_temperatures(messages: Messages, stamp_ns: Ints, values: Floats) -> Messages:
-    """Replace the messages that hold readings by serialized Temperature messages."""
+    """Serialize readings as Temperature messages with the channels and log times of `messages`."""
     rows = encode_stamped(stamp_ns, '', N_NUMBERS[TEMPERATURE], [(0, values[:, None])])
     size = np.full(len(rows), rows.shape[1])
     begins = np.cumsum(size) - size
@@ -115,7 +115,7 @@ def _as_temperatures(messages: Messages, stamp_ns: Ints, values: Floats) -> Mess
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
     """
-    Decode messages of `kind`, a key of `N_NUMBERS` (a header and float64 numbers), to stamps,
+    Decode messages of `kind`, a key of `N_NUMBERS` (a header and k float64 numbers), to stamps,
     numbers, shape (n, k), and frames.
     """
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
@@ -162,15 +162,15 @@ def encode_stamped(
     stamp_ns: Ints, frame_id: str, n_numbers: int, pieces: Sequence[tuple[int, Floats]]
 ) -> Bytes:
     """
-    Serialize (CDR, little-endian) a header and float64 numbers, as rows of bytes, shape (n, size).
-    Each piece is a first column and its values, shape (n, width), or (width,) if equal in all
-    messages; other numbers are 0.
+    Serialize (CDR, little-endian) a header and float64 numbers as rows of bytes, shape (n, size).
+    Each piece is the place of its first number in the message, and values of shape (n, width), or
+    (width,) if equal in all messages; other numbers are 0.
     """
     text = frame_id.encode() + b'\0'
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text
     body = 4 + (len(head) + 3) // 8 * 8
     row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
-    # Write the common values to the template row, which is copied.
+    # Write values that are equal in all messages to the template row, which is then copied.
     for column, values in pieces:
         if values.ndim == 1:
             row[body:].view('<f8')[column : column + len(values)] = values

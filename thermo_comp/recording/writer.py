@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the writing of columns to a rosbag2 directory or a bare MCAP file, or block by block to a
-table in CSV or (extra ``parquet``) Parquet.
+table in CSV or Parquet (with the optional dependency ``parquet``).
 
-The target's name appears only when `BagWriter.close` has succeeded; if writing fails, an older
-file of this name stays.
+The file gets its name only when `BagWriter.close` succeeds; if writing fails, an older file of
+this name stays.
 """
 
 import csv
@@ -30,10 +30,10 @@ from .wire import encode_stamped
 
 STAMP_END_NS = 2**31 * 10**9  # upper limit of ROS stamps, exclusive [ns]
 _AUTO_FLUSH_BYTES = 1 << 26
-#: Format of a table by its suffix.
+#: Formats of tables by the suffix of the file.
 TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}
 WriteRows = Callable[[Mapping[str, NDArray[Any]]], None]
-#: Column of a message: index of its first number in the message, name, values, count of numbers.
+#: Field of a message: place of its first number, name, values of all messages, count of numbers.
 _Column = tuple[int, str, ArrayLike, int]
 
 
@@ -41,10 +41,10 @@ class BagWriter(AbstractContextManager['BagWriter']):
     """
     Write a bag, ``*.mcap`` or a rosbag2 directory; use it as a context manager.
 
-    Messages are buffered until 64 MiB or `flush`, and then merged in log-time order. An
-    `is_precious` bag that cannot be finished is kept. A killed process leaves a torn bag in a
-    hidden file beside the target. Raises OutputError if the bag may not or cannot be written;
-    ValueError for wrong shapes and for times outside the range of ROS stamps.
+    Messages are buffered until they have 64 MiB or `flush` is called, and then merged in log-time
+    order. If `is_precious`, a bag that cannot be finished is kept. A killed process leaves an
+    unfinished bag in a hidden file beside the target. Raises OutputError if the bag may not or
+    cannot be written; ValueError for wrong shapes and for times outside the range of ROS stamps.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         path: str | Path,
         *,
         compression: Compression = 'zstd',
-        # zstd's level -1 is a sixth faster than level 1, and a bag at most a few percent larger.
+        # zstd's level -1 writes a sixth faster than level 1; the bag is a few percent larger.
         level: int = -1,
         metadata: Mapping[str, str] | None = None,
         overwrite: bool = False,
@@ -79,7 +79,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         frame_id: str = '',
         log_ns: ArrayLike | None = None,
     ) -> None:
-        """Write geometry_msgs/Vector3Stamped: counts per cycle, shape (n, 3)."""
+        """Write geometry_msgs/Vector3Stamped messages: counts per cycle, shape (n, 3)."""
         column = (0, 'xyz', xyz, 3)
         self._write_stamped(topic, VECTOR3_STAMPED, stamp_ns, log_ns, frame_id, [column])
 
@@ -91,7 +91,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         log_ns: ArrayLike | None = None,
         frame_id: str = '',
     ) -> None:
-        """Write sensor_msgs/Temperature: degC, shape (n,), of unknown variance."""
+        """Write sensor_msgs/Temperature messages: degC, shape (n,), with unknown variance."""
         columns = [(0, 'celsius', np.reshape(celsius, (-1, 1)), 1)]
         self._write_stamped(topic, TEMPERATURE, stamp_ns, log_ns, frame_id, columns)
 
@@ -106,8 +106,8 @@ class BagWriter(AbstractContextManager['BagWriter']):
         log_ns: ArrayLike | None = None,
     ) -> None:
         """
-        Write sensor_msgs/Imu: m/s^2, shape (n, 3), with the covariance (n, 9) or (9,). Without
-        `imu` orientation and rate are marked as absent: their covariances begin with -1.
+        Write sensor_msgs/Imu messages: m/s^2, shape (n, 3), covariances of shape (n, 9) or (9,).
+        Without `imu`, orientation and rate are marked as absent: their covariances begin with -1.
         """
         columns: list[_Column] = [
             (25, 'linear_acceleration', linear_acceleration, 3),
@@ -119,7 +119,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         self._write_stamped(topic, IMU, stamp_ns, log_ns, frame_id, columns)
 
     def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
-        """Write std_msgs/Bool."""
+        """Write std_msgs/Bool messages."""
         rows = [b'\0\1\0\0' + bytes([flag]) for flag in np.asarray(values, np.bool_).tolist()]
         self.write_raw(topic, BOOL, log_ns, rows)
 
@@ -131,7 +131,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         messages: Sequence[bytes] | Messages,
         definition: tuple[str, str] | None = None,
     ) -> None:
-        """Write serialized (CDR) messages; a type that is not in Jazzy needs its `definition`."""
+        """Write serialized (CDR) messages; a type unknown to ROS 2 Jazzy needs a `definition`."""
         times = _as_times('log_ns', log_ns, len(messages))
         if not isinstance(messages, Messages):
             messages = Messages.of(messages, np.zeros(len(messages)), times)
@@ -145,7 +145,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 self._file.append(batches)
 
     def close(self) -> None:
-        """Finish the bag and rename it to its target; OutputError, and no output, on failure."""
+        """Finish the bag and rename it to the target; on failure raise OutputError, no output."""
         if self._file is None:
             return
         try:
@@ -165,7 +165,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise
 
     def abort(self) -> None:
-        """Drop the unfinished output; an older file of the target's name stays."""
+        """Delete the unfinished bag; an older file of the target's name stays."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):
@@ -174,7 +174,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             self._draft.drop()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Finish the bag, or drop it if the block raised."""
+        """Finish the bag, or abort if the `with` block raised an exception."""
         if kind is None:
             self.close()
         else:
@@ -238,7 +238,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
 
 def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
-    """Check a column of nanoseconds; ValueError unless the column is `n` integers, none < 0."""
+    """Return a column as int64 [ns]; ValueError unless it is `n` integers, none negative."""
     times = np.atleast_1d(values if np.size(values) else np.empty(0, np.int64))
     if times.dtype.kind not in 'iu' or times.ndim != 1:
         raise ValueError(f'`{name}` must be one row of integers, got {times.dtype}')
@@ -256,9 +256,8 @@ def table_writer(
 ) -> Iterator[WriteRows]:
     """
     Write a table in the format of its suffix (`TABLES`, else CSV); the file appears when complete.
-    Yields a function that takes columns by name, shape (n,), with the same names in each call; CSV
-    drops the metadata. OutputError if the table may not or cannot be written, or pyarrow is
-    missing.
+    Yields a function that appends columns by name, shape (n,), with the same names in each call.
+    CSV drops the metadata. OutputError if the table cannot be written, or pyarrow is missing.
     """
     kind = TABLES.get(Path(path).suffix, CSV)
     with drafted(path, kind, overwrite=overwrite) as partial, ExitStack() as stack:

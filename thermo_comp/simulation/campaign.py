@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the plan of a test: the chamber's program, ready-made or typed in, and the attitudes."""
+"""Owns the plan of a thermal test: the program of the chamber, and the attitudes of the unit."""
 
 import math
 import re
@@ -20,14 +20,13 @@ _STEP = re.compile(
 )
 _SECONDS = {'h': 3600.0, 'min': 60.0, 's': 1.0}
 _PROGRAMS = {
-    # A program with the temperature range and the style of the paper's Fig. 3: up, down and back,
-    # with long soaks.
+    # A program with the temperature range and the style of Fig. 3 of Golovach's paper: up, down
+    # and back, with long soaks.
     'paper': '20 60min, 35@0.5 90min, 20 60min, 5 90min, 20 60min, 35 60min',
     # A program of 4 h 20 min for one bag of a thermal test: the whole temperature range, ramps in
     # both directions.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
-    # The shortest program with the whole temperature range, ramps in both directions and short
-    # soaks.
+    # The shortest program from 5 to 35 degC: ramps in both directions and short soaks.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',
     # A program of 9.5 h for the chamber test of 18 positions: ramps of 0.3 to 1 K/min in both
     # directions.
@@ -37,33 +36,33 @@ _PROGRAMS = {
     'held-out': '12 40min, 31@0.35 45min, 17@0.9 30min, 26@0.6 50min, 7@0.7 60min, 22@0.25 40min',
     'slow': '20 60min, 35@0.1 60min, 5@0.2 60min, 20@0.15 60min',
     'fast': '20 45min, 35@3 75min, 5@2 90min, 25@1.5 75min, 10@3 60min',
-    # The program of the sample bags: both regimes, and ramps in both directions.
+    # The program of the sample bags: soaks, and ramps in both directions.
     'demo': '15 12min, 30@1 22min, 8@1.1 21min',
     'soak': '20 4h',
     # Soaks at three temperatures, long enough to settle, for runs on a centrifuge or a rate table.
     'three-soaks': '20 60min, 35@1 60min, 5@1 60min',
 }
 _FACES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
-# Edges of the cube: three that sum to 0, one per pair of axes; their opposites; other edges.
+# Edges of the cube: three edges that sum to 0, one per pair of axes; their opposites; other edges.
 _EDGES = [
     *[(1, 1, 0), (0, -1, 1), (-1, 0, -1), (-1, -1, 0), (0, 1, -1), (1, 0, 1)],
     *[(1, -1, 0), (0, 1, 1), (-1, 0, 1), (-1, 1, 0), (0, -1, -1), (1, 0, -1)],
 ]
-# Corners of the cube: the ends of three space diagonals first.
+# Corners of the cube, as pairs: the ends of the four space diagonals.
 _CORNERS = [
     *[(1, 1, 1), (-1, -1, -1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1), (1, -1, 1)],
     *[(-1, -1, 1), (1, 1, -1)],
 ]
-# Sd of the tilt about each transverse direction [deg]: the mounting block is not levelled.
+# Sd of the random tilt of an attitude about each direction across [deg], as without levelling.
 _SPREAD_DEG = 3.0
-# Attitudes of a test with three positions: each axis measures both signs of gravity.
+# Attitudes of the chamber part of 'tumble-3': each axis measures both signs of gravity.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# Runs at several rotation rates, times in s: ends of the soaks; time from the start of a run to
-# the end of the soak; time at each rate; time between rates.
+# Times [s] of runs through several rotation rates: ends of the soaks; from the start of a run to
+# the end of the soak; duration of each rate; duration of a change of rate.
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
 # Radius [m] and rotation rates [rad/s] of the simulated machines. Centrifuge: 1 m, 2 to 10 g
 # horizontally; rate table: 0.25 m, up to 1000 deg/s.
@@ -80,13 +79,13 @@ class Cyclogram:
 
     @property
     def duration_s(self) -> float:
-        """Duration of the program, s."""
+        """Duration of the program [s]."""
         return self.time_s[-1]
 
 
 def parse_cyclogram(text: str) -> Cyclogram:
     """
-    Read a program as a user types it, or the name of a ready-made program.
+    Read a program in the form below, or the name of a ready-made program.
 
     Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target in
     degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the
@@ -132,8 +131,8 @@ def positions(n: int, seed: int = 0) -> Floats:
     12, 18, 24 and 26 vectors sum to about 0. `seed` tilts each attitude by a small random angle.
     """
     if n == 9:
-        # The prism has three corners on the equator, and six between them at elevations of +-44
-        # degrees.
+        # The prism has three corners on the equator and, at azimuths between them, three corners
+        # each at elevations of +44 and -44 degrees.
         third = np.arange(3) * 2.0 * math.pi / 3.0
         ring = np.stack([np.cos(third), np.sin(third)], axis=1)
         height, radius = 0.7, math.sqrt(1.0 - 0.7**2)
@@ -173,16 +172,16 @@ class Position:
 def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
     Return the positions of a test in the order of their recording: 'chamber-18' (of 9.5 h each),
-    'chamber-9' (3 h), 'tumble' (18 of 20 min at room temperature), 'tumble-3', 'tumble-1'
-    ('tumble', then 3 or 1 of 3 h in the chamber), 'held-out' (3 with other ramps and attitudes),
-    'centrifuge' or 'rate-table' (12 mountings, each at 1 g and at four rates in three soaks).
-    `seed` determines the attitudes and the room temperature.
+    'chamber-9' (3 h each), 'tumble' (18 positions of 20 min at room temperature), 'tumble-3',
+    'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3 positions,
+    ramps and attitudes of no other plan), 'centrifuge' or 'rate-table' (12 mountings, each at 1 g
+    and at four rates in three soaks). `seed` determines the attitudes and the room temperature.
     """
     if name not in PLAN_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # 'held-out' has random attitudes without a vertical axis, unlike all other plans.
+        # In 'held-out' no axis is near the vertical or the horizontal, unlike in other plans.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name in ('centrifuge', 'rate-table'):

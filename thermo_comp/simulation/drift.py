@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the physics of the thermal errors: each effect belongs to a part of the unit, and is zero in
-the steady state in which the board's thermometer shows the reference temperature.
+Owns the physics of the thermal errors: each effect belongs to parts of the unit, and is zero in
+the reference state, the steady state in which the board is at the reference temperature.
 """
 
 from abc import ABC, abstractmethod
@@ -27,8 +27,8 @@ def triple(values: Floats) -> Triple:
 @dataclass(frozen=True, eq=False)
 class PartHistory:
     """
-    Temperatures of the parts on a uniform grid of `step` seconds: deviations from the reference's
-    steady state [K], shape (m, n_parts), and the temperatures in the steady state [degC].
+    Temperatures of the parts on a uniform grid of `step` seconds: deviations from the reference
+    state [K], shape (m, n_parts), and the temperatures in the reference state [degC].
     """
 
     nodes: tuple[str, ...]
@@ -37,17 +37,17 @@ class PartHistory:
     step: float
 
     def of(self, part: str) -> Floats:
-        """Return a part's temperature deviation from the reference's steady state [K], (m,)."""
+        """Return the temperature of a part less that in the reference state [K], shape (m,)."""
         return self.deviation[:, self.nodes.index(part)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effect(ABC):
     """
-    The base class of the causes of thermal errors. Two signals, `first` and `second`, change the
-    bias of each axis by ``bias * first + bias_curvature * second``, the scale likewise.
+    Base class of the causes of thermal errors. Two signals, `first` and `second`, change the bias
+    of each axis by ``bias * first + bias_curvature * second``, and the scale likewise.
 
-    Bias changes in ug and scale changes in ppm per unit of the first and the second signal.
+    Coefficients of the bias are in ug, those of the scale in ppm, per unit of the signal.
     """
 
     scale: Triple = ZERO
@@ -70,7 +70,7 @@ class Effect(ABC):
 class PartEffect(Effect):
     """
     Tempco of a part, or stress or thermo-EMF between two parts. The first signal is the deviation
-    of `part` less that of `cold` [K], the second signal the difference of their squares.
+    of `part` less that of `cold` [K], the second signal the difference of the squares.
     """
 
     part: str
@@ -87,13 +87,13 @@ class PartEffect(Effect):
 @dataclass(frozen=True)
 class FlowEffect(Effect):
     """
-    Effect of a heat flow in either direction, less its effect in the reference's steady state.
+    Effect of a heat flow between two parts in either direction, less that in the reference state.
 
     With ``x = |T_hot - T_cold| / knee`` the first signal is ``x ** exponent`` times the deviation
     of `cold` to the `power`. The exponent is 1.25 for convection in a gap, 1 for the load of a
     heat pump, 2 for the losses of a heat pump. If `is_limited`, as by the supply of a heat pump,
     ``x ** exponent / (1 + x ** exponent)`` replaces ``x ** exponent``.
-    The second signal is the first times the deviation of `cold`.
+    The second signal is the first signal times the deviation of `cold`.
     """
 
     hot: str
@@ -116,15 +116,14 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Slow relaxation in a part: the effect follows a fast temperature change [K], then decays."""
+    """Creep in a part: the signal follows a fast temperature change [K], then decays slowly."""
 
     part: str
     time_constant: float
 
     def _signals(self, history: PartHistory) -> tuple[Floats, float]:
         d = history.of(self.part)
-        # First-order lag, in steady state at the start, of an input that is linear between grid
-        # points.
+        # First-order lag, steady at the start, of an input that is linear between grid points.
         kept = np.exp(-history.step / self.time_constant)
         new = 1.0 - self.time_constant / history.step * (1.0 - kept)
         lagged = lfilter([new, 1.0 - kept - new], [1.0, -kept], d - d[0]) + d[0]

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the thermal network and its solution: lumped parts, conductances, self-heating, thermostat.
+Owns the thermal network of a unit (lumped parts, heat paths, thermostat) and its solution.
 
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
-parts, then the thermostat's integral; `u` is the air temperature; `p` is constant. Between the
-knots of the air temperature the solution is linear plus decaying modes. The nonlinear part of
-convection, beyond its conductance at 1 K, is held constant for a second.
+parts, then the integral of the thermostat's controller; `u` is the air temperature; `p` is
+constant. Between the knots of the air temperature the solution is linear plus decaying modes. The
+nonlinear part of convection, beyond its conductance at 1 K, is held constant for a second.
 """
 
 from collections.abc import Mapping
@@ -24,9 +24,9 @@ _STEP_S = 1.0  # time step over which convection is held constant [s]
 @dataclass(frozen=True)
 class Link:
     """
-    Heat path between two parts, or a part and the chamber's air, `AIR`; conductance in W/K (at 1
-    K). The flow is proportional to the temperature difference to the power `exponent`, 1.25 for
-    free convection.
+    Heat path between two parts, or a part and the chamber's air, `AIR`; conductance in W/K at a
+    temperature difference of 1 K. The flow is proportional to the temperature difference to the
+    power `exponent`, 1.25 for free convection.
     """
 
     a: str
@@ -37,9 +37,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Thermostat:
-    """
-    Heater of a part: up to `max_power` W, PI control to `set_point` [degC], gains W/K, W/(K s).
-    """
+    """Heater of a part, up to `max_power` [W]; PI gains [W/K], [W/(K s)]; `set_point` [degC]."""
 
     node: str
     set_point: float
@@ -50,7 +48,7 @@ class Thermostat:
 
 @dataclass(frozen=True)
 class ThermalNetwork:
-    """Parts by heat capacity [J/K], heat paths between parts, dissipation of parts [W]."""
+    """Heat capacities of parts [J/K], heat paths between parts, dissipation in parts [W]."""
 
     capacity: Mapping[str, float] = field(hash=False)
     links: tuple[Link, ...]
@@ -64,7 +62,7 @@ class ThermalNetwork:
 
     @property
     def is_convective(self) -> bool:
-        """Whether the flow of any path is nonlinear."""
+        """Whether the heat flow of any path is nonlinear."""
         return any(link.exponent != 1.0 for link in self.links)
 
     @property
@@ -72,9 +70,7 @@ class ThermalNetwork:
         return {AIR: -1, **{name: i for i, name in enumerate(self.nodes)}}
 
     def system(self) -> tuple[Floats, Floats, Floats]:
-        """
-        Return A, b, p of ``dx/dt = A x + b u + p``, shapes (k, k), (k,), (k,), for exponents of 1.
-        """
+        """Return A, b, p of ``dx/dt = A x + b u + p`` with all exponents 1; A has shape (k, k)."""
         n, index = len(self.nodes), self._places
         size = n + (self.thermostat is not None)
         both, p = np.zeros((size + 1, size + 1)), np.zeros(size)
@@ -100,7 +96,7 @@ class ThermalNetwork:
         return A, b, p
 
     def convection(self, state: Floats, air: float) -> Floats:
-        """Return the part of ``dx/dt`` due to exponents other than 1, for a state, shape (k,)."""
+        """Return the part of ``dx/dt`` due to exponents other than 1, in a state, shape (k,)."""
         index, at = self._places, np.append(state, air)
         flow = np.zeros(len(at))
         for link in self.links:
@@ -112,7 +108,7 @@ class ThermalNetwork:
         return flow[:-1]
 
     def settled(self, air: float, power: Floats | None = None) -> Floats:
-        """Return the network's state after an endless soak under constant powers, shape (k,)."""
+        """Return the state after an endless soak, shape (k,); `power` replaces p of `system`."""
         A, b, p = self.system()
         drive = p if power is None else power
         state = np.linalg.solve(A, -b * air - drive)
@@ -142,7 +138,7 @@ class ThermalNetwork:
 
 class ThermalResponse:
     """
-    Temperatures of a thermal network over a chamber program, at any time.
+    Temperatures of a thermal network at any time of a chamber program.
 
     `air` are the chamber's temperatures at the knots `time` [s], shape (m,); `power` is the
     dissipation between the knots in addition to the constant powers [W], shape (m - 1, n_parts).
@@ -178,15 +174,14 @@ class ThermalResponse:
         self._rate, self._modes = rate, modes
 
         length = np.diff(self._time)
-        # Linear part alpha + beta (t - t_knot) of each interval, and each mode at the interval's
-        # start.
+        # Per interval: the linear part alpha + beta (t - t_knot), and the modes at the start.
         self._beta = -(np.diff(air) / length)[:, None] * (inverse @ b)
         self._alpha = (self._beta - np.outer(air[:-1], b) - drive) @ inverse.T
         self._amplitude = np.empty((len(length), len(rate)), dtype=complex)
         state = network.settled(air[0], drive[0])
         before = network.convection(state, air[0])
         for k, lasts in enumerate(length):
-            # Mean convection of the next interval, from the last two values (Adams-Bashforth).
+            # Extrapolate the mean convection of this interval from two values (Adams-Bashforth).
             now = network.convection(state, air[k])
             self._alpha[k] -= inverse @ (1.5 * now - 0.5 * before)
             self._amplitude[k] = unmix @ (state - self._alpha[k])

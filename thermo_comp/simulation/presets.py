@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the ready-made units: three instruments, and the unit of the sample bags."""
+"""Owns the ready-made simulated units: three instruments, and the unit of the sample bags."""
 
 import math
 from collections.abc import Iterable
@@ -79,8 +79,7 @@ class Specimen:
 
     def triad(self, network: ThermalNetwork, drift: Iterable[Effect], **others: Any) -> UnitModel:
         """Return a triad of bare sensor heads on a board, with random constants."""
-        # Noise of 3 ug/sqrt(Hz) and the converter's rounding at 4 Hz give 60 s means an sd of 0.65
-        # ug.
+        # At 4 Hz, noise of 3 ug/sqrt(Hz) and rounding give means over 60 s an sd of 0.65 ug.
         noise: dict[str, Any] = {'noise_density': (3.0, 3.0, 3.0), 'full_scale_g': 9.975}
         return self.unit(network, tuple(drift), bias_ug=1500.0, **noise, **others)
 
@@ -183,7 +182,7 @@ def _mems(draw: Specimen) -> UnitModel:
 
 def _demo(draw: Specimen) -> UnitModel:
     """Draw the sample unit: tempcos on the board, `loads`, and a sensor head that lags."""
-    # The time constants are short, because the unit must settle in the soaks of the sample bags.
+    # The thermal time constants are short: the unit must settle in the soaks of the sample bags.
     board_tau, tau = 0.25 * draw.between(400.0, 900.0), draw.between(500.0, 1500.0)
     capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}
     links = [*draw.links((AIR, 'case', 4.0)), Link('case', 'board', 0.4)]
@@ -210,8 +209,8 @@ def tempcos(draw: Specimen) -> dict[str, Any]:
 
 def loads(draw: Specimen) -> list[Effect]:
     """
-    Draw the paper's effect: while the ambient temperature changes, bias and scale have another
-    offset, slope and curvature than in a soak, as with a heat pump at the limit of its supply.
+    Draw the effect of Golovach's paper: while the ambient temperature changes, bias and scale have
+    another offset, slope and curvature than in a soak, as by a heat pump at its supply limit.
     """
     knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
     sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))
@@ -240,7 +239,7 @@ def unit_preset(name: str, seed: int = 0) -> UnitModel:
 
     'thermostatted' (quartz triad in an oven, the converter's board outside: the board's drift
     dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates), 'mems', or 'demo'
-    (the unit of the sample bags: the paper's physics, and a lag).
+    (the unit of the sample bags: the physics of Golovach's paper, and a lag).
     """
     if name not in UNIT_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(UNIT_NAMES)}, got {name!r}')

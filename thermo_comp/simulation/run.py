@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a simulated run: a unit in a chamber over a program, whole or in blocks, and the truth."""
+"""Owns the simulation of a unit in a chamber over a program, whole or in blocks, with truth."""
 
 import math
 import sys
@@ -29,12 +29,12 @@ _GRID_S = 1.0  # step of the thermal grid [s]; bias and scale are linear between
 @dataclass(frozen=True, eq=False)
 class Truth:
     """
-    The true bias, scale and force of a run, on the thermal grid (m points) and at the
-    accelerometer's n cycles.
+    The true bias, scale and force of a run, on the thermal grid (m points) and in the n conversion
+    cycles of the accelerometer.
 
-    Bias is in counts per cycle (`rate_bias`: rad/s), scale is relative; `bias_grid` includes the
-    random walk, which no model predicts. `cycle_s` are the middles of the cycles; `specific_force`
-    is constant, shape (3,), or in a rotation that of each cycle, shape (n, 3).
+    Bias is in counts per cycle (`rate_bias`: rad/s), scale is relative; `bias_grid` is
+    `thermal_bias` plus a random walk. `cycle_s` are the middles of the cycles; `specific_force` is
+    constant, shape (3,), or in a rotation the force in each cycle, shape (n, 3).
     """
 
     unit: UnitModel
@@ -71,8 +71,9 @@ class Truth:
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
     """
-    The data that a recorder would store, and the truth: ends and counts of the conversion cycles,
-    readings [degC], and for a unit with a gyroscope the mean angular rate per cycle [rad/s].
+    The data that a recorder would store, and the truth. The data are the ends and counts of the
+    conversion cycles, readings of the thermometers [degC], and the angular rate in each cycle
+    [rad/s] of a unit with a gyroscope.
     """
 
     accel_stamp_ns: Ints
@@ -93,9 +94,7 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
 def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
-    """
-    Run a unit through a test in memory; each position has a separate seed, and stamps from 0.
-    """
+    """Simulate all positions of a test in memory, each with another seed and stamps from 0."""
     return [
         simulate(
             unit,
@@ -126,7 +125,7 @@ def simulate_blocks(
     """
     Run a unit through a program in bounded memory; the result does not depend on the block size.
 
-    A temperature reading is in the block of the cycles around the reading, or in the last block.
+    A temperature reading is in the block that spans its stamp, or else in the last block.
     `up` is the direction of the specific force without `spin`; K [counts/cycle] does not depend on
     `rate_hz`. `seed` determines all random numbers of the run.
     """
@@ -143,11 +142,11 @@ def simulate_blocks(
             f'{1.0 / rate_hz:g} s'
         )
     direction = np.asarray(up, dtype=float)
-    # Only a load that switches at random times makes the temperatures random.
+    # The temperatures depend on the seed only if a load switches at random times.
     truth = _thermal_truth(unit, cyclogram, seed if unit.load else 0)
     truth = replace(
         truth,
-        bias_grid=truth.thermal_bias + _walk(unit, truth.grid_s, seed),
+        bias_grid=truth.thermal_bias + _random_walk(unit, truth.grid_s, seed),
         specific_force=gravity * (direction / np.linalg.norm(direction)),
     )
     read = unit
@@ -168,7 +167,7 @@ def _blocks(
     seed: int,
     start_ns: int,
 ) -> Iterator[SimulatedRun]:
-    """Yield a run by blocks; `cycles`: numbers of cycles in all, per block, and per second."""
+    """Yield a run in blocks; `cycles`: number of all cycles, cycles per block, and per second."""
     unit, (n_cycles, block_size, rate_hz) = truth.unit, cycles
     K = np.array(unit.scale_factor)
     to_axes = np.asarray(np.linalg.inv(unit.M), np.float64)
@@ -186,7 +185,7 @@ def _blocks(
         if spin is not None:
             force = spin.forces(truth.specific_force, part.cycle_s)
             part = replace(part, specific_force=force)
-        # Eqs. (2), (8) and (9) of the paper
+        # Eqs. (2), (8) and (9) of Golovach's paper.
         s = _along_axes(part, to_axes)
         charge = part.bias + K * part.scale * s + noise_sd * noise(len(cycle))
         counts, remainder = unit.converter(charge, remainder)
@@ -210,9 +209,7 @@ def _blocks(
 
 
 def _along_axes(part: Truth, to_axes: Floats) -> Floats:
-    """
-    Return the force along the sensitivity axes plus the nonlinear part of the axes' readings.
-    """
+    """Return the force along the sensitivity axes plus the nonlinear terms of the axes."""
     s: Floats = np.zeros(3)
     for j in range(3):
         s = s + part.specific_force[..., j, None] * to_axes[:, j]
@@ -246,16 +243,14 @@ def _thermal_truth(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
-    """
-    Return the knots including the switching times of a load, and the load's state between knots.
-    """
+    """Return the knots with switching times of a load, and whether the load is on after each."""
     n = 2 + int(knots[-1] // load.spell[0])
     flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
     fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))
     return fine, np.searchsorted(flips, fine[:-1], side='right') % 2 == 1
 
 
-def _walk(unit: UnitModel, grid: Floats, seed: int) -> Floats:
+def _random_walk(unit: UnitModel, grid: Floats, seed: int) -> Floats:
     """Return the random walk of the bias [counts/cycle]."""
     steps = white(seed, Stream.BIAS_WALK)(len(grid) - 1)
     per_step = np.array(unit.bias_walk) * math.sqrt(grid[1] / 3600.0)

@@ -25,7 +25,7 @@ class Bend:
     per_kelvin: float = 0.0
 
     def added(self, force: Floats, t: Floats) -> Floats:
-        """Return the nonlinear part of readings, (n, 3) [m/s^2], at t [K] from the reference."""
+        """Return the nonlinear terms [m/s^2], shape (n, 3), at t [K] from the reference."""
         f = force / STANDARD_GRAVITY
         terms = np.array(self.square) * f**2 + np.array(self.cube) * f**3
         return np.asarray(MICRO_G * (1.0 + self.per_kelvin * t)[:, None] * terms)
@@ -64,9 +64,7 @@ class Spin:
 def steps(
     begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """
-    Return the knots of runs that begin at given times: times at constant rates, and ramps between.
-    """
+    """Return times and rates of runs that begin at given times: constant rates, and ramps."""
     time, rate = [0.0], [0.0]
     for begin in begins_s:
         now = begin

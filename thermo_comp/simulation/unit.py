@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulated instrument: converter, thermometers, gyroscope, random streams."""
+"""Owns the simulated unit: converter, thermometers, gyroscope, streams of random numbers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .network import ThermalNetwork, ThermalResponse
 from .spin import Bend
 
 _NS = 1_000_000_000
-REFERENCE_C = 20.0  # board temperature at which K and bias are stated, in a soak [degC]
+REFERENCE_C = 20.0  # board temperature in a soak for which K and bias are stated [degC]
 _RANGE = -(1 << 15), (1 << 15) - 1  # range of the converter's output [counts]
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
@@ -52,14 +52,12 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
-    """
-    Return the random generator of a source, for an axis or other number, at the stream's start.
-    """
+    """Return the random generator of a source, at the start of the stream of an axis or number."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
 
 
 def white(seed: int, stream: Stream) -> Callable[[int], Floats]:
-    """Return a function that gives the next n random numbers of each axis, shape (n, 3)."""
+    """Return a function that draws the next n normal numbers of each axis, shape (n, 3)."""
     axes = [generator(seed, stream, axis) for axis in range(3)]
     return lambda n: np.stack([axis.standard_normal(n) for axis in axes], axis=1)
 
@@ -81,7 +79,7 @@ def balanced(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
     counts = np.empty(charge.shape, dtype=np.int32)
     for first in range(0, len(charge), _ROWS):
         rows = charge[first : first + _ROWS]
-        # Eq. (1) of the paper: the output is whole counts, and the fraction is added to the
+        # Eq. (1) of Golovach's paper: the output is whole counts, and the fraction is added to the
         # next cycle.
         whole = np.floor(rows)
         fraction = np.rint((rows - whole) * _ONE).astype(np.int64)
@@ -114,7 +112,7 @@ class ThermometerModel:
     def read(
         self, response: ThermalResponse, duration: float, seed: int, noise: Stream
     ) -> tuple[Ints, Floats]:
-        """Take the readings [degC] of a run, with their stamps [ns] from its start."""
+        """Return the stamps of readings, from the start of the run [ns], and readings [degC]."""
         n = math.floor(duration * self.rate_hz * (1.0 + 1e-12) - self.phase) + 1
         stamp_ns = np.rint((np.arange(max(n, 0)) + self.phase) * (_NS / self.rate_hz))
         time = stamp_ns / _NS
@@ -129,8 +127,8 @@ class ThermometerModel:
 @dataclass(frozen=True)
 class GyroModel:
     """
-    The gyroscope of a unit at rest, with scale 1, in mdeg/s instead of ug; `turn_on` is the
-    standard deviation of the bias from run to run.
+    The gyroscope of a unit, with a scale of 1. Its drift has the unit mdeg/s instead of ug;
+    `turn_on` is the standard deviation of the bias from run to run [mdeg/s].
     """
 
     drift: tuple[Effect, ...]
@@ -139,7 +137,7 @@ class GyroModel:
     turn_on: float
 
     def bias(self, history: PartHistory) -> Floats:
-        """Return the bias on the thermal grid, rad/s, shape (m, 3)."""
+        """Return the bias on the thermal grid [rad/s], shape (m, 3)."""
         drift, _ = drift_of(self.drift, history)
         return np.asarray((drift + np.array(self.bias_at_reference)) * MILLIDEGREE)
 
@@ -153,7 +151,7 @@ class GyroModel:
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """Electronics that heat a part with `power` [W] in random intervals [s], initially off."""
+    """Electronics that heat a part with `power` [W], off and on for random times [s]."""
 
     part: str
     power: float
@@ -165,9 +163,10 @@ class UnitModel:
     """
     A physical unit with all its constants: the truth that a calibration estimates.
 
-    Per axis, ``counts = K * scale(T) * s + bias(T) + noise`` summed into whole counts, where ``s =
+    Per axis, ``counts = K * scale(T) * s + bias(T) + noise``, converted to whole counts; ``s =
     inverse(M) @ f`` is the specific force along the sensitivity axes, plus the nonlinear `bend`.
-    K [counts/cycle per m/s^2] and bias [counts/cycle] are those at the reference temperature.
+    `scale_factor` K [counts/cycle per m/s^2] and bias [counts/cycle] hold at the reference
+    temperature.
     `noise_density` is in ug/sqrt(Hz): the mean over T seconds has the standard deviation
     ``noise_density / sqrt(T)``; `bias_walk` is in ug/sqrt(h).
     """
@@ -189,7 +188,7 @@ class UnitModel:
 
     @property
     def counts_per_micro_g(self) -> Floats:
-        """Counts per cycle of one micro-g, by axis, shape (3,)."""
+        """Counts per cycle for a micro-g, by axis, shape (3,)."""
         return np.array(self.scale_factor) * MICRO_G
 
     @property
@@ -199,11 +198,11 @@ class UnitModel:
 
     @property
     def origin(self) -> Floats:
-        """Temperatures [degC] of the parts in the reference's steady state, shape (n_parts,)."""
+        """Temperatures [degC] of the parts in the reference state, shape (n_parts,)."""
         air = self.network.air_for(self.board.node, REFERENCE_C)
         return self.network.equilibrium(air)
 
     def with_thermometers(self, **changes: Any) -> UnitModel:
-        """Return the unit with changed thermometers, with the same changes on board and case."""
+        """Return the unit with the same changes of its thermometers on board and case."""
         board, case = (replace(sensor, **changes) for sensor in (self.board, self.case))
         return replace(self, board=board, case=case)

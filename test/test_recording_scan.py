@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Records are found with and without an index as by a plain loop, whatever the bytes are."""
+"""Messages of a chunk are found, with and without an index, as by a plain loop over records."""
 
 import struct
 
@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.recording.chunks import locate, walk
+from thermo_comp.recording.chunks import locate, scan_records
 
 MESSAGE, CHANNEL = 5, 4
 
@@ -84,7 +84,7 @@ def test_a_scan_equals_the_plain_loop_and_a_false_index_changes_nothing(data, cu
     wanted, wanted_others, wanted_end = one_by_one(torn)
     if all(log_ns < 2**63 for _, _, _, log_ns in wanted):
         others = []
-        messages, reason = walk(
+        messages, reason = scan_records(
             np.frombuffer(torn, np.uint8), lambda _, content: others.append(content)
         )
         # The message before a record of zeros may end in zeros that do not belong to the message.

@@ -1,6 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the effect of coloured noise on cells at rest: spread of their variance and roughness."""
+"""
+Owns the limits of a cell's variance and roughness at rest, if a low pass has coloured the noise.
+
+A cell is a run of about 0.5 s of samples; its roughness is half the mean square change from sample
+to sample, which equals the variance for white noise.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +20,20 @@ if TYPE_CHECKING:
 
 # Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
 _TENTH, _NEVER = -1.2816, 6.7
-# Ratio of the degrees of freedom to those of white noise, below which noise is coloured; smallest
-# number of degrees of freedom of a cell; number of iterations in `spread_of_variances`, and of
-# candidates in `roughest_at_rest`.
+# Noise is coloured if a cell's degrees of freedom are below this share of those of white noise;
+# smallest number of degrees of freedom of a cell; number of iterations in `spread_of_variances`
+# and of trial values in `roughest_at_rest`.
 _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 
 
 def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats:
     """
-    Return the spread of the variances of cells at rest relative to white noise, per axis.
+    Return the spread of the variances of cells at rest, relative to white noise, per axis: the
+    ratio of the 1 - 1e-11 quantile to the 0.1 quantile, divided by this ratio for white noise.
 
-    After a low pass a cell has few independent samples. With a correlation r of successive samples
-    the effective number of samples is (1 - r) / (1 + r) times their number, and the roughness is
-    1 - r times the mean variance. The mean variance follows from the tenth percentile `level` and
-    the effective number of samples.
+    With a correlation r of successive samples the effective number of samples is (1 - r) / (1 + r)
+    times their number, and the roughness is 1 - r times the mean variance. The mean variance
+    follows from the tenth percentile `level` of the variances and the effective number of samples.
     """
     n_free = float(np.median(cells.count[plausible])) - 1.0
     quiet = plausible & (cells.variance <= level).any(axis=1)
@@ -50,8 +55,8 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
     Return the largest roughness of a cell at rest, per axis; infinite for white noise.
 
     Coloured noise hides a step in a cell's mean and variance, but not in the changes from sample
-    to sample. The spread of the roughness follows from its tenth percentile and its median, for a
-    chi-square distribution.
+    to sample. The roughness is taken as chi-square distributed, with the degrees of freedom that
+    give the ratio of its tenth percentile to its median.
     """
     result = np.full(3, np.inf)
     for axis in np.flatnonzero(is_coloured) if quiet.any() else ():
@@ -68,6 +73,6 @@ def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: floa
 
 
 def _quantile(n_free: float, sigmas: float) -> float:
-    """Quantile of a chi-square variance / its mean (approximation of Wilson and Hilferty)."""
+    """Return a quantile of chi-square / degrees of freedom (Wilson and Hilferty); 0.0: median."""
     width = 2.0 / (9.0 * n_free)
     return float((1.0 - width + sigmas * np.sqrt(width)) ** 3)
