@@ -64,6 +64,8 @@ def factored_with_prior(information: Floats, precision: Floats) -> Floats:
     places = np.diag_indices(len(information))
     hessian = information.copy()
     hessian[places] += precision
+    if not np.all(hessian[places] > 0.0):
+        raise np.linalg.LinAlgError('rounding errors exceed the information about an unknown')
     try:
         return factored(hessian)
     except np.linalg.LinAlgError:

@@ -118,6 +118,8 @@ def _updated(
         # One lag state with the variance of the node's prior (a ratio of 1) is added, so that the
         # states of a single bag cannot make `start_variance_ratio` very small.
         gamma = float(determined[layout.start].sum())
+        if gamma <= -1.0:
+            raise np.linalg.LinAlgError('rounding errors exceed the information about lag states')
         start_ratio = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
         changes.append(float(np.abs(np.log(start_ratio / prior.start_variance_ratio))) / 4.0)
     sigma = white_noise(regression, posterior)

@@ -170,24 +170,27 @@ def _initial_prior(
     least = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), least)
     noise = _noise_in_1_hz(windows, start.scale)
+    # Without noise, the means of a position have an error by rounding, as by a mounting offset.
+    roundings = [interval.rounding_sd / start.scale for _, interval in windows.rests]
+    rounding_sd = float(np.sqrt(np.mean(np.square(roundings))))
     misalignment_sd = misalignment_scale(noise)
     prior = Prior(
         bias_sd=np.full(3, BIAS_SD),
         scale_sd=SCALE_SD,
         misalignment_sd=misalignment_sd,
         column_sd=np.zeros((2, len(data.groups))),
-        offset_sd=least,
+        offset_sd=max(least, rounding_sd),
         sigma=np.full(3, sigma),
         # The three axes of a sensor have similar scale factors: the mean of the prior is their
         # geometric mean.
         scale_mean=np.exp(np.mean(np.log(start.scale))) / start.scale,
-        offset_scale=_mounting_scale(noise),
+        offset_scale=max(_mounting_scale(noise), 3.0 * rounding_sd),
         misalignment_scale=misalignment_sd,
     )
     if data.forces is not None:
         prior = replace(prior, nonlinear_sd=starting_sd(data.forces, options))
     if options.mounting_sd is not None:
-        sd = options.mounting_sd
+        sd = float(np.hypot(options.mounting_sd, rounding_sd))
         prior = replace(prior, offset_sd=sd, turn_on_sd=sd, offset_scale=0.0)
     return prior
 

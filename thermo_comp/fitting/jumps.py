@@ -77,23 +77,17 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
         if after.start_ns - before.end_ns <= longest_ns and up @ other > np.cos(np.radians(10.0))
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
+    # Samples that are equal at rest have at least the error of rounding.
+    rounding_sd = np.median([interval.rounding_sd for interval in bag.intervals], axis=0)
+    quiet_sd = np.maximum(quiet_sd, np.maximum(rounding_sd, 1e-9))
     beside = _beside_gaps(bag, gaps, [margin_s] * len(gaps))
-    if beside and not quiet_sd.all():
-        # Samples that are equal at rest have at least the error of rounding.
-        quiet_sd = np.maximum(quiet_sd, [_rounding_sd(axis) for axis in np.vstack(beside).T[1:4]])
     # If the noise is correlated, the level beside a gap is a mean over more than `margin_s`.
     margins = [max(_margin(part, quiet_sd), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)
-    jumps = (_examine(part, gap, quiet_sd, bag) for part, gap in zip(beside, gaps, strict=True))
+    sds = quiet_sd, rounding_sd
+    jumps = (_examine(part, gap, *sds, bag) for part, gap in zip(beside, gaps, strict=True))
     return tuple(jump for jump in jumps if jump is not None)
-
-
-def _rounding_sd(values: Floats) -> float:
-    """Return the sd by the rounding of samples, shape (n,), to their smallest change."""
-    changes = np.abs(np.diff(values))
-    least = np.min(changes[changes > 0.0], initial=np.inf)
-    return float(least / 12.0**0.5) if np.isfinite(least) else 1e-9
 
 
 def _beside_gaps(
@@ -122,7 +116,11 @@ def _margin(samples: Floats, quiet_sd: Floats) -> float:
 
 
 def _examine(
-    samples: Floats, gap: tuple[float, float], quiet_sd: Floats, bag: ReducedBag
+    samples: Floats,
+    gap: tuple[float, float],
+    quiet_sd: Floats,
+    rounding_sd: Floats,
+    bag: ReducedBag,
 ) -> Jump | None:
     """Return the jump in the samples beside a gap between two rests, or None for no jump."""
     time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
@@ -134,14 +132,19 @@ def _examine(
     # A step, unlike a shock, which decays, also changes the mean level of the quiet samples.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     lasting_sd = quiet_sd * relative_sd * _correlation(residual, quiet_sd)
+    # Both levels beside a step are rounded.
+    by_rounding = 2.0**0.5 * rounding_sd
+    lasting_sd = np.hypot(lasting_sd, by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
     # With correlated noise the scatter within a cell underestimates the noise of means.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
-    step_sd = sd * relative_sd * _correlation(residual, sd)
+    step_sd = np.hypot(sd * relative_sd * _correlation(residual, sd), by_rounding)
     if r:
         # At least half of the step must remain in the mean level, and the change of the mean level
         # must exceed four standard deviations of this change.
-        is_step = (np.abs(step) > _STEP_SDS * step_sd) & (lasting / step > 0.5)
+        is_step = (np.abs(step) > _STEP_SDS * step_sd) & (
+            lasting * np.sign(step) > 0.5 * np.abs(step)
+        )
         is_step &= np.abs(lasting) > 4.0 * lasting_sd
     else:
         is_step = np.abs(lasting) > _STEP_SDS * lasting_sd

@@ -56,6 +56,8 @@ class StillInterval:
     n_whole: number of windows of full length; a shorter window may follow
     time, count, mean: mean time [s], number and mean of the samples of each window
     sample_sd: median over the cells of the standard deviation of single samples, shape (3,)
+    rounding_sd: sd of the error of the mean by the converter's rounding, which noise below half of
+        a step does not average out, shape (3,)
     angular_rate: mean rate of each window [rad/s], or None if a part of the bag has no rate
     """
 
@@ -68,6 +70,7 @@ class StillInterval:
     mean: Floats
     sample_sd: Floats
     angular_rate: Floats | None = None
+    rounding_sd: Floats = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True)
@@ -403,6 +406,7 @@ def _windows(
     # A last window with less than 90 % of the usual samples is not of full length: the bag ended.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
+    variance = np.median(cells.variance[rows], axis=0)
     return StillInterval(
         start_ns=cells.start_ns + round(cells.time[lower] * 1e9),
         end_ns=cells.start_ns + round(cells.time[upper - 1] * 1e9),
@@ -411,6 +415,19 @@ def _windows(
         time=np.add.reduceat(cells.time[rows] * count, offsets) / total,
         count=total,
         mean=block_means(cells.mean[rows], count, offsets),
-        sample_sd=np.sqrt(np.median(cells.variance[rows], axis=0)),
+        sample_sd=np.sqrt(variance),
+        rounding_sd=_rounding_sd(variance, cells.quantum),
         angular_rate=block_means(cells.rate[rows], count, offsets) if has_rate else None,
     )
+
+
+def _rounding_sd(variance: Floats, quantum: Floats) -> Floats:
+    """
+    Return the sd of the error of a mean by rounding to a converter's steps, shape (3,).
+
+    `variance`: of the rounded samples. Gaussian noise of sd s, in steps, reduces the error of a
+    mean by the factor exp(-2 pi^2 s^2), the characteristic function at one cycle per step.
+    """
+    noise = np.maximum(variance - quantum**2 / 12.0, 0.0)
+    share = np.divide(noise, quantum**2, where=quantum > 0.0, out=np.zeros(3))
+    return np.asarray(quantum / 12.0**0.5 * np.exp(-2.0 * np.pi**2 * share))

@@ -200,7 +200,7 @@ class Point:
         n = self.layout.n_unit
         information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
         if not np.isfinite(information).all():
-            raise np.linalg.LinAlgError('the information matrix is not finite')
+            raise np.linalg.LinAlgError('the information about the unit is not finite')
         if self.prior.informative is None:
             precision = self.precision[:n]
             factor = factored_with_prior(information, precision)

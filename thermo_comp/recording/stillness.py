@@ -141,10 +141,13 @@ class CellAccumulator:
             self._begin(stamp_ns, samples)
             self._sums = [np.empty((0, 15 if rate is None else 21))]
         self._last_ns = int(stamp_ns[-1])
-        if self._n_looked_at < _QUANTUM_SAMPLES:
-            quantum = _quantum_of(samples[: _QUANTUM_SAMPLES - self._n_looked_at])
-            self._quantum = np.where(self._quantum > 0.0, self._quantum, quantum)
-            self._n_looked_at += len(samples)
+        for first in range(0, len(samples), _QUANTUM_SAMPLES):
+            # Samples that are equal to the sample before do not show the quantum.
+            if self._n_looked_at >= _QUANTUM_SAMPLES:
+                break
+            part = samples[first : first + _QUANTUM_SAMPLES - self._n_looked_at]
+            self._quantum = np.where(self._quantum > 0.0, self._quantum, _quantum_of(part))
+            self._n_looked_at += int((part[1:] != part[:-1]).any(axis=1).sum()) + 1
         if self._is_integer:
             self._is_integer = bool((samples == np.rint(samples)).all())
         rate = None if rate is None else rate[use]
@@ -177,10 +180,12 @@ class CellAccumulator:
             x[:, 3:] if x.shape[1] > 3 else np.zeros((len(x), 3)) for x in (mean, variance)
         )
         cell_s = self._cell_ns * 1e-9
+        # Whole numbers have a quantum of 1 at least, also on an axis that does not change.
+        quantum = np.maximum(self._quantum, float(self._is_integer))
         return Cells(
             *(self._start_ns, self._last_ns or self._start_ns, cell_s),
             *(self._n_dropped, self._n_saturated, self._n_glitches, self._n_repeated),
-            *(self._is_integer, self._quantum, self._middle),
+            *(self._is_integer, quantum, self._middle),
             *(sums[:, 2] / count + index * cell_s, count.astype(np.int64), index),
             *(mean[:, :3] + self._shift, variance[:, :3], sums[:, -3:] / pairs),
             sums[:, -6:-3],
@@ -262,7 +267,8 @@ def _quantum_of(samples: Floats) -> Floats:
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
         changes = np.sort(changes[changes > 0.0])
-        if not len(changes):
+        # One change or two may be turns of the unit.
+        if len(changes) < 3:
             continue
         # Changes by the same multiple of the quantum differ by rounding only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
