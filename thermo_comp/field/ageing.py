@@ -91,7 +91,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return the rows' derivatives by levels (n, 6), gravity (n, 1) or curve slopes (n, 3)."""
+        """Return derivatives w.r.t. levels (n, 6), gravity (n, 1) or curve slopes (n, 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -400,8 +400,9 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     """
     Condition the parameters of the calibration on the rests.
 
-    `to_file`, `bend`: derivatives of the file's parameters by the six levels, (n_parameters, 6),
-    and by the bias slope of each axis, (n_parameters, 3). `ahead`: days of use after the last rest
+    `to_file`, `bend`: derivatives of the file's parameters w.r.t. the six levels,
+    (n_parameters, 6), and w.r.t. the bias slope of each axis, (n_parameters, 3).
+    `ahead`: days of use after the last rest
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

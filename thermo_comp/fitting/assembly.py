@@ -297,7 +297,7 @@ def file_jacobian(
     kinds: Sequence[Kind] = (),
 ) -> Floats:
     """
-    Return the derivatives of the file's parameters by the regression's parameters.
+    Return the derivatives of the file's parameters w.r.t. the regression's parameters.
 
     `used`: response columns in the file; `kinds`: nonlinear terms in the file
     """

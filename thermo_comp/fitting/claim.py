@@ -48,7 +48,7 @@ class Claim:
     """
     The published uncertainty of a unit.
 
-    layout: places of the unknowns of the fit and of the columns in the covariance alone
+    layout: indices of the unknowns of the fit and of the columns in the covariance alone
     covariance: of the unit's own unknowns, shape (n_unit, n_unit)
     offset_sd: sd of the bias offset of a new mounting or turn-on [m/s^2]
     """
@@ -193,7 +193,7 @@ def _widened(
     # The curve of the positions' means is an alternative to a curve that the drifts of a warm-up
     # determine, because a warm-up heats the board in another way than a chamber does.
     other = _with_curve(regression, state, of_means)
-    # Columns that only the curve of the means has get a place in the covariance by an sd of 1e-9.
+    # Columns that only the curve of the means has get rows in the covariance, with an sd of 1e-9.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)

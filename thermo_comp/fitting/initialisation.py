@@ -247,7 +247,7 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
-    # Bounds of the prior's scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer
+    # Bounds of the prior's scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer
     # MEMS; the tail of the Student prior allows for more. For almost no noise the lower bound of
     # the prior's scale is below 30 ug, because an offset 1e6 times as large as the noise cannot be
     # estimated in double precision.

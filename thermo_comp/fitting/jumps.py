@@ -32,7 +32,7 @@ from .sources import angular_velocity
 _MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
 # Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8
-# Smallest significant ratio of a step to the sd of the step; the search over the place of a step
+# Smallest significant ratio of a step to the sd of the step; the search over the time of a step
 # reaches a ratio of about 5 by chance.
 _STEP_SDS = 8.0
 
@@ -172,8 +172,8 @@ def _examine(
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
     """Return the ratio of the sd of a mean to that under white noise of `sd`, at least 1, (3,)."""
-    # The variance of the means of 40 pieces is multiplied by (1 + r) / (1 - r), r being the lag-1
-    # correlation of the means.
+    # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
+    # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
     n = len(residual) // size
     means = residual[: n * size].reshape(n, size, 3).mean(axis=1)
@@ -200,7 +200,7 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
     """
     Find the first sample after a step, and the lag-1 correlation of the noise.
 
-    The place of the step and the correlation are estimated in turn, three times. Noise with a
+    The time of the step and the correlation are estimated in turn, three times. Noise with a
     lag-1 correlation of 0.4 or less counts as white. The correlation is limited to 0.999, because
     noise of a larger correlation is a random walk.
     """

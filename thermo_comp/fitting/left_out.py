@@ -315,8 +315,8 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
 
 def _is_determined(by_others: float, by_all: float) -> bool:
     """
-    Whether the variance of a position's norm or drift by a fit without the position is below ten
-    times the variance by the fit of all positions, including mounting offset and noise.
+    Whether the variance of a position's norm or drift in a fit without the position is below ten
+    times the variance in the fit of all positions, including mounting offset and noise.
     """
     return by_others < 10.0 * by_all
 

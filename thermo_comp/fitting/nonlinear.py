@@ -65,7 +65,7 @@ class Forces:
         return np.asarray(np.hypot(self.still, spin) * (1.0 + stretch.sum(axis=1)))
 
     def by_radius(self, radius: Floats) -> Floats:
-        """Differentiate the logarithm of |f| by the relative error of the radius."""
+        """Differentiate the logarithm of |f| w.r.t. the relative error of the radius."""
         spin = self.spin * (1.0 + radius.sum())
         return np.asarray(self.spin * spin / (self.still**2 + spin**2))
 

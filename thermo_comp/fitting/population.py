@@ -147,8 +147,8 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
 
 def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     """
-    Return the deviations, multiplied so that each kind of parameter, such as a slope of the bias,
-    has the same scatter on all axes on which any unit has it. The scatter is that of a future unit
+    Scale the deviations so that a kind of parameter, such as a slope of the bias, has the same
+    scatter on all axes that have nonzero deviations. The scatter is that of a future unit
     by Student's distribution [2]_, because three units can be alike by chance.
     """
     size = deviations.shape[1]

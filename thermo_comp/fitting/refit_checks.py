@@ -34,7 +34,7 @@ _FEWEST_NORMS = 6
 _TILT_GAIN = 0.3
 SLOW_TILTS = advice(
     'tilt',
-    'left-out norms are smaller if the supports may tilt from hour to hour: each hour of a rest '
+    'left-out |f| - g is smaller if the supports may tilt from hour to hour: each hour of a rest '
     'was fitted with its own attitude',
 )
 

@@ -145,7 +145,7 @@ class Point:
 
     @property
     def norm_by_axes(self) -> Floats:
-        """Derivatives of the norm of each position by the readings, shape (n_positions, 3)."""
+        """Derivatives of the norm of each position w.r.t. the readings, shape (n_positions, 3)."""
         return np.asarray(self.state.up @ np.linalg.inv(self.state.inverse) / self.state.kappa)
 
     @cached_property
@@ -184,8 +184,8 @@ class Point:
 
     def by_offset(self, axis: int) -> Floats:
         """
-        Return the derivatives of the unit's unknowns by the prior mean of a bias offset that all
-        positions share, shape (n_unit,).
+        Return the derivatives of the unit's unknowns w.r.t. the prior mean of a bias offset that
+        all positions share, shape (n_unit,).
         """
         deviation = self.deviation.copy()
         deviation[self.layout.offset[:, axis]] -= 1.0

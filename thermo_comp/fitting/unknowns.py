@@ -51,7 +51,7 @@ class Windows:
     kelvins: temperature change that corresponds to the RMS of each column [K], 0 for a constant
         column, shape (m,)
     lag: number of the lag of each column; -1 for none, shape (m,)
-    start: derivative of each column by the initial state of its lag, shape (n, m)
+    start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: columns that the scale may have as well as the bias, shape (m,)
     tilt: temperatures with which a support may tilt, divided by their RMS, shape (n, k)

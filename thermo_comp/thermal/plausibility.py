@@ -69,7 +69,7 @@ class Fault(Enum):
     #: A reading that changed faster than any part of a unit can: it is not used.
     STEP = 'jumped'
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
-    #: as by a loose thermometer: its readings are used, with a larger variance.
+    #: as with a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
 
 

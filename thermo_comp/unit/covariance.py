@@ -43,7 +43,7 @@ _TERMS: Final = [
     [(i, j) for i, j in combinations_with_replacement(range(4), 2) if i < first and j < second]
     for first, second in combinations_with_replacement((2, 3, 4), 2)
 ]
-#: Number of coefficients of all six elements, and the places of the constants of xx, yy, zz.
+#: Number of coefficients of all six elements, and the indices of the constants of xx, yy, zz.
 N_COEFFICIENTS: Final = sum(map(len, _TERMS))
 CONSTANTS: Final = tuple(sum(map(len, _TERMS[:element])) for element in (0, 3, 5))
 

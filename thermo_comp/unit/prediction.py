@@ -79,16 +79,16 @@ class SlowUncertainty:
 
     def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         """
-        Differentiate bias [input units] and scale [relative] by the unknown initial lag states, as
-        variables of unit variance, shape (n_unknown, 6, n). `rates`: largest known rate of the
-        board temperature since the start, (n,) [K/s].
+        Differentiate bias [input units] and scale [relative] w.r.t. the unknown initial lag
+        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: largest known
+        rate of the board temperature since the start, (n,) [K/s].
         """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # After a start in a ramp, a part was behind the board by at most the lag in a long ramp at
-        # the largest rate since the start, and by at most the span of the calibrated temperatures.
+        # If the unit was started in a ramp, a part's lag at the start was at most the lag in a
+        # long ramp at the largest rate since then, and at most the calibrated temperature span.
         behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
