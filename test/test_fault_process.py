@@ -195,7 +195,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     assert len(heard.force) == n_samples
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
-    # By noise one sample in a million has an error above 5 sd, so the limit is 6 sd.
+    # Due to noise one sample in a million has an error above 5 sd, so the limit is 6 sd.
     assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
 
 

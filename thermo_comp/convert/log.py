@@ -237,7 +237,7 @@ def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
 
 
 def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
-    """Leave out impossible temperatures, as -127 degC of a DS18B20 without contact; count them."""
+    """Leave out and count impossible temperatures, like -127 degC of a DS18B20 without contact."""
     low, high = PLAUSIBLE_CELSIUS
     kept, n = {}, 0
     for name, readings in log.temperatures.items():

@@ -124,7 +124,7 @@ class Rows:
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives by a jump of the levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
+        """Derivatives w.r.t. a jump of levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
@@ -363,7 +363,7 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
 
 def _log_bayes_factor(precision: Floats, gradient: Floats, sd: float) -> float:
     """
-    Return the gain in log evidence by a change of prior sd `sd`, marginal over all other unknowns.
+    Return the gain in log evidence from a change of prior sd `sd`, marginal over other unknowns.
     """
     inner = np.eye(len(gradient)) + sd**2 * precision
     gain = 0.5 * sd**2 * gradient @ np.linalg.solve(inner, gradient)
@@ -373,12 +373,12 @@ def _log_bayes_factor(precision: Floats, gradient: Floats, sd: float) -> float:
 @dataclass(frozen=True)
 class Solution:
     """
-    Change of the calibration file's parameters by the rests, with covariances of the parameters.
+    Change of the calibration file's parameters due to the rests, with the covariances.
 
     shift: change of the parameters
     prior, posterior: covariances at the time of the last rest, without and with use of the rests
     future: covariance that is added during the time of use after the last rest
-    gains, innovations: the shift is ``gains.T @ innovations``; the shift by the first rows alone
+    gains, innovations: the shift is ``gains.T @ innovations``; the shift due to the first rows
         is the sum over these rows
     gravity: jumps of gravity, each with its size and the sd of the size [m/s^2]
     """

@@ -319,7 +319,7 @@ def _uncertainty(
     x: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """
-    Return the variance of |f| by thermometers and regime, (n,), the variance of |f| that the
+    Return the variance of |f| due to thermometers and regime, (n,), the variance of |f| that the
     calibration claims, (n,), and the sd of the lack of fit of each axis, (n, 3).
     """
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))

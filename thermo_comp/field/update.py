@@ -133,7 +133,7 @@ def update(
     n_starts = int(series.start.max()) + 1
     if n_starts < 3:
         raise FitError(
-            f'the logs hold rests of {counted(n_starts, "start")} of the node, need 3 at least: '
+            f'the logs hold rests of {counted(n_starts, "start")} of the node, need at least 3: '
             'each start has a bias offset, and the update is judged on left-out starts'
         )
     _, aged, is_update = valid_since(calibration)
@@ -280,7 +280,7 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
 
 
 def _gravity_part(series: Series, solution: Solution) -> Floats:
-    """Return the part of ``|f| - g`` by jumps of gravity."""
+    """Return the part of ``|f| - g`` due to jumps of gravity."""
     time = means_by(series.start, series.time)[series.start]
     result = np.zeros(len(series))
     for change, size, _ in solution.gravity:

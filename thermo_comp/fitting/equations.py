@@ -121,7 +121,7 @@ class Equations(Series):
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
         """
-        Assign a place to every unknown; return one `Layout` object for equal arguments.
+        Assign an index to every unknown; return one `Layout` object for equal arguments.
 
         `used`: active columns of bias and scale, shape (2, m); `nonlinear`: active nonlinear
         coefficients, shape (2 k,); None for all
@@ -213,7 +213,7 @@ class Equations(Series):
         self, state: State, layout: Layout, base: Base, scaled: int
     ) -> tuple[Ints, Floats | float]:
         """
-        Return place and factor of the series of each active nonlinear coefficient, see `Tangent`.
+        Return index and factor of the series of each active nonlinear coefficient, see `Tangent`.
 
         The relative change of the scale factor multiplies the terms at the reference temperature,
         but not the terms' change per kelvin: the product of both changes is negligible.

@@ -176,7 +176,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, +-2 at most."""
+    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, at most +-2."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend

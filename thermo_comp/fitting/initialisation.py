@@ -266,7 +266,7 @@ def _candidates(
     """
     Return the columns that may take part, with the typical and largest sd of their weights.
 
-    `is_bench`: whether one attitude of several was heated, see `rests`
+    `is_bench`: whether only one of several attitudes was heated, see `rests`
     """
     data = windows.data
     groups = np.array(data.groups)
@@ -296,7 +296,7 @@ def _candidates(
 
 
 def _steepest(n_directions: int) -> Floats:
-    """Return the largest prior sd of slopes of bias and scale by the number of attitudes, (2,)."""
+    """Return the largest prior sd of slopes of bias and scale, given the number of attitudes."""
     # In two to eight attitudes the prior sd of the scale factor's slope is halved, because a tilt
     # of the support explains a drift that the scale factor of a nearly level axis explains only by
     # a slope of several hundred ppm/K.

@@ -90,7 +90,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
 
 
 def _rounding_sd(values: Floats) -> float:
-    """Return the sd by the rounding of samples, shape (n,), to their smallest change."""
+    """Return the sd of the rounding of samples, shape (n,), to their smallest change."""
     changes = np.abs(np.diff(values))
     least = np.min(changes[changes > 0.0], initial=np.inf)
     return float(least / 12.0**0.5) if np.isfinite(least) else 1e-9
@@ -148,7 +148,7 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # The noise by differences of neighbouring samples does not depend on the drift.
+    # The noise from differences of neighbouring samples does not depend on the drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))

@@ -135,7 +135,7 @@ def lay_out(
     has_turn_ons: bool = False,
 ) -> Layout:
     """
-    Assign a place to every unknown, given the active columns of bias and scale, shape (2, m), and
+    Assign an index to every unknown, given the active columns of bias and scale, shape (2, m), and
     the active nonlinear coefficients, shape (2 k,).
     """
     n = 0

@@ -178,7 +178,7 @@ def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
 
 def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
-    Return the gain by a model if the gain exceeds its standard errors, else 0.
+    Return the gain of a model if the gain exceeds its standard errors, else 0.
 
     The gain is the sum of the log gains of the drift of positions and of sections. If the drifts
     of both models are equal, the gain is the log gain of the norms of left-out positions, which

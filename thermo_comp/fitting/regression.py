@@ -150,7 +150,7 @@ class Point:
 
     @cached_property
     def norms_by_unit(self) -> Floats:
-        """Derivatives of each position's mean norm by the unit's unknowns, (n_positions, n)."""
+        """Derivatives of positions' mean norms w.r.t. the unit's unknowns, (n_positions, n)."""
         regression, state, layout = self.regression, self.state, self.layout
         products = regression.products(layout.used)
         at_state = regression.at_starts(products.means[:, None], state, products.base)
@@ -333,7 +333,7 @@ class Regression(Equations):
         base = self.products(layout.used).base
         columns, at = np.unique(column, return_inverse=True)
         of_columns, with_base = self.products_of(columns, base, state)
-        # Derivatives of the reading by a column's contribution to the bias, and to the scale.
+        # Derivatives of the reading w.r.t. a column's contribution to the bias, and to the scale.
         acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
         acts /= sigma
         rows = point.tangent.of(self.at_starts(with_base, state, base))[:, :, at]

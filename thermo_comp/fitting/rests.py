@@ -30,7 +30,7 @@ def is_constant(windows: ThermalWindows, part: Ints) -> bool:
 
 
 def is_bench(windows: ThermalWindows, up: Floats) -> bool:
-    """Whether one attitude of several shows an effect of temperature; `up`: attitudes, (n, 3)."""
+    """Whether only one of several attitudes shows a temperature effect; `up`: attitudes."""
     n_heated = len(distinct_directions(up[_is_heated(windows)]))
     return n_heated == 1 and len(distinct_directions(up)) > 1
 

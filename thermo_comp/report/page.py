@@ -117,12 +117,12 @@ def render_report(
 
 
 def position_error(bias: float, time: float) -> float:
-    """Return the position error [m] by a constant horizontal error [m/s^2] after a time [s]."""
+    """Return the position error [m] of a constant horizontal error [m/s^2] after a time [s]."""
     return 0.5 * bias * time * time
 
 
 def schuler_peak(bias: float) -> float:
-    """Return the largest position error [m] by a constant bias, 2 R b / g, after 42 minutes."""
+    """Return the largest position error [m] of a constant bias, 2 R b / g, after 42 minutes."""
     return 2.0 * _EARTH_RADIUS * bias / STANDARD_GRAVITY
 
 

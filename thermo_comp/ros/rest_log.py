@@ -28,7 +28,7 @@ from .reader import LoadedCalibration
 
 #: Number of messages in a summed block; a block is shorter if a report is due earlier.
 BLOCK = 1024
-#: Largest size of the file of a day, and of the folder [bytes]; a month takes 10 MB at most.
+#: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 #: Size up to which the file of a day is not thinned to bound the size of the folder [bytes].
 _UNTHINNED_BYTES = 16_000

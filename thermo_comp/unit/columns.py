@@ -134,7 +134,7 @@ class Column:
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],
-        'Range to which the value is limited, before the factors by `power` and `during`.',
+        'Range to which the value is limited, before the factors for `power` and `during`.',
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:

@@ -96,7 +96,7 @@ class Curves:
     @cached_property
     def _basis_slopes(self) -> list[list[list[Floats]]]:
         """
-        Derivatives of each function's slope, at both ends of its range, by free coefficients.
+        Derivatives of each function's slope, at both ends, w.r.t. its free coefficients.
         """
         rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [

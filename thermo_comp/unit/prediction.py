@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns predictions for a thermal state: the slowly varying error covariance (by the parameters, and
-by lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
+Owns predictions for a thermal state: the slowly varying error covariance (due to the parameters,
+and to lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
@@ -29,7 +29,7 @@ _CHUNK: Final = 64
 
 
 class SlowUncertainty:
-    """Error covariance of a thermal state by the posterior and the unknown initial lag states."""
+    """Error covariance of a thermal state due to the posterior and unknown initial lag states."""
 
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
@@ -137,8 +137,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Return the variance of the bias by the parameters at thermal states (n, width), and that of
-        the difference of the bias from its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
+        Return the variance of the bias due to the parameters at thermal states (n, width), and
+        of the difference of the bias from its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -235,7 +235,7 @@ def ramp_states(
 ) -> Floats:
     """
     Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s];
-    the gradient by self-heating is that of a soak.
+    the gradient of self-heating is that of a soak.
     """
     layout = Layout(memory_of_unit(calibration))
     states = np.zeros((len(temperature), layout.width))
