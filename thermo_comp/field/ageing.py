@@ -276,7 +276,7 @@ def learn(
     Estimate the ageing model by evidence, without starts that contradict all other starts.
 
     At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
-    of the node is left out if one of its rows is more than 5 sd from the prediction by all other
+    of the node is left out if one of its rows is more than 5 sd from the prediction of all other
     rows. Returns the variances, the model of all rows, and the rests used.
     """
     centre = usual(calibration)
