@@ -10,7 +10,7 @@ days: bias walk 15 ug and scale walk 10 ppm per root day, turn-on 20 ug, one sho
 unit. On several days the calibration is updated with all rests so far, as in `thermo_comp update`,
 and judged on the rests of the next day. At the end the errors of the calibration are compared with
 those of a Kalman filter that is given the process and the time of the shock. With --recordings
-FOLDER, the real recordings in FOLDER are cut into parts, and an update by all parts so far is
+FOLDER, the real recordings in FOLDER are cut into parts, and an update with all parts so far is
 judged on the next part.
 """
 

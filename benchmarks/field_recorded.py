@@ -5,7 +5,7 @@ Owns updates on real recordings, for the benchmark `field.py`.
 
 No recording spans days, so each is cut into parts: a fit of the first part replaces the
 calibration of a laboratory, and each further part counts as a start of the node. On each part, an
-update by all earlier parts is compared with the fit of the first part.
+update with all earlier parts is compared with the fit of the first part.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 """
 Owns the cost of a fleet: scaling with workers, overhead of the scheduler, network, lost results.
 
-Units are simulated and written to bags once (``--folder`` keeps them), and fitted as by the
-command `fleet fit`. Workers are processes of one thread, as in `fleet fit`.
+Units are simulated and written to bags once (``--folder`` keeps them), and fitted as in
+the command `fleet fit`. Workers are processes of one thread, as in `fleet fit`.
 
     python benchmarks/fleet.py scaling              strong and weak scaling, 1 and 2 workers
     python benchmarks/fleet.py overhead             500 small units; estimate for 100 workers

@@ -1,18 +1,17 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the position errors of an inertial navigator by accelerometer drift, raw and compensated.
+Owns the position errors of an inertial navigator due to accelerometer drift, raw and compensated.
 
 The unit of the held-out bag stands still in the chamber, so any computed motion is an error. The
 navigator levels for five minutes, then navigates freely for half an hour; or it gets a
 zero-velocity update (ZUPT) every minute for 25 minutes, and then coasts for five minutes. A flight
 of each kind begins in every minute of the bag, with raw samples, with samples corrected by a cubic
-for both regimes, and with samples compensated as by the node.
+for both regimes, and with samples compensated as in the node.
 
 The gyroscopes are ideal and the Earth does not rotate, so that all errors are of the
-accelerometer; the height is kept constant, as by a barometer. The filter estimates four errors per
-level axis, of
-position p, velocity v, tilt a and accelerometer b, as in [1]_ chapter 12::
+accelerometer; the height is kept constant, as with a barometer. The filter estimates four errors
+per level axis, of position p, velocity v, tilt a and accelerometer b, as in [1]_ chapter 12::
 
     p' = v      v' = b - g a      a' = v / R      b' = -b / tau + noise
 

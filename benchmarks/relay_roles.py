@@ -184,7 +184,7 @@ def _floor(arguments: argparse.Namespace) -> None:
         Vector3Stamped, 'accel/counts', print, _qos(arguments.reliability), raw=True
     )
     take, publish = subscription.handle.take_message, publisher.handle.publish_raw
-    # All frame_ids have the same length, so the values have the same place in every message.
+    # All frame_ids have the same length, so the values have the same position in every message.
     head, frame = COUNTS.size - 24, bytearray(COUNTS.size - 24 + 37 * 8)
     with subscription.handle, node.context.handle:
         wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)

@@ -7,8 +7,8 @@ Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md,
 ``python benchmarks/second_simulator.py --kinds own,even --plans wide --seeds 1``.
 
 Air, case, board, three heads and their pendulums are nodes of a thermal network, integrated in
-steps of 2 s; by self-heating the board is warmer than the case. Bias and scale are functions of
-the pendulums' temperatures. Samples have 1 Hz and 5 ug of noise, readings of thermometers 0.5 Hz
+steps of 2 s; self-heating makes the board warmer than the case. Bias and scale are functions
+of the pendulums' temperatures. Samples have 1 Hz and 5 ug of noise, thermometer readings 0.5 Hz
 and 5 mK. Three runs are held out, with attitudes, ramps, order of ramps and temperature of the
 first soak other than in the runs of the fit.
 """

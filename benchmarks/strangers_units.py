@@ -85,7 +85,7 @@ class Unit:
     density : float
         White noise [ug/sqrt(Hz)].
     flicker : float
-        Floor of the Allan deviation by flicker noise [ug].
+        Floor of the Allan deviation due to flicker noise [ug].
     reading_sd, reading_step, reading_s : float
         Noise [K], rounding [K] and interval [s] of the thermometers.
     thermometer_s : float

@@ -104,7 +104,7 @@ def test_signalling_nan_survives_the_byte_swap():
 
 
 def test_frame_ids_of_several_lengths_in_one_stream():
-    # WHY: the place of numbers in a message depends on the length of the driver's frame_id.
+    # WHY: the position of numbers in a message depends on the length of the driver's frame_id.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))

@@ -205,7 +205,7 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
     ('heading', 'times', 'reason'),
     [
         ('time [min]', [k / 600 for k in range(900)], r"'time \[min\]' is in min: the times must"),
-        ('time', [k // 10 for k in range(900)], "'time' has the time of the row before in 90%"),
+        ('time', [k // 10 for k in range(900)], "'time' has the same time as the row before"),
         ('date', [46110 + k / 864000 for k in range(900)], 'no plausible interval of samples'),
         ('time', list(range(900, 0, -1)), "'time' is not a rising time"),
         # WHY: dates not of ISO 8601 gave the message that no row has numbers in the stamp column.

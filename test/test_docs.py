@@ -86,7 +86,7 @@ def test_every_page_is_in_the_site_s_menu():
 
 
 def test_rows_of_tables_have_as_many_cells_as_their_head():
-    # WHY: a bar in a cell, as of |f|, began a further cell.
+    # WHY: a bar in a cell, such as in |f|, began a further cell.
     for page in PAGES:
         text = re.sub(FENCE, '', page.read_text(encoding='utf-8'))
         for table in re.findall(r'^\|.*\n(?:\|.*\n)+', text, re.MULTILINE):

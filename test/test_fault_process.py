@@ -176,7 +176,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
         asked = [ask() for _ in range(20)]
         begin, n, n_samples = time.monotonic(), 0, 0
         while len(answers) < n_reloads and n < len(events):
-            # Samples are sent in real time, as by a driver.
+            # Samples are sent in real time, as a driver does.
             while n < len(events) and seconds_of(events[n][1]) < time.monotonic() - begin:
                 n_samples += node.send([events[n]])
                 n += 1
@@ -195,7 +195,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     assert len(heard.force) == n_samples
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
-    # By noise one sample in a million has an error above 5 sd, so the limit is 6 sd.
+    # Due to noise one sample in a million has an error above 5 sd, so the limit is 6 sd.
     assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
 
 

@@ -291,7 +291,7 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
     # WHY: positions of one recording share a turn-on; the claimed bias sd was 1/6 of the error.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # `least`: sd of turn-ons by the prior, for noise of 0.02 m/s^2 at 100 Hz, or as stated.
+    # `least`: sd of turn-ons in the prior, for noise of 0.02 m/s^2 at 100 Hz, or as stated.
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration

@@ -189,7 +189,7 @@ def test_the_residual_of_the_fit_is_reported():
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
         # Temperatures of another clock, an hour late: residual 878 ug left out, raw 692 ug.
-        ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out positions exceed the raw residual'),
+        ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out residuals exceed the raw residual'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
         # WHY: noise, a span of 0.3 K, and different turn-ons each gave false advice.
         ((1.1, 1.0, 0.1, 1.0, 0.3), 'residual', '1.1 ug RMS raw'),

@@ -67,7 +67,7 @@ def table(rng, k2=0.0, kq=0.0, k3=0.0, *, share=0.01, radius_sd=0.0, radius_erro
 
 
 def chosen(rng, **terms):
-    """Fit windows of a centrifuge; return the fit, the chosen terms, and their sd by kind."""
+    """Fit windows of a centrifuge; return the fit, the chosen terms, and the sd of each kind."""
     truth, regression, state = table(rng, **terms)
     prior = prior_of(truth, (), nonlinear_sd=starting_sd(regression.forces, OPTIONS))
     posterior = regression.solve(state, prior, n_steps=12)

@@ -159,7 +159,7 @@ def test_an_interrupted_fleet_run_continues(client, tmp_path):
         fit_fleet(str(fleet), out, OPTIONS, client=client, progress=stop)
     assert not (out / 'fleet.csv').exists()
     assert len(list(out.rglob('result.json'))) == 1
-    # The result file of unit A/u0 is cut off, as by a power failure.
+    # The result file of unit A/u0 is cut off, as after a power failure.
     (out / 'units/A/u0').mkdir(parents=True, exist_ok=True)
     (out / 'units/A/u0/result.json').write_text('{"format": 1,')
     result = fit_fleet(str(fleet), out, OPTIONS, client=client)

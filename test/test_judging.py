@@ -453,6 +453,6 @@ def test_accelerations_of_an_option_are_read_with_their_unit(text, micro_g):
 @pytest.mark.parametrize(
     'text', ['', '100', 'ug', '-1ug', '1 parsec', '1e999ug', '0mg', '1.2.3mg']
 )
-def test_accelerations_without_sense_are_refused(text):
+def test_impossible_accelerations_are_refused(text):
     with pytest.raises(ValueError, match='expected a positive number with its unit, like 100ug'):
         parse_acceleration(text)

@@ -183,7 +183,7 @@ def test_bags_that_only_warm_up_predict_a_cool_down():
 
 
 @pytest.mark.slow
-def test_a_noisy_sensor_in_one_warm_up():
+def test_a_noisy_sensor_in_one_warm_up_shows_its_lags():
     # WHY: with a spline of 60 nodes a fitted lag was twice the true lag, and the error 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)

@@ -180,9 +180,7 @@ def test_play_refuses_a_negative_rate_and_an_absent_bag(tmp_path, rng):
         play(tmp_path / 'none')
 
 
-def test_a_subscriber_that_takes_nothing_is_not_waited_for_without_end(
-    peer, tmp_path, rng, monkeypatch
-):
+def test_the_wait_for_a_subscriber_that_takes_nothing_ends(peer, tmp_path, rng, monkeypatch):
     # The middleware accepts 5000 messages and then refuses further messages.
     with BagWriter(tmp_path / 'bag') as writer:
         stamps = START_NS + np.arange(8000) * CYCLE_NS

@@ -283,7 +283,7 @@ def test_the_command_names_the_nonlinear_terms_that_a_prior_leaves_out(cli, tmp_
     for unit, path in zip((first, *others), paths, strict=True):
         save_calibration(unit, path)
     printed = cli('prior', *paths, '-o', tmp_path / 'type.yaml').stdout
-    assert f'leaves out the nonlinear terms (K2, K3) of {first.unit.serial}\n' in printed
+    assert f'leaves out the nonlinear terms K2, K3 of units {first.unit.serial}\n' in printed
     assert load_calibration(tmp_path / 'type.yaml').nonlinearity is None
 
 

@@ -80,7 +80,7 @@ def test_a_message_an_hour_is_no_recording(tmp_path):
 def test_thermometers_of_another_time_zone_are_named(tmp_path, zone_s, n):
     # WHY: `replay` silently corrected samples with the temperatures of another hour.
     true_ns = START_NS + STEP_NS * np.arange(n)
-    text = f'board readings are stamped {zone_s:+} s from the samples around them: are the stamps'
+    text = f'board readings are stamped {zone_s:+} s from the samples around them: do the stamps'
     with suppress(RecordingError):
         blocks_of(tmp_path / 'bag.mcap', true_ns, true_ns[:: n // 100] + zone_s * 10**9)
     survey = survey_recording(tmp_path / 'bag.mcap')

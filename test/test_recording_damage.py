@@ -305,5 +305,5 @@ def test_a_changed_number_is_found_by_the_checksum(tmp_path):
     changed[position + length - 3] ^= 1
     path = tmp_path / 'bag.mcap'
     path.write_bytes(changed)
-    with pytest.raises(RecordingError, match='checksum does not fit'):
+    with pytest.raises(RecordingError, match='checksum does not match'):
         read(path)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a chunk are found, with and without an index, as by a plain loop over records."""
+"""Messages of a chunk are found, with and without an index, equal those of a plain loop."""
 
 import struct
 

@@ -150,7 +150,7 @@ def test_the_area_of_a_ring_is_proportional_to_the_residual_of_its_position():
      (-4.2e-5, '0.000'), (302.992252, '303'), (9.99, '9.99'), (999.6, '1000'),
      (3.2e10, '3.20e+10'), (float('nan'), '–')],
 )  # fmt: skip
-def test_numbers_are_spelt_for_readers(value, text):
+def test_numbers_have_three_to_four_digits(value, text):
     assert number(value) == text
 
 

@@ -92,7 +92,7 @@ def ramp(tracker):
     return np.array(weights)
 
 
-def test_cross_over_moves_linearly_over_the_transition_time():
+def test_the_dynamic_weight_is_linear_over_the_transition_time():
     tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(transition_time_s=20.0))
     weights = ramp(tracker)
     steps = np.diff(weights)

@@ -235,7 +235,7 @@ def fit(
     RecordingError
         If a file cannot be read.
     FitError
-        If the data do not suffice for a fit, or gravity does not occur on Earth.
+        If the data do not suffice for a fit, or `gravity` is outside the range on Earth.
 
     """
     from .convert.readers import as_bags

@@ -28,10 +28,10 @@ _REST_S = 10.0
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of cells, already searched, that are searched again for the start of a rest.
 _LOOKED_BACK = 200
-# Sd of the mean force in a position by hysteresis, mounting and drift, however long the rest [g].
+# Sd of the mean force in a position due to hysteresis, mounting, drift, however long the rest [g].
 _FLOOR_SD = 2e-5
-# A rest is 'restless' if its noise exceeds this multiple of the median over all rests. A still
-# interval whose noise exceeds the second multiple of that of earlier rests is a unit held by hand.
+# A rest is 'restless' if its noise exceeds this multiple of the median over all rests. A unit
+# is held by hand if a still interval has more noise than the second multiple of earlier rests.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9

@@ -27,7 +27,7 @@ _FINDINGS = {
     'impossible': 'temperatures left out, below -90 or above 200 degC',
     'continued': 'rows at which a 32-bit time overflowed to 0, times continued',
     'backwards': 'rows with an earlier time than the row before, kept',
-    'repeated': 'rows with the time of the row before, kept',
+    'repeated': 'rows with the same time as the row before, kept',
 }
 # Largest parameter file [bytes]; all parameters of a vehicle are about 60 kB.
 _LIMIT = 4 << 20
@@ -38,7 +38,7 @@ def convert(
         'Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin), or bag.',
         metavar='FILE',
     ),
-    output: Path = option('Bag to write; *.mcap makes a bare file.', ..., '--output', '-o'),
+    output: Path = option('Bag to write: a file *.mcap, or a folder.', ..., '--output', '-o'),
     columns: Path | None = option('Column map of a table (YAML): columns and their units.'),
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('IMU of a log, counted from 0.'),

@@ -21,7 +21,7 @@ NOTHING_GAINED = 3
 
 def update(
     calibration: Path = argument('Calibration of the unit (YAML).', metavar='YAML'),
-    rests: list[Path] = argument('Rest logs: folders of the node, or files.', metavar='RESTS...'),
+    rests: list[Path] = argument('Folders or files of rest logs.', metavar='RESTS...'),
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(

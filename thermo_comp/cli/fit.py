@@ -59,7 +59,7 @@ def fit(
     ),
     ageing_scale: float = option(
         'Assumed scale change (1 sd) since the prior calibration, in ppm; estimated from the '
-        'bags if this is 0 without --ageing-bias.',
+        'bags if it is 0 and --ageing-bias is not given.',
         0.0,
         metavar='PPM',
         min=0.0,
@@ -178,7 +178,7 @@ def prior(
     out.line(f'{output}: prior from {len(units)} units, {len(common.response)} columns')
     bent = [unit.unit.serial for unit in units if unit.nonlinearity and unit.nonlinearity.terms]
     if bent:
-        out.line(f'- the prior leaves out the nonlinear terms (K2, K3) of {", ".join(bent)}')
+        out.line(f'- the prior leaves out the nonlinear terms K2, K3 of units {", ".join(bent)}')
     out.end(output=output, units=[unit.unit.serial for unit in units])
 
 

@@ -45,7 +45,7 @@ def fleet_fit(
     Each folder of bags is a thermal test of a unit; bags directly in DIR are
     sorted by the serial in them. Results go to OUT/units, the table to
     OUT/fleet.parquet and .csv, its statistics to OUT/fleet.html, the prior of
-    the valid units (as by `thermo_comp prior`) to OUT/prior.yaml. A second
+    the valid units (as `thermo_comp prior` does) to OUT/prior.yaml. A second
     run fits only tests that are missing or have changed. Exit code 1 if a unit
     has no valid calibration from all of its bags.
 
@@ -109,7 +109,7 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     )
     out.sources((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        # Reservations name the bags left out; without reservations, print the bags left out.
+        # The reservations already name the bags that were left out.
         text = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {problem}' for problem in text if problem)
     out.points(

@@ -50,7 +50,7 @@ class Output:
             _print(f'thermo_comp: {text}', sys.stderr)
 
     def sources(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
-        """Print notes on topics chosen in bags, equal notes once, and the missing parts."""
+        """Print which topics were chosen (equal notes once), and which parts are missing."""
         alike: dict[str, list[object]] = {}
         for bag, chosen, missing in bags:
             if chosen:
@@ -64,7 +64,7 @@ class Output:
             self.note(f'{names[0]}{more}: {chosen}')
 
     def recordings(self, bags: Sequence[ReducedBag]) -> None:
-        """Print notes on topics chosen in bags, missing parts, and which bags were joined."""
+        """Print which topics were chosen, which parts are missing, and which bags were joined."""
         self.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in bags)
         for bag in bags:
             if bag.parts:

@@ -372,7 +372,7 @@ def _no_time(column: Column | None, steps: Floats) -> str:
     if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
         shown = f'{(steps == 0.0).mean():.0%}'
         return (
-            f'its column {column!r} has the time of the row before in {shown} of the rows: '
+            f'its column {column!r} has the same time as the row before in {shown} of rows: '
             f'give {_A_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
         )
     if len(steps) and (steps >= 0.0).mean() > 0.9:

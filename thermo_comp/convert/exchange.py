@@ -46,7 +46,7 @@ def export_calibration(
     `notes` on the parts of the calibration that are lost.
 
     `number` is the number of the parameter set or IMU, if the file numbers them; PX4 matches the
-    sensor by `device_id`. With `up`, the attitude as a unit vector, the error by scale times
+    sensor by `device_id`. With `up`, the attitude as a unit vector, the error of scale times
     gravity is added to the offset of an autopilot.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:

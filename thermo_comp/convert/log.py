@@ -128,7 +128,7 @@ def write_log(
     force: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> ConversionReport:
-    """Check a log and write it as a bag: a bare file ``*.mcap`` or a rosbag2 directory."""
+    """Check a log and write it as a bag: a file ``*.mcap`` or a rosbag2 directory."""
     _check_serial(log)
     holds_numbers = (log.stamp_ns != NO_STAMP) & np.isfinite(log.accel).all(axis=1)
     if log.gyro is not None:
@@ -237,7 +237,7 @@ def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
 
 
 def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
-    """Leave out impossible temperatures, as -127 degC of a DS18B20 without contact; count them."""
+    """Leave out and count impossible temperatures, like -127 degC of a DS18B20 without contact."""
     low, high = PLAUSIBLE_CELSIUS
     kept, n = {}, 0
     for name, readings in log.temperatures.items():
@@ -318,14 +318,14 @@ def find_stillness(stamp_ns: Ints, accel: Floats) -> Stillness:
 def infer_unit(magnitude: float) -> tuple[Unit | Literal['unknown'], str]:
     """Return the unit of samples (or ``unknown``) that follows from |a| at rest, and why."""
     if not np.isfinite(magnitude):
-        return 'unknown', 'the sensor never rests, so its readings do not show the unit'
+        return 'unknown', 'the sensor never rests, so |a| at rest cannot identify g or m/s^2'
     reading = f'|a| at rest is {magnitude:.4g}'
     for unit, gravity in PER_G.items():
         if abs(magnitude / gravity - 1.0) <= _TOLERANCE:
             return unit, f'{reading}, gravity is {gravity:.4g} {unit}'
     for sensitivity in _SENSITIVITIES:
         if abs(magnitude / sensitivity - 1.0) <= _TOLERANCE:
-            return 'counts', f'{reading}, as of a sensor with {sensitivity} counts per g'
+            return 'counts', f'{reading}, as for a sensor with {sensitivity} counts per g'
     if magnitude > 50.0:
         return 'counts', f'{reading}, which is not gravity in g or m/s^2'
     return 'unknown', f'{reading}, which is not gravity in any known unit'

@@ -91,7 +91,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return the rows' derivatives by levels (n, 6), gravity (n, 1) or curve slopes (n, 3)."""
+        """Return derivatives w.r.t. levels (n, 6), gravity (n, 1) or curve slopes (n, 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -124,7 +124,7 @@ class Rows:
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives by a jump of the levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
+        """Derivatives w.r.t. a jump of levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
@@ -276,7 +276,7 @@ def learn(
     Estimate the ageing model by evidence, without starts that contradict all other starts.
 
     At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
-    of the node is left out if one of its rows is more than 5 sd from the prediction by all other
+    of the node is left out if one of its rows is more than 5 sd from the prediction of all other
     rows. Returns the variances, the model of all rows, and the rests used.
     """
     centre = usual(calibration)
@@ -363,7 +363,7 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
 
 def _log_bayes_factor(precision: Floats, gradient: Floats, sd: float) -> float:
     """
-    Return the gain in log evidence by a change of prior sd `sd`, marginal over all other unknowns.
+    Return the gain in log evidence from a change of prior sd `sd`, marginal over other unknowns.
     """
     inner = np.eye(len(gradient)) + sd**2 * precision
     gain = 0.5 * sd**2 * gradient @ np.linalg.solve(inner, gradient)
@@ -373,12 +373,12 @@ def _log_bayes_factor(precision: Floats, gradient: Floats, sd: float) -> float:
 @dataclass(frozen=True)
 class Solution:
     """
-    Change of the calibration file's parameters by the rests, with covariances of the parameters.
+    Change of the calibration file's parameters due to the rests, with the covariances.
 
     shift: change of the parameters
     prior, posterior: covariances at the time of the last rest, without and with use of the rests
     future: covariance that is added during the time of use after the last rest
-    gains, innovations: the shift is ``gains.T @ innovations``; the shift by the first rows alone
+    gains, innovations: the shift is ``gains.T @ innovations``; the shift due to the first rows
         is the sum over these rows
     gravity: jumps of gravity, each with its size and the sd of the size [m/s^2]
     """
@@ -400,8 +400,9 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     """
     Condition the parameters of the calibration on the rests.
 
-    `to_file`, `bend`: derivatives of the file's parameters by the six levels, (n_parameters, 6),
-    and by the bias slope of each axis, (n_parameters, 3). `ahead`: days of use after the last rest
+    `to_file`, `bend`: derivatives of the file's parameters w.r.t. the six levels,
+    (n_parameters, 6), and w.r.t. the bias slope of each axis, (n_parameters, 3).
+    `ahead`: days of use after the last rest
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

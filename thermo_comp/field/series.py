@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns rests as measurements of a calibration, by ``|f| - g`` and its derivatives by every parameter.
+Owns rests as measurements of a calibration: ``|f| - g``, its derivatives w.r.t. all parameters.
 
 A rest at an unknown attitude measures one number, |f|. With x the axes' forces before the matrix
 M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
@@ -48,9 +48,9 @@ class Series:
 
     `time`: days since 1970; `start`: number of the node's start, from 0 in order;
     `direction`, `force`, `by_parameter`: v, x and H of the module's equations; `gravity`: stated
-    g; `residual`: ``|f| - g``; `by_level`: derivatives by the bias of each axis and by its scale
-    times g, (n, 6); `noise`: variance of one rest by samples and thermometers; `by_start`:
-    derivatives by the unknown lag states at the start of the node, of unit variance each;
+    g; `residual`: ``|f| - g``; `by_level`: derivatives w.r.t. each axis' bias, and each axis'
+    scale times g, (n, 6); `noise`: variance of a rest due to noise of samples and thermometers;
+    `by_start`: derivatives w.r.t. unknown lag states at the node's start, of unit variance each;
     `lack`: sd of the lack of fit of each axis times `direction`; `claim`: claimed sd of `residual`
     """
 
@@ -319,7 +319,7 @@ def _uncertainty(
     x: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """
-    Return the variance of |f| by thermometers and regime, (n,), the variance of |f| that the
+    Return the variance of |f| due to thermometers and regime, (n,), the variance of |f| that the
     calibration claims, (n,), and the sd of the lack of fit of each axis, (n, 3).
     """
     without = replace(calibration, posterior=None, misalignment_sd=(0.0, 0.0, 0.0))

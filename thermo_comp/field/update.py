@@ -133,7 +133,7 @@ def update(
     n_starts = int(series.start.max()) + 1
     if n_starts < 3:
         raise FitError(
-            f'the logs hold rests of {counted(n_starts, "start")} of the node, need 3 at least: '
+            f'the logs hold rests of {counted(n_starts, "start")} of the node, need at least 3: '
             'each start has a bias offset, and the update is judged on left-out starts'
         )
     _, aged, is_update = valid_since(calibration)
@@ -183,7 +183,7 @@ def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Prov
 
 
 def _levels(calibration: Calibration) -> Floats:
-    """Differentiate the parameters by bias [m/s^2] and scale [times g] of each axis, (n, 6)."""
+    """Differentiate parameters w.r.t. bias [m/s^2] and scale [times g] of each axis: (n, 6)."""
     layout = parameter_layout(calibration)
     result = np.zeros((layout.n_parameters, 6))
     for axis, reference in enumerate(calibration.axes):
@@ -194,7 +194,7 @@ def _levels(calibration: Calibration) -> Floats:
 
 
 def _slopes(calibration: Calibration) -> Floats:
-    """Differentiate the parameters by a slope of the bias of each axis [m/s^2 per K], (n, 3)."""
+    """Differentiate parameters w.r.t. a slope of the bias of each axis [m/s^2 per K], (n, 3)."""
     layout = parameter_layout(calibration)
     result = np.zeros((layout.n_parameters, 3))
     for axis, reference in enumerate(calibration.axes):
@@ -280,7 +280,7 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
 
 
 def _gravity_part(series: Series, solution: Solution) -> Floats:
-    """Return the part of ``|f| - g`` by jumps of gravity."""
+    """Return the part of ``|f| - g`` due to jumps of gravity."""
     time = means_by(series.start, series.time)[series.start]
     result = np.zeros(len(series))
     for change, size, _ in solution.gravity:
@@ -302,7 +302,7 @@ def refuse_another_unit(result: Update) -> None:
         raise FitError(
             f'on {day} |f| differs from the gravity {series.gravity[at]:.5f} m/s^2 by '
             f'{ug_text(rms[worst])} RMS, expected at most {ug_text(largest[worst])} for this unit '
-            'by ageing: samples of another unit, another gravity, or damage (override with '
+            'from ageing: samples of another unit, another gravity, or damage (override with '
             '--allow unit)'
         )
 
@@ -338,8 +338,8 @@ def _gravity_texts(result: Update) -> Iterator[str]:
         yield (
             f'from {np.datetime64(int(time * 86400.0), "s")} on |f| is '
             f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} in '
-            f'all attitudes, as by another gravity than the stated {stated:.5f} m/s^2: no scale '
-            'was changed for it; state the gravity of the place (--gravity; parameter '
+            f'all attitudes, as if gravity were not the stated {stated:.5f} m/s^2: no scale '
+            'was changed for this; state the gravity of the place (--gravity; parameter '
             'local_gravity of the node) or, if the stated gravity is right, use --allow gravity'
         )
 

@@ -192,7 +192,7 @@ def _forecasts(
     """
     Forecast when the unit leaves its claim, with the present calibration and just after an update.
 
-    The attitudes of use are those of the rests in the last week, and of ten starts at least.
+    The attitudes are those of the rests of the last week, and of the last ten starts.
     """
     used, ageing, solution = updated.series, updated.ageing, updated.solution
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS

@@ -297,13 +297,13 @@ def file_jacobian(
     kinds: Sequence[Kind] = (),
 ) -> Floats:
     """
-    Return the derivatives of the file's parameters by the regression's parameters.
+    Return the derivatives of the file's parameters w.r.t. the regression's parameters.
 
     `used`: response columns in the file; `kinds`: nonlinear terms in the file
     """
     sets, sums = model.sets, model.part_curves.sums
     n, m = sets.static.n_free, sets.dynamic.n_free
-    # The last row, at place -1, is zero: the place -1 marks a parameter that is not estimated.
+    # The last row, at index -1, is zero: the index -1 marks a parameter that is not estimated.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
     for axis, K in enumerate(regression.nominal_scale):

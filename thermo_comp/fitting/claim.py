@@ -48,7 +48,7 @@ class Claim:
     """
     The published uncertainty of a unit.
 
-    layout: places of the unknowns of the fit and of the columns in the covariance alone
+    layout: indices of the unknowns of the fit and of the columns in the covariance alone
     covariance: of the unit's own unknowns, shape (n_unit, n_unit)
     offset_sd: sd of the bias offset of a new mounting or turn-on [m/s^2]
     """
@@ -117,7 +117,7 @@ def _over_offsets(
     mountings and turn-ons, the sd of the offset of a new mounting after a new turn-on [m/s^2], and
     the variance of the offset of a single turn-on, which is no unknown of the regression.
 
-    `offset_sd`: sd of a mounting's offset; `known_sd`: offset sd by a prior calibration [m/s^2]
+    `offset_sd`: sd of a mounting's offset; `known_sd`: offset sd of a prior calibration [m/s^2]
     """
     windows, scale = regression.windows, posterior.prior.offset_scale
     n_mountings = int(windows.mounting[-1]) + 1
@@ -193,7 +193,7 @@ def _widened(
     # The curve of the positions' means is an alternative to a curve that the drifts of a warm-up
     # determine, because a warm-up heats the board in another way than a chamber does.
     other = _with_curve(regression, state, of_means)
-    # Columns that only the curve of the means has get a place in the covariance by an sd of 1e-9.
+    # Columns that only the curve of the means has get rows in the covariance, with an sd of 1e-9.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -236,7 +236,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures lags change by thermometer errors alone: no weight is bounded.
+        # At constant temperatures only thermometer errors change the lags: no weight is bounded.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:

@@ -31,7 +31,7 @@ SAME_DIRECTION_DEG = 5.0
 
 
 def force_columns(up: Floats) -> Floats:
-    """Differentiate the force at unit vectors (n, 3) by a triad's constants: shape (n, 3, 9)."""
+    """Differentiate the force at unit vectors (n, 3) w.r.t. a triad's constants: (n, 3, 9)."""
     columns = np.zeros((len(up), 3, 9))
     for axis in range(3):
         columns[:, axis, axis] = 1.0
@@ -41,7 +41,7 @@ def force_columns(up: Floats) -> Floats:
 
 
 def norm_columns(up: Floats) -> Floats:
-    """Differentiate |f| at unit vectors (n, 3) by the nine constants of a triad: shape (n, 9)."""
+    """Differentiate |f| at unit vectors (n, 3) w.r.t. the nine constants of a triad: (n, 9)."""
     return np.asarray(np.einsum('ni,nij->nj', up, force_columns(up)))
 
 

@@ -348,7 +348,7 @@ def judge_result(
         yield advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
         why = 'each position is predicted badly by the other positions; record more positions'
-        yield advice('left out', f'{text}: left-out positions exceed the raw residual: {why}')
+        yield advice('left out', f'{text}: left-out residuals exceed the raw residual: {why}')
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms

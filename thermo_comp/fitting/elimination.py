@@ -129,7 +129,7 @@ class Reduced:
     """
     The normal equations of the unit's n unknowns, with all other unknowns eliminated.
 
-    layout: places of the unknowns
+    layout: indices of the unknowns
     of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
         from the prior mean, shape (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)

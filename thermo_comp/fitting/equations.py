@@ -57,11 +57,11 @@ class Effects(NamedTuple):
     The readings that a state of the unknowns predicts at the reference temperature, by parts.
 
     force: specific force along each axis in each position, shape (n_positions, 3)
-    by_rotation: derivative of the reading by a rotation of the attitude, shape (n_positions, 3, 2)
+    by_rotation: derivative of the reading w.r.t. a rotation of the attitude, (n_positions, 3, 2)
     without_bias: reading without the bias, shape (n_positions, 3)
     nonlinear: sums of the nonlinear terms at the reference temperature and per kelvin, shape (2,
         n_positions, 3)
-    slopes: derivatives of `nonlinear` by the force, of the same shape
+    slopes: derivatives of `nonlinear` w.r.t. the force, of the same shape
     """
 
     force: Floats
@@ -121,7 +121,7 @@ class Equations(Series):
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
         """
-        Assign a place to every unknown; return one `Layout` object for equal arguments.
+        Assign an index to every unknown; return one `Layout` object for equal arguments.
 
         `used`: active columns of bias and scale, shape (2, m); `nonlinear`: active nonlinear
         coefficients, shape (2 k,); None for all
@@ -191,8 +191,8 @@ class Equations(Series):
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
-        Return the combinations of the base series that a tangent uses, in this order: 1 + S s; the
-        derivatives by kappa, by the force along the axis, by the initial lag states; the residual.
+        Return the combinations of the base series that a tangent uses: 1 + S s; the derivatives
+        w.r.t. kappa, the force along the axis and the initial lag states; the residual.
         """
         force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
@@ -213,7 +213,7 @@ class Equations(Series):
         self, state: State, layout: Layout, base: Base, scaled: int
     ) -> tuple[Ints, Floats | float]:
         """
-        Return place and factor of the series of each active nonlinear coefficient, see `Tangent`.
+        Return index and factor of the series of each active nonlinear coefficient, see `Tangent`.
 
         The relative change of the scale factor multiplies the terms at the reference temperature,
         but not the terms' change per kelvin: the product of both changes is negligible.
@@ -227,7 +227,7 @@ class Equations(Series):
         return place, state.kappa[:, None] * value[..., active % k]
 
     def _by_misalignment(self, state: State) -> Floats:
-        """Differentiate the force along each axis by the misalignment, times kappa, (n, 3, 3)."""
+        """Differentiate each axis' force w.r.t. the misalignment, times kappa, (n, 3, 3)."""
         result = np.zeros((len(state.up), 3, 3))
         # Rows and columns of the three free elements of the inverse of M.
         rows, columns = [1, 2, 2], [0, 0, 1]
@@ -359,7 +359,7 @@ def _poses(up: Floats, pose_of: Ints | None, n_poses: int) -> Floats:
 
 
 def _by_poses(by_rotation: Floats, layout: Layout) -> Floats:
-    """Return the derivatives by rotations of the poses, shape (n_positions, 3, 2 n_poses)."""
+    """Return the derivatives w.r.t. rotations of the poses, shape (n_positions, 3, 2 n_poses)."""
     is_in = layout.pose_of[:, None] == np.arange(len(layout.pose))
     each = by_rotation[:, :, None, :] * is_in[:, None, :, None]
     return np.asarray(each.reshape(*by_rotation.shape[:2], -1))

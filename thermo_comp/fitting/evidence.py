@@ -4,8 +4,8 @@
 Owns the statistics that a fit reports: the residuals of each position, the residuals with
 constants, curves and response added in turn, and the contribution of each group of columns.
 
-Each position has two residuals: in sample, that is, by the fit of all positions; and left out,
-by a fit without this position, which estimates the error in a new attitude.
+Each position has two residuals: in sample, that is, of the fit of all positions; and left out,
+of a fit without this position, which estimates the error in a new attitude.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ def _fit_without_code_offset(
     if not offset.any():
         return _fit_one_environment(bags, options, progress)
     codes = ' '.join(f'{code:g}' for code in offset)
-    how = 'by the readings; --offset can state it' if options.offset is None else 'by --offset'
+    how = 'estimated; --offset can state it' if options.offset is None else 'by --offset'
     finding = Finding(
         'offset',
         'advice',
@@ -373,7 +373,7 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
         # If the positions determine a misalignment out of range, the sensor is no accelerometer.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
-            'by the fit the angle between two of the axes is less than 60 degrees, which no '
+            'in the fit the angle between two of the axes is less than 60 degrees, which no '
             'accelerometer has: is the topic that of the accelerometer, did the axes stay the '
             'same in all positions, and are there at least 9 positions?'
         )

@@ -49,7 +49,7 @@ class Inactive:
 
     part, column: part (0: bias, 1: scale) and column of each of k inactive columns, shape (k,)
     S: sparsity factor: information about the weights, ordered by column, then axis, (3 k, 3 k)
-    Q: quality factor: gradient of the log likelihood by the weights, shape (3 k,)
+    Q: quality factor: gradient of the log likelihood w.r.t. the weights, shape (3 k,)
     """
 
     part: Ints

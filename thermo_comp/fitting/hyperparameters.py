@@ -110,8 +110,8 @@ def _updated(
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
         new_sd = float(np.sqrt(square / (share * gamma + 1.0)))
-        # Limit the misalignment sd to 0.03 rad: larger misalignments, as of single sensors on a
-        # printed bracket, would explain the norms of six faces, to second order.
+        # Limit the misalignment sd to 0.03 rad: larger misalignments, such as those of separate
+        # sensors on a printed bracket, would explain the norms of six faces, to second order.
         misalignment_sd = min(new_sd, 0.03)
     start_ratio = prior.start_variance_ratio
     if layout.start.size:
@@ -178,7 +178,7 @@ def _toward(
     slope: Floats | float,
     bend: Floats | float,
 ) -> Floats:
-    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, +-2 at most."""
+    """Return Newton's step of log sd towards ``power / sd^2 = effective + slope``, at most +-2."""
     ratio = power / (sd * sd)
     gradient = ratio - effective - slope
     curvature = 2.0 * np.minimum(ratio, 2.0 * effective + 1.0) + 0.5 * effective + bend
@@ -200,7 +200,7 @@ def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, fl
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, sd, slope, bend + 0.1)
-    # Bounds of the offset sd [m/s^2]: 1e-4 of the prior's scale; 5 mg, as of the cheapest MEMS.
+    # Bounds of the offset sd [m/s^2]: 1e-4 of the prior's scale; 5 mg, as in the cheapest MEMS.
     new = float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
     return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
 

@@ -162,10 +162,10 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
 
 def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool = False) -> Floats:
     """
-    Return the error of the windows of each axis by the board's thermometer [m/s^2], shape (3,):
+    Return the error of the windows of each axis due to the board's thermometer [m/s^2], (3,):
     the sd of the temperature times the slope of the samples over temperature within the positions.
 
-    `beyond_noise`: use the variance less that of a reading's noise, as by coarse steps or long
+    `beyond_noise`: use the variance less that of a reading's noise, left by coarse steps or long
     intervals
     """
     if windows.board is None:

@@ -250,7 +250,7 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
-    # Bounds of the prior's scale: 30 ug, typical of navigation grade, and 0.5 mg, as of consumer
+    # Bounds of the prior's scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer
     # MEMS; the tail of the Student prior allows for more. For almost no noise the lower bound of
     # the prior's scale is below 30 ug, because an offset 1e6 times as large as the noise cannot be
     # estimated in double precision.
@@ -269,7 +269,7 @@ def _candidates(
     """
     Return the columns that may take part, with the typical and largest sd of their weights.
 
-    `is_bench`: whether one attitude of several was heated, see `rests`
+    `is_bench`: whether only one of several attitudes was heated, see `rests`
     """
     data = windows.data
     groups = np.array(data.groups)
@@ -299,7 +299,7 @@ def _candidates(
 
 
 def _steepest(n_directions: int) -> Floats:
-    """Return the largest prior sd of slopes of bias and scale by the number of attitudes, (2,)."""
+    """Return the largest prior sd of slopes of bias and scale, given the number of attitudes."""
     # In two to eight attitudes the prior sd of the scale factor's slope is halved, because a tilt
     # of the support explains a drift that the scale factor of a nearly level axis explains only by
     # a slope of several hundred ppm/K.

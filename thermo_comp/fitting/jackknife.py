@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the covariance by effects that the model lacks: a jackknife over the sections of the program.
+Owns the covariance due to effects that the model lacks: a jackknife over the program's sections.
 
-The covariance of a fit contains the errors by noise alone. If the model lacks an effect, each
+The covariance of a fit contains only the errors due to noise. If the model lacks an effect, each
 section of the program requires other weights, and the error in another program is as large as the
 differences of weights, which the jackknife [1]_ estimates from fits without one section.
 
@@ -48,7 +48,7 @@ def jackknife_covariance(regression: Regression, posterior: Posterior) -> Floats
 def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     """
     Return the squared changes of the unknowns without some windows, along the principal directions
-    that these windows measure, in units of the variance of these changes by noise, shape (k,).
+    that these windows measure, in units of the variance of these changes due to noise, (k,).
 
     `change`: change of the unknowns, shape (n,), and `remaining`: root of the information of the
     remaining windows, ``remaining.T @ remaining``, shape (n, n), both in units of the fit's root

@@ -32,7 +32,7 @@ from .sources import angular_velocity
 _MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
 # Smallest number of samples on either side of a step that is tested.
 _FEWEST_SAMPLES = 8
-# Smallest significant ratio of a step to the sd of the step; the search over the place of a step
+# Smallest significant ratio of a step to the sd of the step; the search over the time of a step
 # reaches a ratio of about 5 by chance.
 _STEP_SDS = 8.0
 
@@ -151,7 +151,7 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # The noise by differences of neighbouring samples does not depend on the drift.
+    # The noise from differences of neighbouring samples does not depend on the drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -175,8 +175,8 @@ def _examine(
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
     """Return the ratio of the sd of a mean to that under white noise of `sd`, at least 1, (3,)."""
-    # The variance of the means of 40 pieces is multiplied by (1 + r) / (1 - r), r being the lag-1
-    # correlation of the means.
+    # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
+    # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
     n = len(residual) // size
     means = residual[: n * size].reshape(n, size, 3).mean(axis=1)
@@ -203,7 +203,7 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
     """
     Find the first sample after a step, and the lag-1 correlation of the noise.
 
-    The place of the step and the correlation are estimated in turn, three times. Noise with a
+    The time of the step and the correlation are estimated in turn, three times. Noise with a
     lag-1 correlation of 0.4 or less counts as white. The correlation is limited to 0.999, because
     noise of a larger correlation is a random walk.
     """

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Layout:
     """
-    Places (indices) of the unknowns in the vector of parameters; those of the unit come first.
+    Indices of the unknowns in the vector of parameters; those of the unit come first.
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
-    weights, nonlinear: places of the weights, shape (2, 3, m), and of the nonlinear coefficients,
+    weights, nonlinear: indices of the weights, shape (2, 3, m), and of the nonlinear coefficients,
         shape (3, 2 k); -1 for an inactive unknown
     start, turn_on: unknowns of each bag: initial lag states, and the bias offset of its turn-on,
         shapes (n_bags, r) and (n_bags, 3) or (n_bags, 0)
@@ -53,22 +53,22 @@ class Layout:
 
     @property
     def kappa(self) -> Ints:
-        """Places of kappa, shape (3,)."""
+        """Indices of kappa, shape (3,)."""
         return self.axis[:, 0]
 
     @property
     def bias(self) -> Ints:
-        """Places of the bias, shape (3,)."""
+        """Indices of the bias, shape (3,)."""
         return self.axis[:, 1]
 
     @cached_property
     def shared(self) -> Ints:
-        """Places of radius, misalignment and poses, which all axes share; the last of the unit."""
+        """Indices of radius, misalignment and poses, which all axes share; the unit's last."""
         return np.concatenate((self.radius, self.misalignment, self.pose.ravel()))
 
     @property
     def posed(self) -> Ints:
-        """Places of the attitudes of those positions that are in a pose, shape (k, 2)."""
+        """Indices of the attitudes of the k positions that are in a pose, shape (k, 2)."""
         return self.up[self.pose_of >= 0]
 
     @cached_property
@@ -86,7 +86,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """The unknowns of the unit that each axis has, then the place of the residual, (3, k)."""
+        """The unknowns of the unit that each axis has, then the index of the residual, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
@@ -114,8 +114,8 @@ class Layout:
 
     def by_weights(self, columns: Floats, force: Floats) -> Iterator[tuple[Floats, Ints]]:
         """
-        Yield the derivatives of readings by the weights of each axis, and the weights' places,
-        given columns, shape (n, m), and the force along the axes, shape (n, 3) or (3,).
+        Yield the derivatives of readings w.r.t. the weights of each axis, and the indices of the
+        weights, given columns, (n, m), and the force along the axes, shape (n, 3) or (3,).
         """
         in_bias, in_scale = self.used
         for axis in range(3):
@@ -135,7 +135,7 @@ def lay_out(
     has_turn_ons: bool = False,
 ) -> Layout:
     """
-    Assign a place to every unknown, given the active columns of bias and scale, shape (2, m), and
+    Assign an index to every unknown, given the active columns of bias and scale, shape (2, m), and
     the active nonlinear coefficients, shape (2 k,).
     """
     n = 0

@@ -178,7 +178,7 @@ def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
 
 def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
-    Return the gain by a model if the gain exceeds its standard errors, else 0.
+    Return the gain of a model if the gain exceeds its standard errors, else 0.
 
     The gain is the sum of the log gains of the drift of positions and of sections. If the drifts
     of both models are equal, the gain is the log gain of the norms of left-out positions, which
@@ -315,8 +315,8 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
 
 def _is_determined(by_others: float, by_all: float) -> bool:
     """
-    Whether the variance of a position's norm or drift by a fit without the position is below ten
-    times the variance by the fit of all positions, including mounting offset and noise.
+    Whether the variance of a position's norm or drift in a fit without the position is below ten
+    times the variance in the fit of all positions, including mounting offset and noise.
     """
     return by_others < 10.0 * by_all
 

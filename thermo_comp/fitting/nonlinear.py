@@ -65,7 +65,7 @@ class Forces:
         return np.asarray(np.hypot(self.still, spin) * (1.0 + stretch.sum(axis=1)))
 
     def by_radius(self, radius: Floats) -> Floats:
-        """Differentiate the logarithm of |f| by the relative error of the radius."""
+        """Differentiate the logarithm of |f| w.r.t. the relative error of the radius."""
         spin = self.spin * (1.0 + radius.sum())
         return np.asarray(self.spin * spin / (self.still**2 + spin**2))
 
@@ -161,7 +161,7 @@ def starting_sd(forces: Forces, options: FitOptions) -> Floats:
 
 
 class _TermFits:
-    """Fits with different nonlinear coefficients, and what a fit gains by some coefficients."""
+    """Fits with different nonlinear coefficients, and the gain of a fit from some of them."""
 
     def __init__(self, regression: Regression, selected: Selected, sd: Floats) -> None:
         """Set the prior sd of the nonlinear coefficients, shape (2 k,)."""
@@ -186,7 +186,7 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the log gain of left-out norms by some coefficients, and its standard error."""
+        """Return the log gain of left-out norms from some coefficients, and its standard error."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:

@@ -138,7 +138,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     others = ~np.eye(len(curves), dtype=bool)
     share = np.sum(variance, where=others) / max(np.sum(correlation**2, where=others), 1e-300)
     is_pair = (kind == 0) & ~np.eye(len(kind), dtype=bool)
-    # Correlations are reduced by 1 % at least, so that the covariance is regular.
+    # Correlations are reduced by at least 1 %, so that the covariance is regular.
     scatter[is_pair] *= 1.0 - np.clip(share, 0.01, 1.0)
     # `to_curves`, the inverse of `to_differences`, adds the static curve to the differences.
     to_curves = 2.0 * np.eye(len(kind)) - to_differences
@@ -147,8 +147,8 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
 
 def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     """
-    Return the deviations, multiplied so that each kind of parameter, such as a slope of the bias,
-    has the same scatter on all axes on which any unit has it. The scatter is that of a future unit
+    Scale the deviations so that a kind of parameter, such as a slope of the bias, has the same
+    scatter on all axes that have nonzero deviations. The scatter is that of a future unit
     by Student's distribution [2]_, because three units can be alike by chance.
     """
     size = deviations.shape[1]

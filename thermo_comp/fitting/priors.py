@@ -158,8 +158,8 @@ def _root(covariance: Floats, share: float, to_file: Floats) -> Floats:
     """
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
-    `covariance`: of the parameters of the file, to which an uncorrelated part of `share` times
-    each variance is added; `to_file`: derivatives of the parameters of the file by the unknowns
+    `covariance`: of the file's parameters, to which an uncorrelated part of `share` times each
+    variance is added; `to_file`: derivatives of the file's parameters w.r.t. the unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))

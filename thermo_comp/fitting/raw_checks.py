@@ -46,8 +46,8 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
         yield Finding(
             'saturation',
             'refusal' if part > 0.05 else 'advice',
-            f'{100.0 * part:.2f} % of the samples are at the full scale: an axis sees more than '
-            'it can measure, or --full-scale is wrong',
+            f'{100.0 * part:.2f} % of the samples are at the full scale: a force exceeds the '
+            'range of the sensor, or --full-scale is wrong',
         )
     if n_dropped := total('n_dropped'):
         why = 'was a clock set back?'

@@ -406,6 +406,7 @@ def _windows(
     # A last window with less than 90 % of the usual samples is not of full length: the bag ended.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
+    mean = block_means(cells.mean[rows], count, offsets)
     variance = np.median(cells.variance[rows], axis=0)
     return StillInterval(
         start_ns=cells.start_ns + round(cells.time[lower] * 1e9),
@@ -414,20 +415,25 @@ def _windows(
         n_whole=n_whole,
         time=np.add.reduceat(cells.time[rows] * count, offsets) / total,
         count=total,
-        mean=block_means(cells.mean[rows], count, offsets),
+        mean=mean,
         sample_sd=np.sqrt(variance),
-        rounding_sd=_rounding_sd(variance, cells.quantum),
+        rounding_sd=_rounding_sd(variance, np.ptp(mean, axis=0), cells.quantum),
         angular_rate=block_means(cells.rate[rows], count, offsets) if has_rate else None,
     )
 
 
-def _rounding_sd(variance: Floats, quantum: Floats) -> Floats:
+def _rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
     """
     Return the sd of the error of a mean by rounding to a converter's steps, shape (3,).
 
-    `variance`: of the rounded samples. Gaussian noise of sd s, in steps, reduces the error of a
-    mean by the factor exp(-2 pi^2 s^2), the characteristic function at one cycle per step.
+    `variance`: of the rounded samples; `drift`: range of the means. Gaussian noise of sd s, in
+    steps, reduces the error of a mean by the factor exp(-2 pi^2 s^2), the characteristic function
+    at one cycle per step; a drift over n steps averages the errors of n + 1 steps.
     """
     noise = np.maximum(variance - quantum**2 / 12.0, 0.0)
-    share = np.divide(noise, quantum**2, where=quantum > 0.0, out=np.zeros(3))
-    return np.asarray(quantum / 12.0**0.5 * np.exp(-2.0 * np.pi**2 * share))
+    noise, drift = (
+        np.divide(x, unit, where=unit > 0.0, out=np.zeros(3))
+        for x, unit in ((noise, quantum**2), (drift, quantum))
+    )
+    by_noise = np.exp(-2.0 * np.pi**2 * noise)
+    return np.asarray(quantum / 12.0**0.5 * by_noise / (1.0 + drift))

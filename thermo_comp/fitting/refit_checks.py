@@ -28,13 +28,13 @@ _PIECE_S = 3600.0
 # multiples of the white noise of the average, and of the error of the left-out norms.
 _DRIFT_TO_NOISE, _DRIFT_TO_NORMS = 6.0, 0.1
 # Smallest number of positions with left-out norms: the norms of fewer positions give no reliable
-# standard error of the gain by slow tilts.
+# standard error of the gain from slow tilts.
 _FEWEST_NORMS = 6
-# Smallest log gain of the mean square left-out norm by slow tilts: 14 % of the RMS.
+# Smallest log gain of the mean square left-out norm from slow tilts: 14 % of the RMS.
 _TILT_GAIN = 0.3
 SLOW_TILTS = advice(
     'tilt',
-    'left-out norms are smaller if the supports may tilt from hour to hour: each hour of a rest '
+    'left-out |f| - g is smaller if the supports may tilt from hour to hour: each hour of a rest '
     'was fitted with its own attitude',
 )
 

@@ -145,12 +145,12 @@ class Point:
 
     @property
     def norm_by_axes(self) -> Floats:
-        """Derivatives of the norm of each position by the readings, shape (n_positions, 3)."""
+        """Derivatives of the norm of each position w.r.t. the readings, shape (n_positions, 3)."""
         return np.asarray(self.state.up @ np.linalg.inv(self.state.inverse) / self.state.kappa)
 
     @cached_property
     def norms_by_unit(self) -> Floats:
-        """Derivatives of each position's mean norm by the unit's unknowns, (n_positions, n)."""
+        """Derivatives of positions' mean norms w.r.t. the unit's unknowns, (n_positions, n)."""
         regression, state, layout = self.regression, self.state, self.layout
         products = regression.products(layout.used)
         at_state = regression.at_starts(products.means[:, None], state, products.base)
@@ -184,8 +184,8 @@ class Point:
 
     def by_offset(self, axis: int) -> Floats:
         """
-        Return the derivatives of the unit's unknowns by the prior mean of a bias offset that all
-        positions share, shape (n_unit,).
+        Return the derivatives of the unit's unknowns w.r.t. the prior mean of a bias offset that
+        all positions share, shape (n_unit,).
         """
         deviation = self.deviation.copy()
         deviation[self.layout.offset[:, axis]] -= 1.0
@@ -333,7 +333,7 @@ class Regression(Equations):
         base = self.products(layout.used).base
         columns, at = np.unique(column, return_inverse=True)
         of_columns, with_base = self.products_of(columns, base, state)
-        # Derivatives of the reading by a column's contribution to the bias, and to the scale.
+        # Derivatives of the reading w.r.t. a column's contribution to the bias, and to the scale.
         acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
         acts /= sigma
         rows = point.tangent.of(self.at_starts(with_base, state, base))[:, :, at]

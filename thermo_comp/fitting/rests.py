@@ -30,7 +30,7 @@ def is_constant(windows: ThermalWindows, part: Ints) -> bool:
 
 
 def is_bench(windows: ThermalWindows, up: Floats) -> bool:
-    """Whether one attitude of several shows an effect of temperature; `up`: attitudes, (n, 3)."""
+    """Whether only one of several attitudes shows a temperature effect; `up`: attitudes."""
     n_heated = len(distinct_directions(up[_is_heated(windows)]))
     return n_heated == 1 and len(distinct_directions(up)) > 1
 
@@ -54,8 +54,8 @@ def is_steady(windows: ThermalWindows) -> Bools:
     Return the positions whose temperatures change by less than three sd of the thermometers' noise
     (RMS), shape (n_positions,).
 
-    In a steady position the noise of the temperature would act as a change without a drift, as if
-    the unit had no thermal response in the attitudes of short rests. At a change of three sd, a
+    In a steady position the thermometers' noise would look like temperature changes without drift,
+    as if the unit had no thermal response in attitudes of short rests. At a change of three sd, a
     ninth of the mean square change is noise, and a slope would be a ninth too small.
     """
     data, model = windows.data, windows.model

@@ -164,13 +164,13 @@ def _vertex(values: Floats, at: int) -> float:
 class Base:
     """
     The base series of some columns, in this order: 1; the columns; for each column with a lag its
-    derivative by the lag's initial state; t of the nonlinear terms; the temperatures of a support
-    (`Windows.tilt`); the measured values of the three axes less their mean in the position.
+    derivative w.r.t. the lag's initial state; t of the nonlinear terms; the temperatures of a
+    support (`Windows.tilt`); the measured values of the three axes less the mean of the position.
 
     columns: the active columns; lagged: indices in `columns` of the columns with a lag
     lag: number of the lag of each column in `lagged`
-    at_start, t, tilts, measured: places of the derivatives by the initial lag states, of t for the
-        nonlinear terms, shape (1,) or (0,), of a support's temperatures, of the measured values
+    at_start, t, tilts, measured: indices of the derivatives w.r.t. the initial lag states, of t
+        for nonlinear terms, (1,) or (0,), of a support's temperatures, of the measured values
     """
 
     columns: Ints
@@ -183,7 +183,7 @@ class Base:
 
     @classmethod
     def of(cls, columns: Ints, lags: Ints, n_t: int, n_tilts: int) -> Base:
-        """Assign places to the series, given the number of the lag of each column, -1 for none."""
+        """Assign indices to the series; `lags`: number of the lag of each column, -1 for none."""
         lagged = np.flatnonzero(lags[columns] >= 0)
         counts = 1 + len(columns), len(lagged), n_t, n_tilts, 3
         _, *places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -198,7 +198,7 @@ class Base:
 @dataclass(frozen=True)
 class Products:
     """
-    Products of the base series over the windows.
+    Sums over the windows of the products of each two base series.
 
     base: the base series
     means: mean of each series in each position, shape (n_positions, n_base)
@@ -214,11 +214,11 @@ class Products:
 
     @cached_property
     def of_positions(self) -> Floats:
-        """Products of each position, shape (n_positions, n_base, n_base)."""
+        """Products summed over each position, shape (n_positions, n_base, n_base)."""
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Products of each position without some sections, (n_positions, n_base, n_base)."""
+        """Products summed over each position without some sections, shape of `of_positions`."""
         result: Floats = self.of_positions.copy()
         left_out = np.flatnonzero(np.isin(self.section, sections))
         position = np.searchsorted(self.first, left_out, side='right') - 1

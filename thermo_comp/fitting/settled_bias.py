@@ -41,7 +41,7 @@ def settled_error(
 
 
 def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
-    """Return the RMS sd of the bias [m/s^2] of three axes by columns, shape (k, m)."""
+    """Return the RMS sd of the bias [m/s^2] of three axes due to columns, shape (k, m)."""
     parts = posterior.layout.by_weights(columns, np.zeros(3))
     square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
     return float(np.sqrt(square / (3 * len(columns))))

@@ -16,9 +16,9 @@ class Normal(NamedTuple):
     """
     Normal equations of each axis without any prior, in the order of `Tangent`.
 
-    local: products of the derivatives by the unknowns of positions and bags with all derivatives
-        and the residual, shape (n_positions, 3, n_local, k + 1)
-    unit: products of the derivatives by the unknowns of the unit and of the residual with each
+    local: products of the derivatives w.r.t. the unknowns of positions and bags with all
+        derivatives and the residual, shape (n_positions, 3, n_local, k + 1)
+    unit: products of the derivatives w.r.t. the unknowns of the unit and of the residual with each
         other, sum over the positions, shape (3, n, n)
     """
 
@@ -40,10 +40,10 @@ class Tangent:
     """
     The equations linearised about a state, as coefficients of the base series at this state.
 
-    The derivative of the readings by an unknown is a factor times one base series or one of a few
-    combinations of base series. For axis i, position p and unknown u the derivative is ``factor[p,
-    i, u]`` times series ``place[u]``, in the order base series, combinations. An axis has unknowns
-    of the position (2 of the attitude, stretch, offset, tilts), then those of the bag
+    The derivative of the readings w.r.t. an unknown is a factor times one base series or one of a
+    few combinations of base series. For axis i, position p and unknown u the derivative is
+    ``factor[p, i, u]`` times series ``place[u]``, in the order base series, combinations. An axis
+    has unknowns of the position (2 of the attitude, stretch, offset, tilts), then those of the bag
     (initial lag states, turn-on offset), then those of the unit (kappa, bias, weights, nonlinear
     coefficients, radius, 3 of the misalignment, 2 of each pose). The last "unknown" is the
     residual, measured minus predicted.

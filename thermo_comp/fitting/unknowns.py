@@ -51,7 +51,7 @@ class Windows:
     kelvins: temperature change that corresponds to the RMS of each column [K], 0 for a constant
         column, shape (m,)
     lag: number of the lag of each column; -1 for none, shape (m,)
-    start: derivative of each column by the initial state of its lag, shape (n, m)
+    start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: columns that the scale may have as well as the bias, shape (m,)
     tilt: temperatures with which a support may tilt, divided by their RMS, shape (n, k)
@@ -226,8 +226,8 @@ class Prior:
     misalignment_sd: sd of the elements of M [rad]
     column_sd: sd of the weights of the columns, each divided by its RMS, in the bias [m/s^2] and
         in the scale (relative); 0 for an inactive column, shape (2, m)
-    offset_sd: sd of the bias offset of each position and axis by mounting and turn-on [m/s^2]
-    turn_on_sd: sd of the bias offset that all positions of a bag share, by its turn-on [m/s^2]
+    offset_sd: sd of the bias offset of each position and axis, of mounting and turn-on [m/s^2]
+    turn_on_sd: sd of the bias offset that all positions of a bag share, its turn-on [m/s^2]
     sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
     least_sigma: lower bound of sigma [m/s^2]; by default it is below the noise of any sensor
     noise: slow noise

@@ -38,7 +38,7 @@ def with_unseen_axes(
     """
     Add the error of axes at temperatures at which no position determines their scale factor.
 
-    `lacks`: lack of fit of each regime by left-out data; `known`: calibration that was the prior.
+    `lacks`: lack of fit of each regime on left-out data; `known`: calibration that was the prior.
     The lack of fit of the prior holds for an axis at temperatures at which no new position
     determines the axis' scale factor.
     """

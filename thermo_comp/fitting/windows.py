@@ -34,7 +34,7 @@ from .unknowns import Windows
 #: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
 #: slope at a temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
-#: Groups whose columns, with those of the curve, are summed in a curve over a part's temperature.
+#: Groups of columns that, added to the curve, make it a curve over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
 #: Groups of columns linear in a difference of temperatures; groups of the products of such a
 #: difference with temperature, and of its squares.
@@ -193,7 +193,7 @@ class _Rows(NamedTuple):
     thermal: board temperature [degC], its rate [K/s], weight of the dynamic set, gradient [K], and
         the columns of the response without powers of t, as in `ThermalWindows`, shape (n, 4 + k)
     columns: values of the columns, as in `Windows`
-    start: derivatives of the k columns of the response by their initial lag states, shape (n, k)
+    start: derivatives of the k response columns w.r.t. their initial lag states, shape (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3) or (n, 0)
     """
 
@@ -239,8 +239,8 @@ def thermal_windows(
                 numbers.append(number)
         if not rests or rests[-1][0] is not bag:
             raise FitError(
-                f'{bag.source.name}: no temperatures during its rests: are the stamps of '
-                'thermometer and accelerometer of two clocks?'
+                f'{bag.source.name}: no temperatures during its rests: do the stamps of '
+                'thermometer and accelerometer come from two clocks?'
             )
     sizes = [len(part.time) for part in parts]
     rows = _Rows(*(np.concatenate(values) for values in zip(*parts, strict=True)))

@@ -100,7 +100,7 @@ _TABLE = (
     ('dynamic_ug', 'number', '|f| - g at rest, RMS, dynamic regime'),
     ('all_ug', 'number', '|f| - g at rest, RMS'),
     ('peak_ug', 'number', 'largest |f| - g of a window at rest'),
-    ('unseen_ug', 'number', '|f| - g of each position by a fit to all other positions, RMS'),
+    ('unseen_ug', 'number', '|f| - g of each position with a fit to all other positions, RMS'),
     ('claimed_ug', 'number', 'RMS of the claimed standard deviation of the windows'),
     ('cpu_s', 'number', 'processor time of reading and fit'),
     ('tool_version', 'text', 'version of thermo_comp that fitted the unit'),

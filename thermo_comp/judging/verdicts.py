@@ -101,7 +101,7 @@ def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats
 
 
 def by_force(windows: Windows, claimed: Floats) -> dict[float, Section]:
-    """Summarise the residuals by known |f| [m/s^2]; empty if |f| is gravity in all windows."""
+    """Summarise the residuals per known |f| [m/s^2]; empty if |f| is gravity in all windows."""
     if windows.is_usual.all():
         return {}
     order = np.argsort(windows.size, kind='stable')
@@ -170,8 +170,8 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
         correction = Correction(triad, Correction(calibration).memory)
         bias, change = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
-        # Errors by thermometer noise and unknown initial lag states nearly vanish in the mean of a
-        # rest, so a change from the mean has their whole variance.
+        # Errors due to thermometer noise and unknown initial lag states nearly vanish in the mean
+        # of a rest, so a change from the mean has their whole variance.
         of_thermometers = np.maximum(variance - np.array(correction.noise) - slow - bias, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]

@@ -47,8 +47,8 @@ class Windows:
     is a still interval, numbered through all bags. `rate`: rate of the board temperature [K/s].
     `is_dynamic`: the dynamic set has more than half the weight; `is_inside`: the window is
     entirely inside the calibrated ranges; `is_swapped`: the board temperature leads that of the
-    case. `raw` is the specific force by the constants at the reference temperature, `force` by the
-    calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the bag states
+    case. `raw` is the specific force with the constants at the reference temperature, `force` with
+    the calibration, shapes (n, 3). `size`: the known |f|, which is gravity unless the bag states
     another value. `claimed_sd` of the norm of `force`: error of the calibration, error of `size`,
     and white noise of the mean; `noise_sd`: the white noise alone. Rows of `gyro`: angular rate
     raw and corrected, its claimed variances, the thermal state; empty without a gyroscope.
@@ -84,12 +84,12 @@ class Windows:
 
     @cached_property
     def raw_residual(self) -> Floats:
-        """|f| by the constants at the reference temperature, less `size`, (n,) [m/s^2]."""
+        """|f| with the constants at the reference temperature, less `size`, (n,) [m/s^2]."""
         return norm_residual(self.raw, self.size)
 
     @cached_property
     def residual(self) -> Floats:
-        """|f| by the calibration, less `size`, shape (n,) [m/s^2]."""
+        """|f| with the calibration, less `size`, shape (n,) [m/s^2]."""
         return norm_residual(self.force, self.size)
 
     @property

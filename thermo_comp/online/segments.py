@@ -5,7 +5,7 @@ Owns the segments: time intervals between temperature readings, with a correctio
 
 A segment ends at a temperature reading, or after one second. The correction is evaluated in full
 at both ends of a segment, so a sample costs a few operations, the output has no steps between two
-readings, and a batch needs one evaluation per segment. The part of the variance by parameters and
+readings, and a batch needs one evaluation per segment. The variance due to the parameters and
 initial lag states, which changes slowly, is evaluated at the first segment in each ten seconds.
 """
 
@@ -41,7 +41,7 @@ UNMEASURED_SD_K: Final = 10.0
 
 class SlowState(NamedTuple):
     """
-    Arguments of the variance by parameters and initial lag states: the thermal state, remaining
+    Arguments of the variance due to parameters and initial lag states: thermal state, remaining
     shares of the lags' unknown initial states, `ThermalMemory.start_rate`.
     """
 

@@ -179,7 +179,7 @@ class Block:
 
     @property
     def stamp_ns(self) -> dict[Role, Ints]:
-        """The stamps of each role."""
+        """The stamps of each role, such as accel, board or case."""
         stamps = {name: readings.stamp_ns for name, readings in self.temperatures.items()}
         return {'accel': self.accel_stamp_ns, **stamps}
 
@@ -297,8 +297,8 @@ def clocks_apart(block: Block) -> str:
         apart_s = (stamp_ns - np.clip(stamp_ns, *edges)) * 1e-9
         if len(apart_s) >= _FEWEST_READINGS and abs(middle := np.median(apart_s)) > _APART_S:
             return (
-                f'{name} readings are stamped {middle:+.0f} s from the samples around them: are '
-                'the stamps of thermometer and accelerometer of two clocks?'
+                f'{name} readings are stamped {middle:+.0f} s from the samples around them: do '
+                'the stamps of thermometer and accelerometer come from two clocks?'
             )
     return ''
 

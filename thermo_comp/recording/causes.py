@@ -40,7 +40,7 @@ class CauseCounter:
         """Describe why the samples cannot be those of an accelerometer at rest; '' if they can."""
         if self._n_absent > _FAULT_SHARE * self._n:
             return (
-                'its messages say that they hold no acceleration '
+                'its messages are marked as without acceleration '
                 '(linear_acceleration_covariance[0] = -1): another topic of the driver has it'
             )
         if self._n > 1 and len(self._stamps_ns) == 1:

@@ -136,7 +136,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
         if len(data) != span.size:
             raise DamagedError(f'{len(data)} bytes after decompression, expected {span.size}')
         if checksum and zlib.crc32(data.data) != checksum:
-            raise DamagedError('the checksum does not fit the content')
+            raise DamagedError('the checksum does not match the content')
         messages = locate(data, memoryview(record)[span.length :], on_record)
         log_ns = messages.log_ns
         if len(log_ns) and (np.min(log_ns) < span.start_ns or np.max(log_ns) > span.end_ns):

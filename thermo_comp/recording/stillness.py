@@ -204,7 +204,7 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # A buffer that is polled gives bursts of samples at a constant interval, 5 s at most,
+            # A buffer that is polled gives bursts of samples at a constant interval, at most 5 s,
             # and a cell contains two bursts. Pauses of a tumble by hand are irregular or longer.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
@@ -270,7 +270,7 @@ def _quantum_of(samples: Floats) -> Floats:
         # One change or two may be turns of the unit.
         if len(changes) < 3:
             continue
-        # Changes by the same multiple of the quantum differ by rounding only.
+        # Changes of the same multiple of the quantum differ by rounding only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         # All changes must be whole multiples of the smallest change.
         steps = changes / changes[0]

@@ -30,7 +30,7 @@ from .fields import Field, typestore
 from .serialized import Messages, gather, number_at
 from .topics import shown
 
-#: Places of the fields of `ImuColumns` among the 37 numbers of sensor_msgs/Imu.
+#: Indices of the fields of `ImuColumns` among the 37 numbers of sensor_msgs/Imu.
 _IMU_COLUMNS = (slice(0, 4), slice(4, 13), slice(13, 16), slice(16, 25), slice(28, 37))
 _IMU_ACCELERATION = slice(25, 28)
 
@@ -163,7 +163,7 @@ def encode_stamped(
 ) -> Bytes:
     """
     Serialize (CDR, little-endian) a header and float64 numbers as rows of bytes, shape (n, size).
-    Each piece is the place of its first number in the message, and values of shape (n, width), or
+    Each piece is the index of its first number in the message, and values of shape (n, width), or
     (width,) if equal in all messages; other numbers are 0.
     """
     text = frame_id.encode() + b'\0'

@@ -33,7 +33,7 @@ _AUTO_FLUSH_BYTES = 1 << 26
 #: Formats of tables by the suffix of the file.
 TABLES: Mapping[str, Kind] = {'.csv': CSV, '.parquet': PARQUET}
 WriteRows = Callable[[Mapping[str, NDArray[Any]]], None]
-#: Field of a message: place of its first number, name, values of all messages, count of numbers.
+#: Field of a message: index of its first number, name, values of all messages, count of numbers.
 _Column = tuple[int, str, ArrayLike, int]
 
 

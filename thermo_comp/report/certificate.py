@@ -78,7 +78,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     claimed = noise
     if calibration.has_uncertainty:
         x, y, z = (windows.force / np.linalg.norm(windows.force, axis=1, keepdims=True)).T
-        # Derivatives of |f| = g by M[1][0], M[2][0] and M[2][1].
+        # Derivatives of |f| = g w.r.t. M[1][0], M[2][0] and M[2][1].
         by_element = np.stack((x * y, x * z, y * z)) * windows.gravity
         attitude = _rms(np.linalg.norm(by_element.T * calibration.misalignment_sd, axis=1))
         claimed = _rms(windows.claimed_sd)
@@ -217,7 +217,7 @@ def _four_digits(value: Floats) -> Floats:
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
-    """Return the scale's relative uncertainty by gravity; NaN if gravity's sd is not stated."""
+    """Return the scale's relative uncertainty due to gravity; NaN if its sd is not stated."""
     sd = unclaimed_gravity_sd(evidence, info)
     if sd is None or evidence.calibration is None:
         return np.nan

@@ -117,12 +117,12 @@ def render_report(
 
 
 def position_error(bias: float, time: float) -> float:
-    """Return the position error [m] by a constant horizontal error [m/s^2] after a time [s]."""
+    """Return the position error [m] of a constant horizontal error [m/s^2] after a time [s]."""
     return 0.5 * bias * time * time
 
 
 def schuler_peak(bias: float) -> float:
-    """Return the largest position error [m] by a constant bias, 2 R b / g, after 42 minutes."""
+    """Return the largest position error [m] of a constant bias, 2 R b / g, after 42 minutes."""
     return 2.0 * _EARTH_RADIUS * bias / STANDARD_GRAVITY
 
 
@@ -261,8 +261,8 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             of_unit.draw_rates,
             'Bias of the gyroscope over temperature, in a soak and in ramps, less the '
             'value at the reference temperature and less a straight line, whose slope stands '
-            'above each panel. Hatched: 95 % band, of the constant as well, which the Earth’s '
-            'rate and the turn-on blur.',
+            'above each panel. Hatched: 95 % band; it includes the uncertainty of the constant '
+            'due to the Earth’s rate and the turn-on offset.',
             '' if judged is None else f'Judged on these bags, {judged}.',
         )
 

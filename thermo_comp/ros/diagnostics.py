@@ -32,7 +32,7 @@ from .relay import Relay
 from .waitloop import WaitLoop
 
 IDLE_S = 5.0  # time without samples until readings apply [s]; Fast DDS may deliver 3 s late
-#: Readings stamped later than the samples by more than this time are of another clock [s].
+#: Readings stamped later than the samples by more than this time use another clock [s].
 AHEAD_S = 5.0
 #: The samples have stopped if the next sample is late by more than both times [cycles], [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5

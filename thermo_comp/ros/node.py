@@ -53,7 +53,7 @@ parameters:
 #: Prefix that the launch file puts before the name of a parameter whose argument is missing.
 NOT_GIVEN = 'not_given.'
 
-#: Errors by the user's files, values or environment, or by the middleware (RuntimeError).
+#: Errors caused by the user's files, values or environment, or the middleware (RuntimeError).
 _USER_ERRORS = (ThermoCompError, OSError, RuntimeError, rclpy.exceptions.ParameterException)
 
 

@@ -4,9 +4,9 @@
 Owns the node's parameters: their table, and the services that set them.
 
 The table of the parameters is `NodeConfig`. The node runs with one immutable `NodeConfig`; a
-change makes a new `NodeConfig` or is refused as a whole. A thread waits while a file is read; the
-loop then replaces the reference to the `NodeConfig`. Requests are answered in order of arrival,
-but a request without a file does not wait for requests with files.
+change makes a new `NodeConfig` or is refused as a whole. Files are read while a separate thread
+waits; the node's loop then replaces the reference to the `NodeConfig`. Requests are answered in
+order of arrival, but a request without a file does not wait for requests with files.
 """
 
 import math

@@ -3,7 +3,7 @@
 """
 Owns the rest log of the node: samples at rest become lines of files, without delaying the relay.
 
-The relay appends references of messages to a list. The messages are summed in blocks of `BLOCK`,
+The relay appends references to messages to a list. The messages are summed in blocks of `BLOCK`,
 as arrays; a thread writes the lines, so a slow or hanging disk delays nothing. Rests that cannot
 be kept are counted and named in the diagnostics.
 """
@@ -28,7 +28,7 @@ from .reader import LoadedCalibration
 
 #: Number of messages in a summed block; a block is shorter if a report is due earlier.
 BLOCK = 1024
-#: Largest size of the file of a day, and of the folder [bytes]; a month takes 10 MB at most.
+#: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
 #: Size up to which the file of a day is not thinned to bound the size of the folder [bytes].
 _UNTHINNED_BYTES = 16_000
@@ -55,7 +55,7 @@ class RestLog:
         except OSError as error:
             raise OutputError(f'parameter `rest_log`: {error.strerror}', folder) from error
         if not os.access(self._folder, os.W_OK | os.X_OK):
-            raise OutputError('parameter `rest_log`: the folder is closed to the node', folder)
+            raise OutputError('parameter `rest_log`: the node may not write to the folder', folder)
         self.n_rests = self.n_days = self.n_lost = 0
         self.reason = ''
         self._is_torn = True  # the file's last line may be incomplete

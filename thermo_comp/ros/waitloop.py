@@ -60,7 +60,7 @@ class Sources:
     """
     Decides whether a topic's messages are from one publisher while several publishers are known.
 
-    The middleware lists a killed publisher for the time of its lease, 20 s. Messages do not
+    The middleware lists a killed publisher until its lease of 20 s ends. Messages do not
     identify their publisher, but each publisher numbers its messages, so consecutive numbers over
     a long enough time come from one publisher.
     """
@@ -305,7 +305,7 @@ class WaitLoop:
             if now - self._logged_ns >= _LOG_PERIOD_NS:
                 self._logged_ns = now
                 lines = ''.join(traceback.format_exception(error)).splitlines()
-                text = '\n'.join(['a callback failed, samples go on:', *map(one_line, lines)])
+                text = '\n'.join(['a callback failed, the node goes on:', *map(one_line, lines)])
                 self.node.get_logger().error(text)
             return None
 

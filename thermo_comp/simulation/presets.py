@@ -210,7 +210,7 @@ def tempcos(draw: Specimen) -> dict[str, Any]:
 def loads(draw: Specimen) -> list[Effect]:
     """
     Draw the effect of Golovach's paper: while the ambient temperature changes, bias and scale have
-    another offset, slope and curvature than in a soak, as by a heat pump at its supply limit.
+    another offset, slope and curvature than in a soak, as with a heat pump at its supply limit.
     """
     knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
     sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))

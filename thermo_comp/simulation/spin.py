@@ -48,7 +48,7 @@ class Spin:
         return np.interp(time, self.time_s, self.rate)
 
     def forces(self, upward: Floats, time: Floats) -> Floats:
-        """Return the specific force by rotation and gravity at times [s], shape (n, 3)."""
+        """Return the specific force of rotation and gravity at times [s], shape (n, 3)."""
         return np.asarray(upward + (self.rate_at(time) ** 2 * self.radius)[:, None] * self.inward)
 
     def sections(self, gravity: float) -> list[tuple[float, float, float]]:

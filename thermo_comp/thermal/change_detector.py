@@ -64,8 +64,8 @@ class ChangeDetector:
             TUNING * math.pow(sqrt(self._noise) / (share * onset), 0.4) for share in BEND_SHARES
         ]
         self._powers = [self._noise / memory**4 for memory in memories]
-        # Crossings per second of a threshold of h sd: acos(rho) / (2 pi dt) exp(-h^2 / 2), for
-        # each of two filters and two signs.
+        # False alarms per second at a threshold of h sd: acos(rho) / (2 pi dt) exp(-h^2 / 2) for
+        # each filter and sign, rho the correlation of the noise of rates dt apart.
         self._log_crossings = -log(2.0 * pi * false_alarms / (2.0 * len(self._powers)))
         self._edge_noise = sensor.noise_sd_c * sqrt(2.0)
         self._quantum = sensor.quantum_c

@@ -63,7 +63,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def by_board(self) -> float:
-        """Derivative by the board temperature, at constant first-order lags L."""
+        """Derivative w.r.t. the board temperature, at constant first-order lags L."""
         if self.input != BOARD_INPUT:
             return 0.0
         return 1.0 if self.second_tau_s else self.shares[0]

@@ -52,7 +52,7 @@ LEAD_SHARE: Final = 0.15
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
-_NOISE_SDS: Final = 6.0  # largest deviation of a temperature by noise, in sd
+_NOISE_SDS: Final = 6.0  # largest deviation of a temperature due to noise, in sd
 #: Time [ns] for which the rates of both sensors must be low before the temperatures count as
 #: constant: estimates of rates start at 0, also in a unit that heats itself after switch-on.
 _CALM_NS: Final = 120 * 10**9
@@ -69,7 +69,7 @@ class Fault(Enum):
     #: A reading that changed faster than any part of a unit can: it is not used.
     STEP = 'jumped'
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
-    #: as by a loose thermometer: its readings are used, with a larger variance.
+    #: as with a loose thermometer: its readings are used, with a larger variance.
     LOOSE = 'apart'
 
 
@@ -227,7 +227,7 @@ class SensorCheck:
         return self._jumped * exp(-max(stamp_ns - self._jumped_ns, 0) * self._decay)
 
     def extra_variance(self, stamp_ns: int) -> float:
-        """Return the variance of a temperature by constant readings and jumps [K^2]."""
+        """Return the variance of a temperature due to constant readings and jumps [K^2]."""
         return self._jump_at(stamp_ns) + self.still(stamp_ns)[0] ** 2
 
     def still(self, stamp_ns: int) -> tuple[float, float]:

@@ -25,5 +25,5 @@ class Quantity:
 
     @property
     def by_board(self) -> float:
-        """Derivative by the board temperature, at constant lags and other temperatures."""
+        """Derivative w.r.t. the board temperature, at constant lags and other temperatures."""
         return float(self.input == 'board')

@@ -214,7 +214,7 @@ class Thermometer:
         return True
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
-        """Extrapolate temperature, rate and variance to a stamp, for a few intervals at most."""
+        """Extrapolate temperature, rate and variance to a stamp, for at most a few intervals."""
         if self.stamp_ns is None:
             return nan, nan, inf
         if not self.is_ready:

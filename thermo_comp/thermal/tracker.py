@@ -297,7 +297,7 @@ class ThermalTracker:
 
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
-        Estimate a gradient while its sensor is lost: the gradient by self-heating, from the last
+        Estimate a gradient while its sensor is lost: the gradient of self-heating, from the last
         rest or else from the fit, plus the board's lag times its rate.
         """
         lag = self._board_lag_s

@@ -226,7 +226,7 @@ class Calibration:
     ] = None
     soak_gradient_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'T_s - T_board in a soak, by self-heating, and its sd, s: first of `sensors`; null: '
+        'T_s - T_board in a soak, from self-heating, and its sd, s: first of `sensors`; null: '
         'unknown, 0 is assumed. Used in certificates and exported files.',
     ] = None
     detector: Annotated[

@@ -134,7 +134,7 @@ class Column:
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],
-        'Range to which the value is limited, before the factors by `power` and `during`.',
+        'Range to which the value is limited, before the factors for `power` and `during`.',
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -359,7 +359,7 @@ class ColumnTable:
         return excess
 
     def factors(self, board: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """Return the factor phi / u (power of t times regime weight) and its derivative by t."""
+        """Return the factor phi / u (power of t times regime weight), and its slope over t."""
         t = hold(board - self._reference, *self._t_range)
         n_powers = int(self._power.max(initial=0))
         powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
@@ -374,8 +374,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate u, without limits of range: by the number that u is computed from, and by the
-        board temperature at a given lag (None if no column depends on the board temperature).
+        Differentiate u, without limits of range: w.r.t. the number that u is computed from, and
+        w.r.t. the board temperature at a given lag (None if no column depends on the temperature).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

@@ -43,9 +43,9 @@ _LEAST_SHARE = 1e-13
 #: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
 #: samples do not overflow.
 _LARGEST = 1e140
-#: Places of the variances of the axes at zero force in a result of `Correction.line`.
+#: Indices of the variances of the axes at zero force in a result of `Correction.line`.
 VARIANCES = tuple(12 + place for place in CONSTANTS)
-#: Places of the variances of the relative scale of the axes in a result of `Correction.line`: the
+#: Indices of the variances of the relative scale of the axes in a result of `Correction.line`: the
 #: coefficients of x^2 in xx, y^2 in yy, z^2 in zz.
 SCALE_VARIANCES = tuple(place + last for place, last in zip(VARIANCES, (2, 5, 9), strict=True))
 #: Number of thermal states from which one call per column costs less than a table of all sums.
@@ -177,8 +177,8 @@ class Correction:
 
     def by_pairs(self, slopes: Floats) -> Floats:
         """
-        Differentiate bias and relative scale by the quantities of `Layout.pairs`, (p, 6, n), given
-        the derivatives of the columns phi by these quantities, (n_columns, n).
+        Differentiate bias and relative scale w.r.t. the quantities of `Layout.pairs`, (p, 6, n),
+        given the derivatives of the columns phi w.r.t. these quantities, (n_columns, n).
         """
         columns = self._pair_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))

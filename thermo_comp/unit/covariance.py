@@ -43,7 +43,7 @@ _TERMS: Final = [
     [(i, j) for i, j in combinations_with_replacement(range(4), 2) if i < first and j < second]
     for first, second in combinations_with_replacement((2, 3, 4), 2)
 ]
-#: Number of coefficients of all six elements, and the places of the constants of xx, yy, zz.
+#: Number of coefficients of all six elements, and the indices of the constants of xx, yy, zz.
 N_COEFFICIENTS: Final = sum(map(len, _TERMS))
 CONSTANTS: Final = tuple(sum(map(len, _TERMS[:element])) for element in (0, 3, 5))
 
@@ -63,7 +63,7 @@ class CovarianceMap:
 @lru_cache(maxsize=16)
 def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
     """Return which rows of the covariance of u a coefficient sums, and the factors of the rows."""
-    # Derivative of the force by the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
+    # Derivative of the force w.r.t. the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
     J = np.zeros((3, 4, 9))
     J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0
     J[2] += zx * J[0] + zy * J[1]
@@ -79,7 +79,7 @@ def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
     factors = sums[:, u, w]
     # The row b of an axis is twice the covariance of its constant error and its scale error.
     factors[:, 1:9:3] /= 2.0
-    # In each sum few rows have a factor other than 0: keep the places and factors of these rows.
+    # In each sum few rows have a factor other than 0: keep the indices and factors of these rows.
     n = int((factors != 0.0).sum(axis=1).max())
     used = np.argsort(factors == 0.0, axis=1, kind='stable')[:, :n]
     return used, np.take_along_axis(factors, used, axis=1)[:, :, np.newaxis]

@@ -88,7 +88,7 @@ class Curves:
     @cached_property
     def _tangents(self) -> Floats:
         """
-        Slopes of the curves at the lower and the upper end, laid out as by `slopes`, (2, 2, 6, 1).
+        Slopes of the curves at the lower and upper end, in the layout of `slopes`, (2, 2, 6, 1).
         """
         ends = zip(self._t_range, self._leads, strict=True)
         return np.array([self._functions.evaluate(t, 'slope')[leads] for t, leads in ends])
@@ -96,7 +96,7 @@ class Curves:
     @cached_property
     def _basis_slopes(self) -> list[list[list[Floats]]]:
         """
-        Derivatives of each function's slope, at both ends of its range, by free coefficients.
+        Derivatives of each function's slope, at both ends, w.r.t. its free coefficients.
         """
         rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [
@@ -129,14 +129,14 @@ class Curves:
 
     def slopes(self, board: Floats) -> Floats:
         """
-        Differentiate the bias and scale of both sets by the board temperature [per K], (2, 6, n).
+        Differentiate bias and scale of both sets w.r.t. the board temperature [per K], (2, 6, n).
         """
         held = hold(board - self._reference, *self._t_range)
         return self._functions.evaluate(held, 'slope')
 
     def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
         """
-        Differentiate biases and scales by the parameters of the curves, in the posterior's order.
+        Differentiate biases and scales w.r.t. the curves' parameters, in the posterior's order.
         """
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
@@ -166,7 +166,7 @@ class Curves:
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
-        Differentiate values beyond the ranges by the free coefficients of a function, (n_free, n).
+        Differentiate values beyond the ranges w.r.t. a function's free coefficients, (n_free, n).
         Beyond the range of a set, its values are a tangent plus the constant difference of sets.
         """
         function = self._functions.rows[regime][place]

@@ -106,7 +106,7 @@ class Polynomial(_Family):
         return tuple(k * c for k, c in enumerate(self.coefficients))[1:] or (0.0,)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives of the polynomial by its free coefficients: t, t^2, ..."""
+        """Evaluate the derivatives of the polynomial w.r.t. its free coefficients: t, t^2, ..."""
         return list(np.multiply.accumulate([np.asarray(t)] * self.n_free)) if self.n_free else []
 
 
@@ -163,7 +163,7 @@ class CubicSpline(_Family):
         return self._along(self._pieces, t, is_slope=is_slope)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives of the spline by its free values: the cardinal splines."""
+        """Evaluate the derivatives of the spline w.r.t. its free values: the cardinal splines."""
         return [self._along(pieces, np.asarray(t)) for pieces in self._cardinal_pieces]
 
     def _along(self, pieces: Floats, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -219,7 +219,7 @@ class Exponential(_Family):
         return np.asarray(result)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the function's derivatives by the amplitudes, with a fixed reference value."""
+        """Evaluate the derivatives w.r.t. the amplitudes; the value at t = 0 stays constant."""
         return [by_element(math.exp, t / e_fold) - 1.0 for e_fold in self.e_fold_k]
 
 
@@ -274,7 +274,7 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
-    """Differentiate the functions of `basis` by the temperature, at `t` [per K]."""
+    """Differentiate the functions of `basis` w.r.t. the temperature, at `t` [per K]."""
     units = np.eye(function.n_free).tolist()
     return [float(function.with_free(tuple(unit), 0.0).slope(t)) for unit in units]
 

@@ -149,7 +149,7 @@ def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[fl
 def _regressors(
     functions: Sequence[TemperatureFunction], edges: Sequence[Sequence[float]]
 ) -> list[float]:
-    """Return the largest derivative of each function by its level and each free coefficient."""
+    """Return each function's largest derivative w.r.t. its level and each free coefficient."""
     pairs = zip(functions, edges, strict=True)
     both = [function.basis(np.array(ends)) for function, ends in pairs]
     return [size for basis in both for size in (1.0, *(float(np.abs(v).max()) for v in basis))]

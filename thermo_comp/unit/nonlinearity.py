@@ -40,7 +40,7 @@ AT_REST = 1.01
 #: sufficient.
 LARGEST_SLOPE = 0.2
 
-#: Place of the first coefficient of the nonlinearity in a result of `Correction.line`.
+#: Index of the first coefficient of the nonlinearity in a result of `Correction.line`.
 _NONLINEAR: Final = 12 + N_COEFFICIENTS
 
 # Type of a quantity: the value of one sample, or an array of many samples.
@@ -230,7 +230,7 @@ class ForceCorrection:
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
     def regressors(self, force: Floats, board: Floats) -> Floats:
-        """Differentiate the readings by the coefficients in the file's order, (n, 3, 2 k)."""
+        """Differentiate the readings w.r.t. the coefficients in the file's order, (n, 3, 2 k)."""
         size = np.abs(force)
         each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
         values = [each[term.kind] / unit_of(term.kind) for term in self._of.terms]

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns predictions for a thermal state: the slowly varying error covariance (by the parameters, and
-by lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
+Owns predictions for a thermal state: the slowly varying error covariance (due to the parameters,
+and to lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
 
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
 of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
@@ -29,7 +29,7 @@ _CHUNK: Final = 64
 
 
 class SlowUncertainty:
-    """Error covariance of a thermal state by the posterior and the unknown initial lag states."""
+    """Error covariance of a thermal state due to the posterior and unknown initial lag states."""
 
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction
@@ -79,16 +79,16 @@ class SlowUncertainty:
 
     def of_start(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         """
-        Differentiate bias [input units] and scale [relative] by the unknown initial lag states, as
-        variables of unit variance, shape (n_unknown, 6, n). `rates`: largest known rate of the
-        board temperature since the start, (n,) [K/s].
+        Differentiate bias [input units] and scale [relative] w.r.t. the unknown initial lag
+        states, as variables of unit variance, shape (n_unknown, 6, n). `rates`: largest known
+        rate of the board temperature since the start, (n,) [K/s].
         """
         table = self._correction.table
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # After a start in a ramp, a part was behind the board by at most the lag in a long ramp at
-        # the largest rate since the start, and by at most the span of the calibrated temperatures.
+        # If the unit was started in a ramp, a part's lag at the start was at most the lag in a
+        # long ramp at the largest rate since then, and at most the calibrated temperature span.
         behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
@@ -137,8 +137,8 @@ class SlowUncertainty:
         self, states: Floats, mean_of: Callable[[Floats], Floats]
     ) -> tuple[Floats, Floats]:
         """
-        Return the variance of the bias by the parameters at thermal states (n, width), and that of
-        the difference of the bias from its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
+        Return the variance of the bias due to the parameters at thermal states (n, width), and
+        of the difference of the bias from its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -235,7 +235,7 @@ def ramp_states(
 ) -> Floats:
     """
     Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s];
-    the gradient by self-heating is that of a soak.
+    the gradient of self-heating is that of a soak.
     """
     layout = Layout(memory_of_unit(calibration))
     states = np.zeros((len(temperature), layout.width))

@@ -26,7 +26,7 @@ class GroupEvidence:
     log_evidence_change: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Loss of log evidence without the group or, with a prior, at the prior mean.',
+        'Loss of log evidence without the group or, with a prior, with weights at its mean.',
     ]
     prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
 

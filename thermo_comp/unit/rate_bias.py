@@ -79,7 +79,7 @@ class Gyroscope:
     ] = NIL
     residual_sd_rad_s: Annotated[
         tuple[_Deviation, _Deviation, _Deviation],
-        'Sd of the slowly varying error that the correction leaves, as by turn-ons.',
+        'Sd of the slowly varying error that the correction leaves, such as turn-on offsets.',
     ] = NIL
     response: Annotated[
         tuple[RateTerm, ...], QUANTITIES['columns'], 'Columns of the thermal response.'
