@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from position_helpers import GRAVITY, Rest
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, normal_gravity
 from thermo_comp.fitting.raw_checks import judge_bags
-from thermo_comp.fitting.reduction import Readings, is_spike, reduce_source
+from thermo_comp.fitting.reduction import Readings, is_spike, reduce_source, rounding_sd
 from thermo_comp.fitting.sensors import learn_detector, learn_thermometer, quantum_of
 from thermo_comp.recording.stillness import CellAccumulator
 from thermo_comp.simulation.campaign import positions
@@ -397,3 +398,43 @@ def test_an_axis_with_a_coarse_quantum_is_at_rest(step, rng):
     bag = reduced([block(np.round(accel) * step)], full_scale=None)
     assert len(bag.intervals) == 1
     assert bag.n_still_cells == bag.n_cells
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.2, 0.3])
+def test_noise_averages_the_error_of_rounding(rng, noise):
+    # The level of 400 rests is uniform within a step, and each rest has 4000 samples.
+    level = rng.uniform(-0.5, 0.5, 400)
+    samples = np.rint(level[:, None] + noise * rng.standard_normal((400, 4000)))
+    error = samples.mean(axis=1) - level
+    # Variance of rounded samples: that of the noise and of rounding.
+    variance = np.full(3, noise**2 + 1.0 / 12.0 if noise else 0.0)
+    (expected, _, _) = rounding_sd(variance, np.zeros(3), np.ones(3))
+    # Noise averages the harmonics of the error, a sawtooth, of which the first has 78 % of its sd.
+    assert 0.7 * expected < np.sqrt(np.mean(error**2)) < 1.1 * expected
+
+
+def test_a_drift_averages_the_error_of_rounding(rng):
+    level = rng.uniform(-0.5, 0.5, 400)
+    drift = np.linspace(0.0, 5.3, 1000)
+    error = np.mean(np.rint(level[:, None] + drift) - level[:, None] - drift, axis=1)
+    (expected, _, _) = rounding_sd(np.zeros(3), np.full(3, 5.3), np.ones(3))
+    assert np.sqrt(np.mean(error**2)) < expected
+
+
+@pytest.mark.parametrize('step', [1.0, 0.04])
+def test_steps_of_a_converter_after_a_constant_soak_are_no_rests(rng, step):
+    # WHY: the step of the converter was looked for in the first 20000 samples only, and a bag
+    # that began with a constant soak was cut into a rest for each later step.
+    rest = Rest(rng, duration_s=3600.0, sd=0.0)
+    ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
+    rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
+    bag = reduce_source(rest.source(), full_scale=None)
+    assert len(bag.intervals) == 1
+
+
+def test_a_turn_is_no_step_of_the_converter(rng):
+    # WHY: the only change of constant samples, a turn, counted as the step of the converter.
+    rest = Rest(rng, sd=0.0)
+    rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
+    bag = reduce_source(rest.source(), full_scale=None)
+    assert len(bag.intervals) == 2

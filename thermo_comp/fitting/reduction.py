@@ -417,12 +417,12 @@ def _windows(
         count=total,
         mean=mean,
         sample_sd=np.sqrt(variance),
-        rounding_sd=_rounding_sd(variance, np.ptp(mean, axis=0), cells.quantum),
+        rounding_sd=rounding_sd(variance, np.ptp(mean, axis=0), cells.quantum),
         angular_rate=block_means(cells.rate[rows], count, offsets) if has_rate else None,
     )
 
 
-def _rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
+def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
     """
     Return the sd of the error of a mean by rounding to a converter's steps, shape (3,).
 

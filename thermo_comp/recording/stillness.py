@@ -117,6 +117,7 @@ class CellAccumulator:
         self._n_repeated = 0
         self._is_integer, self._is_negative = True, False
         self._middle, self._quantum = 0.0, np.zeros(3)
+        self._few_changes = [np.zeros(0)] * 3
 
     def add(self, stamp_ns: Ints, samples: Floats, rate: Floats | None = None) -> None:
         """Add the next samples and angular rates, shape (n, 3), in file order, to the cells."""
@@ -146,7 +147,9 @@ class CellAccumulator:
             if self._n_looked_at >= _QUANTUM_SAMPLES:
                 break
             part = samples[first : first + _QUANTUM_SAMPLES - self._n_looked_at]
-            self._quantum = np.where(self._quantum > 0.0, self._quantum, _quantum_of(part))
+            self._quantum = np.where(
+                self._quantum > 0.0, self._quantum, _quantum_of(part, self._few_changes)
+            )
             self._n_looked_at += int((part[1:] != part[:-1]).any(axis=1).sum()) + 1
         if self._is_integer:
             self._is_integer = bool((samples == np.rint(samples)).all())
@@ -261,13 +264,18 @@ def _part_of(window_s: float, least: float) -> float:
     return least
 
 
-def _quantum_of(samples: Floats) -> Floats:
-    """Return the quantum of each axis from the changes between samples; 0 without a quantum."""
+def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
+    """
+    Return the quantum of each axis from the changes between samples; 0 without a quantum.
+
+    `few`: for each axis the changes of earlier samples, if they were too few; it is updated.
+    """
     result = np.zeros(3)
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
-        changes = np.sort(changes[changes > 0.0])
+        changes = np.sort(np.concatenate((few[axis], changes[changes > 0.0])))
         # One change or two may be turns of the unit.
+        few[axis] = changes[: 3 * (len(changes) < 3)]
         if len(changes) < 3:
             continue
         # Changes of the same multiple of the quantum differ by rounding only.
