@@ -56,8 +56,8 @@ class StillInterval:
     n_whole: number of windows of full length; a shorter window may follow
     time, count, mean: mean time [s], number and mean of the samples of each window
     sample_sd: median over the cells of the standard deviation of single samples, shape (3,)
-    rounding_sd: sd of the error of the mean by the converter's rounding, which noise below half of
-        a step does not average out, shape (3,)
+    rounding_sd: sd of the error of the mean by the converter's rounding, 0 for samples with noise,
+        shape (3,)
     angular_rate: mean rate of each window [rad/s], or None if a part of the bag has no rate
     """
 
@@ -426,14 +426,8 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
     """
     Return the sd of the error of a mean by rounding to a converter's steps, shape (3,).
 
-    `variance`: of the rounded samples; `drift`: range of the means. Gaussian noise of sd s, in
-    steps, reduces the error of a mean by the factor exp(-2 pi^2 s^2), the characteristic function
-    at one cycle per step; a drift over n steps averages the errors of n + 1 steps.
+    `variance`: of the rounded samples of most cells; noise that shows in them averages the error.
+    `drift`: range of the means; a drift over n steps averages the errors of n + 1 steps.
     """
-    noise = np.maximum(variance - quantum**2 / 12.0, 0.0)
-    noise, drift = (
-        np.divide(x, unit, where=unit > 0.0, out=np.zeros(3))
-        for x, unit in ((noise, quantum**2), (drift, quantum))
-    )
-    by_noise = np.exp(-2.0 * np.pi**2 * noise)
-    return np.asarray(quantum / 12.0**0.5 * by_noise / (1.0 + drift))
+    steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
+    return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))
