@@ -3,17 +3,20 @@
 """Refusals and advice of a fit, with the numbers in the texts, on simulated tables."""
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builders import calibration
 from fitting_truth import Truth, table_of
 
-from thermo_comp.errors import FitError
+from thermo_comp.errors import FitError, UndeterminedError
 from thermo_comp.fitting import FitOptions, ResidualRow
 from thermo_comp.fitting.data_checks import (
     Finding,
+    check_scale,
     determines_misalignment,
     distinct_directions,
     enforce,
@@ -235,3 +238,17 @@ def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
     assert soak_gradient(replace(windows, rate=rate, gradient=np.zeros_like(t)), None) is None
     known = calibration(soak_gradient_k=(-2.0, 0.1))
     assert soak_gradient(replace(windows, rate=rate), known) == (-2.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ('kappa', 'n', 'is_refused'),
+    [((1.0, 1.2, 0.53), 3, True), ((1.0, 1.2, 0.53), 6, False), ((0.9, 1.1, 1.2), 3, False)],
+)
+def test_scale_factors_of_no_triad_need_six_attitudes(kappa, n, is_refused):
+    # WHY: from three attitudes a fit had the scale factors 1.04, 1.19 and 0.53, 0.3 g wrong.
+    state = SimpleNamespace(kappa=np.array(kappa), up=positions(n, 3))
+    prior = SimpleNamespace(informative=None, scale_mean=np.ones(3), scale_sd=0.05)
+    fit = SimpleNamespace(posterior=SimpleNamespace(state=state, prior=prior))
+    with pytest.raises(UndeterminedError) if is_refused else nullcontext() as refusal:
+        check_scale(fit)
+    assert not is_refused or 'scale factor of z is 0.53 times' in str(refusal.value)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ..errors import FitError
+from ..errors import FitError, UndeterminedError
 from ..text import counted
 from ..thermal.settings import ADVISED_SPAN_K, RAMP_K_MIN
 from ..typing import Floats
@@ -301,6 +301,25 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
             f'RMS, scales differ by {1e6 * scale:.1f} ppm, biases reach {worst / MICRO_G:.1f} ug '
             f'and misalignments {1e6 * angle:.1f} urad: the samples have been compensated '
             'already, and the calibration must be made from raw samples',
+        )
+
+
+def check_scale(fit: Fit) -> None:
+    """
+    Refuse scale factors that few attitudes do not determine and that are no scale factors of a
+    triad: their ratio is beyond six sd of the prior. The bags then have drifts, steps or motions
+    that the model takes for an effect of the scale factor.
+    """
+    state, prior = fit.posterior.state, fit.posterior.prior
+    if prior.informative or len(distinct_directions(state.up)) >= POSITIONS_NEEDED:
+        return
+    ratio = state.kappa / prior.scale_mean
+    axis = int(np.argmax(np.abs(np.log(np.maximum(ratio, 1e-9)))))
+    if abs(ratio[axis] - 1.0) > 6.0 * prior.scale_sd:
+        raise UndeterminedError(
+            f'by the fit the scale factor of {"xyz"[axis]} is {ratio[axis]:.2f} times the mean of '
+            'the axes, which no triad has, and too few attitudes show it: are all rests of one '
+            f'unit, and was it at rest? {POSITIONS_NEEDED} attitudes determine the scale factors'
         )
 
 

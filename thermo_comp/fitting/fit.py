@@ -300,6 +300,7 @@ def _fit(
     fit = regressed(
         windows, Problem(bags, options, start, up, progress, is_by_settled, has_pieces)
     )
+    data_checks.check_scale(fit)
     selected, terms = choose(fit.regression, fit.selected, options)
     fit = fit._replace(selected=selected)
     offset_sd = 0.0 if known is None else offset_sd_of(known)
