@@ -145,7 +145,8 @@ class RegimeSet:
     z: AxisSet
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
-        'Error on data left out of the fit, in excess of the posterior; its variance is linear '
+        'Error on data left out of the fit, in excess of the posterior, and of scale factors '
+        'at temperatures without a position along gravity; its variance is linear '
         'between the temperatures of the entries, and constant outside of them.',
     ] = ()
 
