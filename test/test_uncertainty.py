@@ -3,13 +3,16 @@
 """The covariance covers a start in a ramp, a lost thermometer, and forces beyond 1 g."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import SECOND_NS, axis_set, calibration, regime_set, term
+from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
 
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
+from thermo_comp.unit.calibration import LackOfFit
+from thermo_comp.unit.prediction import ramp_states, sd_of_states
 
 UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
@@ -115,3 +118,16 @@ def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fa
     ratio = np.abs(errors) / sds
     assert ratio.max() < 3.0
     assert ratio.max() > 0.1
+
+
+def test_the_lack_of_fit_may_be_one_of_the_bias_or_of_the_scale():
+    # WHY: the certificate stated the scale factor to 11 ppm at temperatures at which no position
+    # had gravity along the axis, and attributed the whole unknown error to the bias.
+    lacks = LackOfFit(0.0, (0.0, 3e-3, 4e-3)), LackOfFit(20.0, (0.0, 0.0, 0.0))
+    plain = calibration()
+    lacking = replace(plain, static=replace(plain.static, lack_of_fit=lacks))
+    states = ramp_states(plain, np.array([0.0, 20.0]))
+    before, after = (np.square(sd_of_states(unit, states)) for unit in (plain, lacking))
+    added = np.array([[0.0, 3e-3, 4e-3], [0.0, 0.0, 0.0]]) ** 2
+    np.testing.assert_allclose(after[0] - before[0], added, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(after[1] - before[1], added / GRAVITY**2, rtol=1e-9, atol=1e-18)

@@ -86,7 +86,7 @@ def _draw_less_line(
         look = {'marker': marker, 'markersize': 3.5, 'markevery': [0, -1]}
         axes.plot(at, value, label=curve.program.label, **look, **line)
     title = f'{AXES[k % 3]}: slope {minus(f"{slope:+.3g}")} {unit}/K'
-    axes.set_title(f'{title}\n95 % band: ±{number(widest, 2)} {unit} at most' if widest else title)
+    axes.set_title(f'{title}\n95 % band within ±{number(widest, 2)} {unit}' if widest else title)
     axes.axvline(reference, color=style.GREY, linewidth=0.8)
     axes.locator_params(axis='y', nbins=5)
 

@@ -113,9 +113,11 @@ class Curves:
         """
         Evaluate the variance of residual and lack of fit by set and axis [m^2/s^4], (2, 3, n).
         """
-        if not self._has_lacks:
-            return self._residuals
-        result = np.repeat(self._residuals, len(board), axis=2)
+        return self._residuals + self.lack_of_fit(board) if self._has_lacks else self._residuals
+
+    def lack_of_fit(self, board: Floats) -> Floats:
+        """Evaluate the variance of the lack of fit by set and axis [m^2/s^4], shape (2, 3, n)."""
+        result = np.zeros((2, 3, len(board)))
         for regime, (at, variance) in enumerate(self._lacks):
             if len(at) == 1:
                 result[regime] += variance

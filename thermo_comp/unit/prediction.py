@@ -210,20 +210,28 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
 def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
     """
     Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3), including
-    the sd of the self-heating gradient in a soak.
+    the sd of the self-heating gradient in a soak. The lack of fit, an error of the axis under
+    gravity, may be one of the bias or of the scale: both include it.
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
     forgotten = np.zeros((len(correction.memory.lags), len(states)))
     variance = slow.at(states.T, forgotten)[:9].T.reshape(-1, 3, 3)
-    is_dynamic = np.rint(states[:, WEIGHT]) == 1.0
-    both = np.broadcast_to(correction.curves.unexplained(states[:, BOARD]), (2, 3, len(states)))
-    unexplained = np.where(is_dynamic, both[1], both[0]).T
+    board, n = states[:, BOARD], len(states)
+    regime, each = np.rint(states[:, WEIGHT]).astype(np.int64), np.arange(n)
+    unexplained, lack = (
+        np.broadcast_to(variances, (2, 3, n))[regime, :, each]
+        for variances in (
+            correction.curves.unexplained(board),
+            correction.curves.lack_of_fit(board),
+        )
+    )
     warmer = states.copy()
     _add_gradient(warmer, calibration, (calibration.soak_gradient_k or (0.0, 0.0))[1])
     by_gradient = correction.bias_scale(warmer.T) - correction.bias_scale(states.T)
     bias, scale = (by_gradient / correction.K).swapaxes(1, 2) ** 2
     a, c = variance[:, :, 0] + unexplained, np.maximum(variance[:, :, 2], 0.0)
+    c += lack / calibration.gravity_m_s2**2
     return np.sqrt(a + bias), np.sqrt(c + scale)
 
 
