@@ -81,14 +81,14 @@ def test_the_round_trip_of_a_calibration_is_exact(value):
     assert parse_calibration(dump_calibration(value).encode()) == value
 
 
-@pytest.mark.parametrize('closes', ['board', 'case'])
-def test_the_end_condition_of_the_dynamic_regime_is_in_the_file(closes):
-    value = calibration(detector=DetectorSettings(closes=closes))
+@pytest.mark.parametrize('end_condition', ['board', 'case'])
+def test_the_end_condition_of_the_dynamic_regime_is_in_the_file(end_condition):
+    value = calibration(detector=DetectorSettings(end_condition=end_condition))
     text = dump_calibration(value)
     assert parse_calibration(text.encode()) == value
-    without = text.replace(f'  closes: {closes}\n', '')
+    without = text.replace(f'  end_condition: {end_condition}\n', '')
     assert without != text
-    assert parse_calibration(without.encode()).detector.closes == 'board'
+    assert parse_calibration(without.encode()).detector.end_condition == 'board'
 
 
 @pytest.mark.parametrize('serial', ['no', '1e5', '0x1F', '12', 'null', '~', 'a: b', '- x', '1:30'])
@@ -168,7 +168,7 @@ TEXT = dump_calibration(RICH)
         ('rank: ', 'rank: -', 'posterior.rank', 'must be at least 0'),
         ('smallest_ramp_k_min: ', 'smallest_ramp_k_min: -', 'detector.smallest_ramp_k_min',
          'must be'),
-        ('closes: board', 'closes: both', 'detector.closes', "'board' or 'case', got 'both'"),
+        ('end_condition: board', 'end_condition: both', 'detector.end_condition', "'board' or 'case', got 'both'"),
     ],
 )  # fmt: skip
 def test_refusals_name_key_value_and_rule(old, new, key, message):
@@ -293,9 +293,9 @@ def test_a_calibration_that_the_reader_refuses_is_not_written():
         ('factor', '?', 'base64 of float32'),
         ('factor', 'AAAA', 'base64 of float32'),
         ('factor', 'AADAfw==', 'finite'),
-        ('factor', '', r'must hold \d+ x \d+ numbers \(`rest` x `rank`\), got 0'),
-        ('rest', 'AACAvw==', 'must hold'),
-        ('rest', '', 'must hold 0 x'),
+        ('factor', '', r'must hold \d+ x \d+ numbers \(`diagonal` x `rank`\), got 0'),
+        ('diagonal', 'AACAvw==', 'must hold'),
+        ('diagonal', '', 'must hold 0 x'),
     ],
 )
 def test_a_posterior_of_wrong_content_is_refused(key, value, message):
@@ -309,7 +309,7 @@ def test_a_posterior_of_wrong_content_is_refused(key, value, message):
 def test_a_posterior_of_another_size_is_refused():
     n = parameter_layout(RICH).n_parameters
     with pytest.raises(
-        ValueError, match=rf'`posterior.rest` .*per parameter \({n + 6}\), got {n}'
+        ValueError, match=rf'`posterior.diagonal` .*per parameter \({n + 6}\), got {n}'
     ):
         replace(RICH, response=(term('gradient'), *RICH.response))
 
@@ -319,6 +319,13 @@ def test_former_names_of_columns_are_read():
     for former, name in _FORMER.items():
         text = re.sub(rf'(group|kind): {name}(?=[,}}\n])', rf'\1: {former}', text)
     assert text != TEXT
+    assert parse_calibration(text.encode()) == RICH
+
+
+def test_former_keys_are_read():
+    text = re.sub(r'\bend_condition:', 'closes:', re.sub(r'\bdiagonal:', 'rest:', TEXT))
+    assert text.count('closes:') == 1
+    assert text.count('rest:') >= 1
     assert parse_calibration(text.encode()) == RICH
 
 

@@ -25,9 +25,9 @@ PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
-def weight(record, closes):
+def weight(record, end_condition):
     """Return the weight of the dynamic set at each sample, with the true sensor settings."""
-    tracker = ThermalTracker(replace(DetectorSettings(), closes=closes))
+    tracker = ThermalTracker(replace(DetectorSettings(), end_condition=end_condition))
     readings = sorted(
         (stamp, name, value)
         for name, stamps, values in (
@@ -48,19 +48,19 @@ def weight(record, closes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ('closes', 'options'),
+    ('end_condition', 'options'),
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
-def test_the_evidence_selects_the_end_condition_of_the_regime(closes, options):
+def test_the_evidence_selects_the_end_condition_of_the_regime(end_condition, options):
     # A reading every four seconds suffices: the case changes by at most 0.1 K in 4 s.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
     plan = [Position(PROGRAM, up) for up in FACES[:4]]
     for record in arrays(unit, plan, 11, rate_hz=2.0):
-        step = np.outer(weight(record, closes), STEP * unit.scale_factor)
+        step = np.outer(weight(record, end_condition), STEP * unit.scale_factor)
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
-    assert result.calibration.detector.closes == closes
+    assert result.calibration.detector.end_condition == end_condition
     # The fit estimates the sensor settings, so its regimes switch at slightly other times.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms

@@ -280,7 +280,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
         case=ThermometerSettings(noise, quantum, lag_s=lag),
         board=ThermometerSettings(noise, quantum, lag_s=lag + behind),
     )
-    case_alone = replace(board_too, closes='case')
+    case_alone = replace(board_too, end_condition='case')
     earlier = behind * math.log(10.0 * behind / (behind - lag)) - lag * math.log(10.0)
     rng = np.random.default_rng(5)
     t = np.arange(-1500.0, 6600.0)
@@ -291,7 +291,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # With `closes: case` the board has no effect; without a case the board decides.
+    # With `end_condition: case` the board has no effect; without a case the board decides.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -396,7 +396,7 @@ def test_switches_do_not_depend_on_the_origin_of_time():
         (DetectorSettings, {'relaxed_rate_k_min': math.nan}, 'must be greater than 0'),
         (DetectorSettings, {'ripple_c': -0.1}, 'must be at least 0, got -0.1'),
         (DetectorSettings, {'dwell_s': math.inf}, r'must be at most 1e\+07, got inf'),
-        (DetectorSettings, {'closes': 'chamber'}, "must be 'board' or 'case', got 'chamber'"),
+        (DetectorSettings, {'end_condition': 'chamber'}, "must be 'board' or 'case', got 'chamber'"),
         (
             DetectorSettings,
             {'relaxed_rate_k_min': 0.15},

@@ -70,7 +70,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     # The alternative detector ends the dynamic regime once the case temperature is constant; the
     # default detector also waits for the board. Models with one set do not depend on the regime.
     model = fit.windows.model
-    closed = replace(model, detector=replace(model.detector, closes='case'))
+    closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
     # Left-out halves limit the number of columns, so they do not count in the comparison of two

@@ -7,7 +7,7 @@ The dynamic state *begins* when the rate of the leading sensor has left the base
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
 rate of any sensor is clearly that of a ramp. The dynamic state is *held* while the rate of any
 sensor, at present or predicted half a lag ahead, may exceed the relaxed rate, thus in a ramp of
-constant rate, too, and until the board has relaxed. With `closes` = 'case' (the paper's rule) the
+constant rate, too, and until the board has relaxed. With `end_condition` = 'case' (the paper's rule) the
 dynamic state ends with the change of the case temperature, and the board is used only while the
 case is lost. The derivation of the detector is in docs/regime.md.
 
@@ -53,7 +53,7 @@ class RegimeDetector:
         self._relaxed_rate = settings.relaxed_rate_k_min / 60.0
         self._dwell_ns = round(settings.dwell_s * 1e9)
         self._turn_ns = self._dwell_ns // 2
-        self._needs_calm_board = settings.closes == 'board'
+        self._needs_calm_board = settings.end_condition == 'board'
         self._case = _Watch(settings, settings.case)
         self._board = _Watch(settings, settings.board)
         self.regime = Regime.UNKNOWN

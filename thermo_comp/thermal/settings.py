@@ -60,7 +60,7 @@ class ThermometerSettings:
         return self.quantum_c > WIDE_CELL_SIGMAS * self.noise_sd_c
 
 
-Closes = Literal['board', 'case']
+EndCondition = Literal['board', 'case']
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +91,8 @@ class DetectorSettings:
         QUANTITIES['dwell'],
         'Time for which every rate must be below the relaxed rate; shortest dynamic state, s.',
     ] = 60.0
-    closes: Annotated[
-        Closes,
+    end_condition: Annotated[
+        EndCondition,
         'Sensors that must settle before the dynamic state ends: the leading sensor alone '
         '(`case`, as in the paper), or leading sensor and board (`board`).',
     ] = 'board'
@@ -105,8 +105,10 @@ class DetectorSettings:
 
     def __post_init__(self) -> None:
         refuse_impossible(self)
-        if self.closes not in get_args(Closes):
-            raise ValueError(f"`closes` must be 'board' or 'case', got {self.closes!r}")
+        if self.end_condition not in get_args(EndCondition):
+            raise ValueError(
+                f"`end_condition` must be 'board' or 'case', got {self.end_condition!r}"
+            )
         if self.relaxed_rate_k_min * OBVIOUS_SHARE >= self.smallest_ramp_k_min:
             raise ValueError(
                 f'`relaxed_rate_k_min` must be below `smallest_ramp_k_min` / {OBVIOUS_SHARE}, '

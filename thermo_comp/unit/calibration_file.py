@@ -35,6 +35,8 @@ _FORMER = {
     'even': 'gradient_even',
     'change': 'gradient_even_about_rest',
 }
+#: Former keys of sections of a calibration file of version 0.2.0, and the present keys.
+_FORMER_KEYS = {'detector': ('closes', 'end_condition'), 'posterior': ('rest', 'diagonal')}
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -83,8 +85,13 @@ def parse_calibration(content: bytes, path: str | Path | None = None) -> Calibra
 
 
 def _rename(data: dict[str, Any]) -> None:
-    """Replace former names of columns in the plain values of a calibration file."""
+    """Replace former keys and former names of columns in the values of a calibration file."""
     gyroscope = data.get('gyroscope')
+    for holder in (data, gyroscope):
+        for name, (former, key) in _FORMER_KEYS.items():
+            section = holder.get(name) if isinstance(holder, dict) else None
+            if isinstance(section, dict) and former in section and key not in section:
+                section[key] = section.pop(former)
     lists = [data.get('response'), data.get('evidence')]
     lists += [gyroscope.get('response')] if isinstance(gyroscope, dict) else []
     for entries in lists:

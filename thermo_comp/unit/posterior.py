@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the covariance of all parameters: factor @ factor.T + diag(rest), float32 in base64."""
+"""Owns the covariance of all parameters: factor @ factor.T + diag(diagonal), float32 in base64."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ _FLOAT32 = np.dtype('<f4')
 class Posterior:
     """
     Covariance of all parameters, in the order that docs/calibration_file.md states: factor @
-    factor.T + diag(rest).
+    factor.T + diag(diagonal).
     """
 
     rank: Annotated[int, QUANTITIES['number'], 'Number of columns of the factor.']
     factor: Annotated[
         str, 'base64 of little-endian float32: one row of `rank` numbers per parameter.'
     ]
-    rest: Annotated[
-        str, 'base64 of little-endian float32: one variance per parameter, of diag(rest).'
+    diagonal: Annotated[
+        str, 'base64 of little-endian float32: one variance per parameter, of diag(diagonal).'
     ]
 
     def __post_init__(self) -> None:
         n, size = self.n_parameters, len(_decoded('factor', self.factor))
         if size != n * self.rank:
             raise ValueError(
-                f'`factor` must hold {n} x {self.rank} numbers (`rest` x `rank`), got {size}'
+                f'`factor` must hold {n} x {self.rank} numbers (`diagonal` x `rank`), got {size}'
             )
         if (self.variances < 0.0).any():
-            raise ValueError('`rest` must not have a negative variance')
+            raise ValueError('`diagonal` must not have a negative variance')
 
     @classmethod
     def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
@@ -66,7 +66,7 @@ class Posterior:
     @cached_property
     def variances(self) -> Floats:
         """The variances added to the covariance's diagonal, shape (n_parameters,)."""
-        return _decoded('rest', self.rest)
+        return _decoded('diagonal', self.diagonal)
 
     def covariance(self) -> Floats:
         """Return the covariance matrix, shape (n_parameters, n_parameters)."""
@@ -77,7 +77,7 @@ class Posterior:
         """Raise ValueError, with the key's name, if there are not `expected` parameters."""
         if self.n_parameters != expected:
             raise ValueError(
-                f'`posterior.rest` must have one number per parameter ({expected}), '
+                f'`posterior.diagonal` must have one number per parameter ({expected}), '
                 f'got {self.n_parameters}'
             )
 
