@@ -168,7 +168,8 @@ TEXT = dump_calibration(RICH)
         ('rank: ', 'rank: -', 'posterior.rank', 'must be at least 0'),
         ('smallest_ramp_k_min: ', 'smallest_ramp_k_min: -', 'detector.smallest_ramp_k_min',
          'must be'),
-        ('end_condition: board', 'end_condition: both', 'detector.end_condition', "'board' or 'case', got 'both'"),
+        ('end_condition: board', 'end_condition: both', 'detector.end_condition',
+         "'board' or 'case', got 'both'"),
     ],
 )  # fmt: skip
 def test_refusals_name_key_value_and_rule(old, new, key, message):

@@ -81,8 +81,8 @@ def test_numbers_beyond_single_precision_are_refused():
         posterior_of(np.array([[1e80]]))
 
 
-def test_negative_rest_is_refused():
-    with pytest.raises(ValueError, match='`rest` must not have a negative variance'):
+def test_a_negative_variance_is_refused():
+    with pytest.raises(ValueError, match='`diagonal` must not have a negative variance'):
         Posterior.of(np.ones((1, 1)), np.array([-1.0]))
 
 

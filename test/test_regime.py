@@ -396,7 +396,11 @@ def test_switches_do_not_depend_on_the_origin_of_time():
         (DetectorSettings, {'relaxed_rate_k_min': math.nan}, 'must be greater than 0'),
         (DetectorSettings, {'ripple_c': -0.1}, 'must be at least 0, got -0.1'),
         (DetectorSettings, {'dwell_s': math.inf}, r'must be at most 1e\+07, got inf'),
-        (DetectorSettings, {'end_condition': 'chamber'}, "must be 'board' or 'case', got 'chamber'"),
+        (
+            DetectorSettings,
+            {'end_condition': 'chamber'},
+            "must be 'board' or 'case', got 'chamber'",
+        ),
         (
             DetectorSettings,
             {'relaxed_rate_k_min': 0.15},

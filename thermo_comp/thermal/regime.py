@@ -7,9 +7,9 @@ The dynamic state *begins* when the rate of the leading sensor has left the base
 (`change_detector`: the integral of the second derivative against ripple and noise), or when the
 rate of any sensor is clearly that of a ramp. The dynamic state is *held* while the rate of any
 sensor, at present or predicted half a lag ahead, may exceed the relaxed rate, thus in a ramp of
-constant rate, too, and until the board has relaxed. With `end_condition` = 'case' (the paper's rule) the
-dynamic state ends with the change of the case temperature, and the board is used only while the
-case is lost. The derivation of the detector is in docs/regime.md.
+constant rate, too, and until the board has relaxed. With `end_condition` = 'case' (the paper's
+rule) the dynamic state ends with the change of the case temperature, and the board is used only
+while the case is lost. The derivation of the detector is in docs/regime.md.
 
 References
 ----------
