@@ -23,6 +23,7 @@ from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 from thermo_comp.unit.nonlinearity import Nonlinearity, NonlinearTerm
 from thermo_comp.unit.posterior import Posterior
+from thermo_comp.unit.prediction import in_a_soak
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
@@ -239,6 +240,56 @@ def test_rests_at_one_temperature_correct_ageing_and_keep_the_response():
     assert sd < 20e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
     assert left[2] < left[1] / 50.0
+
+
+def after(change, ups):
+    """
+    Update the calibration of sibling 9 by rests of 10 min, whose counts are changed by a function
+    of counts and calibration. Return the change of the bias at 20 degC [m/s^2], its sd, the
+    relative change of the scale factor, and its sd, shape (4, 3).
+    """
+    old, day = fitted(9).calibration, parse_cyclogram('20 10min')
+    records = arrays(sibling(KIND, 9, 0.15), [Position(day, up) for up in ups], 999)
+    later = [
+        source(replace(record, counts=np.rint(change(record.counts, old)).astype(np.int32)))
+        for record in records
+    ]
+    new = fit(later, replace(OPTIONS, serial='unit-9', prior=old)).calibration
+    before, after = (in_a_soak(calibration, 20.0) for calibration in (old, new))
+    return np.array([after[0] - before[0], after[1], after[2] / before[2] - 1.0, after[3]])
+
+
+@pytest.mark.parametrize('n_faces', [1, 3])
+def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
+    # WHY: one unchanged face had increased the claimed sd of bias and scale from 0.2 to 424 ug.
+    bias, bias_sd, scale, scale_sd = after(lambda counts, _: counts, np.eye(3)[:n_faces])
+    # A tenth of the usual repeatability of turn-ons, 300 ug.
+    assert max(bias_sd.max(), scale_sd.max() * STANDARD_GRAVITY) < 30e-6 * STANDARD_GRAVITY
+    assert np.abs(bias).max() < 2.0 * bias_sd.max()
+    assert np.abs(scale).max() < 2.0 * scale_sd.max()
+
+
+@pytest.mark.parametrize('kind', ['bias', 'scale'])
+def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
+    # WHY: an update with three faces ascribed a change of 100 ug to the mountings, and left it.
+    # WHAT: in each face one count, 300 ug, is added by a change of the bias or of the scale.
+    K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])
+    change = np.array([1.0, -1.0, 1.0]) / (K * STANDARD_GRAVITY)
+
+    def changed(counts, old):
+        zero = np.array([axis.bias for axis in old.axes])
+        return (
+            counts + np.sign(change) if kind == 'bias' else zero + (counts - zero) * (1 + change)
+        )
+
+    bias, bias_sd, scale, scale_sd = after(changed, np.eye(3))
+    wrong = np.array([bias / STANDARD_GRAVITY, scale])
+    wrong[('bias', 'scale').index(kind)] -= change
+    # The rests show the sum of both errors; nothing separates bias and scale, so each gets half of
+    # the change. The noise of 10 min and the lags of an unknown start leave some ug.
+    assert np.abs(wrong.sum(axis=0)).max() < 10e-6
+    assert np.abs(np.abs(wrong) / np.abs(change) - 0.5).max() < 0.1
+    assert (np.abs(wrong) < 2.0 * np.array([bias_sd / STANDARD_GRAVITY, scale_sd])).all()
 
 
 def left_by(calibration, record):

@@ -27,7 +27,7 @@ from scipy.linalg import solve_triangular
 
 from ..typing import Floats, Ints
 from .equations import as_vector
-from .hyperparameters import CLEAR_GAIN, STUDENT_NU
+from .hyperparameters import CLEAR_GAIN, log_density, log_student
 from .initial_triad import within_positions
 from .jackknife import jackknife_covariance
 from .layout import Layout
@@ -154,19 +154,14 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     if known_sd:
         # Twelve positions determine the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
-        return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
+        return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
     # By data sheets, turn-ons of navigation grade repeat within some 10 ug at best; mountings
     # within one turn-on repeat better.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
     # The grid of the sd has steps of a third of a decade: the log evidence is smooth over a step.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     small = np.minimum(np.log(ratio / least), 0.0)
-    return scale * ratio, _student(ratio / LARGEST_USUAL[kind]) + small
-
-
-def _student(x: Floats) -> Floats:
-    """Return the log density of Student's distribution at x, without its constant."""
-    return np.asarray(-0.5 * (STUDENT_NU + 1.0) * np.log1p(x**2 / STUDENT_NU))
+    return scale * ratio, log_student(ratio / LARGEST_USUAL[kind]) + small
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
@@ -345,7 +340,7 @@ def _excess_over_priors(
         regression.solve(posterior.state, replace(posterior.prior, informative=each), n_steps=3)
         for each in informative
     ]
-    mixture, _ = _mixture(posterior, fits, np.array([fit.log_evidence for fit in fits]))
+    mixture, _ = _mixture(posterior, fits, np.array([log_density(fit) for fit in fits]))
     return _excess(mixture, posterior.covariance)
 
 

@@ -371,9 +371,11 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # A bias offset of a new turn-on of up to 2 sd (`slow`) does not contradict the prior.
+    # Neither a bias offset of a new turn-on of up to 2 sd (`slow`) contradicts the prior, nor a
+    # residual that the initial lag states explain: `noise` then is that of two sets alone.
     contradiction = ''
-    if options.prior is not None and overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow):
+    is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and noise > 1.5 * alone
+    if options.prior is not None and is_above:
         contradiction = (
             f'|f| - g is {ug_text(overall.fitted.rms)} RMS with the prior, {ug_text(alone)} with '
             'two sets fitted without it'

@@ -207,16 +207,23 @@ def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, fl
 
 def log_density(posterior: Posterior) -> float:
     """
-    Return the log evidence plus the log prior density of the sd of mountings, turn-ons and poses.
+    Return the log evidence plus the log prior density of the sd of mountings, turn-ons and poses,
+    and of the ageing since a prior calibration.
     """
     prior, result = posterior.prior, posterior.log_evidence
     if prior.offset_scale:
         sd = [prior.offset_sd, *[prior.turn_on_sd] * bool(posterior.layout.turn_on.size)]
-        squares = (np.array(sd) / prior.offset_scale) ** 2
-        result -= (STUDENT_NU + 1.0) / 2.0 * float(np.log1p(squares / STUDENT_NU).sum())
+        result += float(log_student(np.array(sd) / prior.offset_scale).sum())
     if posterior.layout.pose.size:
         result -= 0.5 * float(np.log(prior.pose_sd / POSE_SD)) ** 2 / LOG_VARIANCE
+    if prior.informative is not None:
+        result += prior.informative.log_density
     return result
+
+
+def log_student(x: Floats) -> Floats:
+    """Return the log density of Student's distribution at x, without its constant."""
+    return np.asarray(-0.5 * (STUDENT_NU + 1.0) * np.log1p(x**2 / STUDENT_NU))
 
 
 def white_noise(regression: Regression, posterior: Posterior) -> Floats:

@@ -28,7 +28,7 @@ from .options import FitOptions
 from .priors import informative_priors, offset_sd_of, with_calibration
 from .reduction import ReducedBag
 from .regression import Regression
-from .selection import Fit, fit_all, select
+from .selection import LARGE_OFFSETS, Fit, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, Prior, State, misalignment_scale
 from .windows import CURVE, PART, ThermalWindows
 
@@ -116,7 +116,10 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
     if known is not None:
         state = with_terms(with_calibration(known, regression, state), known)
-        *others, widest = informative_priors(known, regression, state, windows.model, options)
+        usual_ageing = LARGE_OFFSETS * _mounting_scale(_noise_in_1_hz(windows, start.scale))
+        *others, widest = informative_priors(
+            known, regression, state, windows.model, options, usual_ageing
+        )
         # A few windows may be fitted exactly: the noise is at least half of the known noise.
         window_s = windows.typical_count * known.unit.cycle_time_s
         least = 0.5 * float(np.min(known.noise_density_m_s2_sqrt_hz)) / window_s**0.5
@@ -126,8 +129,12 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
             informative=widest,
             least_sigma=max(least, prior.least_sigma),
         )
-        if prior.offset_scale and offset_sd_of(known):
-            prior = replace(prior, turn_on_sd=offset_sd_of(known))
+        if prior.offset_scale and (known_sd := offset_sd_of(known)):
+            # The calibration's bags showed how well mountings and turn-ons repeat, at most to a
+            # factor of two: larger changes of the norms are an ageing of the unit.
+            scale = min(prior.offset_scale, 2.0 * known_sd)
+            offset_sd = prior.offset_sd if data.has_turn_ons else known_sd
+            prior = replace(prior, offset_sd=offset_sd, turn_on_sd=known_sd, offset_scale=scale)
         fixed = replace(candidates, fixed=np.ones_like(candidates.fixed))
         return Fit(windows, regression, fit_all(regression, state, prior, fixed, others))
     if options.model == 'golovach':

@@ -23,6 +23,7 @@ from ..unit.calibration import Calibration, parameter_layout
 from ..unit.columns import Column
 from .assembly import file_jacobian, parameters_of
 from .equations import as_vector
+from .hyperparameters import CLEAR_GAIN, log_student
 from .initial_triad import ConstantCalibration
 from .options import FitOptions
 from .regression import Regression
@@ -96,9 +97,11 @@ def informative_priors(
     state: State,
     model: Model,
     options: FitOptions,
+    usual_ageing: float = 1.0,
 ) -> Iterator[InformativePrior]:
     """
-    Return candidate priors from a calibration, which the fit compares by evidence.
+    Return candidate priors from a calibration, which the fit compares by evidence and by the log
+    density of their ageing, a half-Student distribution whose scale is `usual_ageing` [m/s^2].
 
     The last candidate is the widest, with which the fit begins. Raises FitError if the calibration
     has no covariance.
@@ -123,43 +126,59 @@ def informative_priors(
 
     stated = options.ageing_bias, options.ageing_scale
     # Candidates of an added uncorrelated variance, relative to each variance of the prior.
-    tried = [(grown(*stated), share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
+    tried = [(grown(*stated), share, 0.0) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Candidates of ageing: sd of biases [g], and sd of scale factors / sd of biases.
+        # Candidates of ageing: sd of biases [g] and of scale factors. Both are equal, because data
+        # sheets state similar numbers for both, and few rests do not separate bias and scale.
         tried += [
-            (grown(ageing * options.gravity, multiple * ageing), 0.0)
-            for multiple in (0.3, 1.0)
+            (grown(ageing * options.gravity, ageing), 0.0, ageing)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
         # Candidates in which the effects of temperature have changed as well: `share` multiplies
         # the sd of the prior by 1.4, 30 and 1000, as the sd of a good prior may be a thousandth
-        # of the effect itself.
+        # of the effect itself; at most by the effect itself, as a few rests would otherwise leave
+        # the effects at other temperatures unknown.
         tried += [
-            (grown(ageing * options.gravity, ageing), share)
+            (grown(ageing * options.gravity, ageing), share, ageing)
             for share in (1.0, 1e3, 1e6)
             for ageing in (3e-5, 3e-4, 3e-3)
         ]
     # The fit begins with the last, widest candidate: under a narrow prior the noise estimated by
     # the first fit would absorb changes of the unit.
     if any(stated):
-        tried.append((tried[-1][0], 1.0))
+        tried.append((tried[-1][0], 1.0, 0.0))
     layout = regression.layout(regression.windows.parts)
     kinds = regression.forces.kinds if regression.forces else ()
     used = range(len(calibration.response))
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
-    mean = as_vector(state, layout)[: layout.n_unit]
-    return (
-        InformativePrior(mean, _root(wide, share, to_file), is_changed=share > 1.0)
-        for wide, share in tried
-    )
+    mean, sizes = as_vector(state, layout)[: layout.n_unit], _sizes(calibration)
+    for wide, share, ageing in tried:
+        density = float(log_student(np.array(ageing * options.gravity / usual_ageing)))
+        # Changed effects of temperature are rare: the rests must show them clearly.
+        density -= CLEAR_GAIN * (share >= 1.0)
+        root = _root(wide, share, sizes, to_file)
+        yield InformativePrior(mean, root, density, is_changed=share > 1.0)
 
 
-def _root(covariance: Floats, share: float, to_file: Floats) -> Floats:
+def _sizes(calibration: Calibration) -> Floats:
+    """Return the RMS over the axes of each coefficient and weight; 0 for other parameters."""
+    values, layout = parameters_of(calibration), parameter_layout(calibration)
+    result = np.zeros_like(values)
+    for blocks in (layout.bias, layout.scale):
+        rms = np.sqrt(np.mean([values[block.rows] ** 2 for block in blocks], axis=0))
+        for block in blocks:
+            result[block.rows] = rms
+            result[[block.static, block.dynamic]] = 0.0
+    return result
+
+
+def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> Floats:
     """
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
     `covariance`: of the file's parameters, to which an uncorrelated part of `share` times each
-    variance is added; `to_file`: derivatives of the file's parameters w.r.t. the unknowns
+    variance is added, at most the variance or the square of the parameter's size; `to_file`:
+    derivatives of the file's parameters w.r.t. the unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
@@ -167,7 +186,8 @@ def _root(covariance: Floats, share: float, to_file: Floats) -> Floats:
     # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
     # QR factor of the covariance's factor, instead of a product, keeps the precision of nearly
     # equal parameters.
-    widened = covariance / np.outer(sd, sd) + (1e-6 + share) * np.eye(len(sd))
+    added = np.minimum(share, np.maximum((sizes / sd) ** 2, 1.0))
+    widened = covariance / np.outer(sd, sd) + np.diag(1e-6 + added)
     scaled = to_file / sd[:, None]
     whitened = solve_triangular(np.linalg.cholesky(widened), scaled, lower=True)
     root: Floats = np.asarray(np.linalg.qr(whitened, mode='r'))

@@ -358,6 +358,10 @@ def fit_all(
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
     """Fit all columns, with the informative prior of the largest log evidence if there are any."""
+    # Offsets of mountings would explain the norms of few positions as well as an ageing of the
+    # unit, so their sd is constant until an informative prior is chosen.
+    scale = prior.offset_scale
+    prior = replace(prior, offset_scale=0.0 if informative else scale)
     posterior = settle(regression, state, prior, candidates)
     downweigh(regression, posterior)
     posterior = settle(regression, posterior.state, posterior.prior, candidates)
@@ -368,8 +372,9 @@ def fit_all(
             )
             for candidate in informative
         ]
-        best = max(fits, key=lambda fit: fit.log_evidence)
-        posterior = settle(regression, best.state, best.prior, candidates)
+        best = max(fits, key=log_density)
+        prior = replace(best.prior, offset_scale=scale)
+        posterior = settle(regression, best.state, prior, candidates)
     posterior = with_slow_noise(regression, posterior, candidates)
     score = score_of(regression, posterior)
     groups = tuple(dict.fromkeys(regression.windows.groups))

@@ -208,11 +208,13 @@ class InformativePrior:
 
     mean: shape (n_unit,)
     root: upper triangular R with ``R.T @ R`` the inverse covariance, shape (n_unit, n_unit)
+    log_density: log prior density of the ageing that this prior assumes
     is_changed: whether the covariance is far wider than that of the prior calibration
     """
 
     mean: Floats
     root: Floats
+    log_density: float = 0.0
     is_changed: bool = False
 
 
