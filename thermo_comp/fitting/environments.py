@@ -125,7 +125,11 @@ def contradiction(
     along = regression.at(state, prior).norms_by_unit @ inverse
     usual = np.mean(drift**2) + np.mean(np.sum(along**2, axis=1)) + offset_sd_of(known) ** 2
     is_changed = bool(_is_far_above(np.mean(norm**2), usual))
-    return Contradiction(np.flatnonzero(_is_far_above(mean, 1.0)).tolist(), is_changed)
+    is_far = _is_far_above(mean, 1.0)
+    if np.mean(is_far) > 0.5:
+        # A minority that agrees by its attitudes alone is of the same environment as the majority.
+        is_far[:] = True
+    return Contradiction(np.flatnonzero(is_far).tolist(), is_changed)
 
 
 def _at_calibration(
