@@ -329,7 +329,7 @@ def test_stamps_in_any_order_give_a_valid_covariance(rng):
 def test_too_few_starts_are_refused():
     unit = known()
     logged = rests(unit, upright, no_error, days=1)[:8]
-    with pytest.raises(FitError, match='rests of 2 starts of the node, need at least 3'):
+    with pytest.raises(FitError, match='rests of 2 starts of the node, at least 3 are needed'):
         update(series_of(logged, unit), unit)
 
 
@@ -407,7 +407,7 @@ def test_mistakes_of_update_end_in_one_sentence(tmp_path, unit_file, cli):
     save_calibration(rich_calibration(), rich)
     log = write_log(tmp_path / 'own', rests(unit, upright, no_error, days=2))
     printed = cli('update', rich, log, *new, code=1).stderr
-    assert 'logged with a calibration that has other columns' in printed
+    assert 'the rests were logged with another calibration' in printed
 
 
 def with_shares(logged, share):

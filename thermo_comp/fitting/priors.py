@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the informative prior of a fit, from an earlier calibration of the unit or from the
-population of its type.
+Owns the informative prior of a fit, from an earlier calibration of the unit or from a prior of its
+type (`population`).
 
-Mean and covariance of all parameters of the calibration form the Gaussian prior of the regression,
-which has the calibration's columns. The covariance of an earlier calibration of the unit is
-increased by the ageing of the unit.
+Values and covariance of all parameters of the calibration are mean and covariance of the Gaussian
+prior of the regression, which has the calibration's columns. The covariance is increased by the
+ageing of the unit since the calibration.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
-                f'the prior has a thermal response of the {term.during} regime alone, as files of '
-                'format_version 1 have: fit the bags of the prior again'
+                f'the prior has a thermal response for the {term.during} regime only, as in files '
+                'of format_version 1: fit the bags of the prior again, with this release'
             )
     names = [field.name for field in fields(Column)]
     return tuple(
@@ -76,12 +76,12 @@ def offset_sd_of(calibration: Calibration) -> float:
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Set bias and weights of a state to those of a calibration whose K is the nominal scale."""
+    """Set bias and weights of a state to those of a calibration, whose K is `nominal_scale`."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
-            'the curves of the prior differ from axis to axis, or from bias to scale: a prior '
-            'needs curves of one form, as a fit writes them'
+            'the curves of the prior have different forms on the axes, or for bias and scale: a '
+            'prior needs curves of one form, as a fit writes them'
         )
     # Replace the level of the dynamic set by its difference from the level of the static set.
     both = np.array([[values[block.rows] for block in part] for part in layout[:2]])
@@ -98,10 +98,11 @@ def informative_priors(
     options: FitOptions,
 ) -> Iterator[InformativePrior]:
     """
-    Return candidate priors from a calibration, which the fit compares by evidence.
+    Return several priors from a calibration, for different amounts of ageing; the fit compares
+    them by evidence.
 
-    The last candidate is the widest, with which the fit begins. Raises FitError if the calibration
-    has no covariance.
+    The fit begins with the last prior, which is the widest. Raises FitError if the calibration has
+    no covariance.
     """
     if calibration.posterior is None:
         raise FitError(
@@ -122,25 +123,25 @@ def informative_priors(
         return result
 
     stated = options.ageing_bias, options.ageing_scale
-    # Candidates of an added uncorrelated variance, relative to each variance of the prior.
+    # Stated ageing, with several uncorrelated variances added, relative to those of the prior.
     tried = [(grown(*stated), share) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Candidates of ageing: sd of biases [g], and sd of scale factors / sd of biases.
+        # Ageing to try: sd of the biases [g], and ratio of the sd of the scale factors to it.
         tried += [
             (grown(ageing * options.gravity, multiple * ageing), 0.0)
             for multiple in (0.3, 1.0)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
-        # Candidates in which the effects of temperature have changed as well: `share` multiplies
-        # the sd of the prior by 1.4, 30 and 1000, as the sd of a good prior may be a thousandth
-        # of the effect itself.
+        # Priors for a unit whose effects of temperature have changed, too: `share` multiplies the
+        # sd of the prior by 1.4, 30 and 1000, because the sd of an effect of temperature may be a
+        # thousandth of the effect.
         tried += [
             (grown(ageing * options.gravity, ageing), share)
             for share in (1.0, 1e3, 1e6)
             for ageing in (3e-5, 3e-4, 3e-3)
         ]
-    # The fit begins with the last, widest candidate: under a narrow prior the noise estimated by
-    # the first fit would absorb changes of the unit.
+    # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
+    # would absorb changes of the unit.
     if any(stated):
         tried.append((tried[-1][0], 1.0))
     layout = regression.layout(regression.windows.parts)
@@ -158,15 +159,15 @@ def _root(covariance: Floats, share: float, to_file: Floats) -> Floats:
     """
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
-    `covariance`: of the file's parameters, to which an uncorrelated part of `share` times each
-    variance is added; `to_file`: derivatives of the file's parameters w.r.t. the unknowns
+    `covariance`: of the file's parameters; `share` times each variance is added to its diagonal;
+    `to_file`: derivatives of the file's parameters w.r.t. the unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
     sd = np.sqrt(floor)
-    # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
-    # QR factor of the covariance's factor, instead of a product, keeps the precision of nearly
-    # equal parameters.
+    # A relative jitter of 1e-6 keeps the covariance, stored in single precision, positive
+    # definite. QR of the whitened derivatives, without the product of the normal equations, loses
+    # no precision for strongly correlated parameters.
     widened = covariance / np.outer(sd, sd) + (1e-6 + share) * np.eye(len(sd))
     scaled = to_file / sd[:, None]
     whitened = solve_triangular(np.linalg.cholesky(widened), scaled, lower=True)
