@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ageing model of a unit: a Gaussian model of ``|f| - g`` at rest, with variances estimated
-by evidence.
+Owns the ageing model of a unit: a Gaussian model of ``|f| - g`` at rest, fitted by evidence.
 
 ``|f| - g`` of rest i at time t_i, recorded after start k of the node, is ``H_i delta + B_i b(t_i)
 + S_i s(t_i) + B_i o_k + L_i l_k + lack + e_i``: delta is the error of the calibration parameters,
@@ -84,8 +83,7 @@ class Change:
 
     time: time of a jump; None for a change of slope, which holds for all rests
     sd: prior sd of the change of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
-    may_be_gravity: whether a jump of gravity explains the rests almost as well as this jump of
-        the levels
+    may_be_gravity: whether a jump of gravity explains the rests almost as well as one of levels
     """
 
     kind: Literal['levels', 'gravity', 'curve']
@@ -403,9 +401,8 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     """
     Condition the parameters of the calibration on the rests.
 
-    `to_file`, `bend`: derivatives of the file's parameters w.r.t. the six levels, (n_parameters,
-    6), and w.r.t. the bias slope of each axis, (n_parameters, 3); `ahead`: days of use after the
-    last rest
+    `to_file`, `bend`: derivatives of the n parameters of the file by the six levels, (n, 6), and
+    by the bias slope of each axis, (n, 3); `ahead`: days of use after the last rest
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

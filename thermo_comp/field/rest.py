@@ -28,8 +28,7 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node; or a change of the calibration in a running node, whose `start_ns` is that
-    of the node's start.
+    A start of the node, or a later change of its calibration, with the same `start_ns`.
 
     `start_ns` identifies a start; it is no date, as many computers set their clock only later.
     """

@@ -108,12 +108,10 @@ def read_rests(
     """
     Read the rest logs of a calibration's unit.
 
-    Returns the rests, the source of an update whose covariance is aged by `ahead` days, and notes
-    for the user.
+    Returns the rests, the source of an update aged by `ahead` days, and notes for the user.
 
     Rests before the date of the calibration are left out, unless all rests are before it. Rests
-    that an earlier update used are left out only if `is_for_update`. Raises RecordingError if no
-    rest remains.
+    that an earlier update used are left out only if `is_for_update`. No rest: RecordingError.
     """
     files: list[Path] = []
     for path in paths:

@@ -27,8 +27,8 @@ from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import Series, last_rest, valid_since
 
-#: Names of conclusions that a user can override: that gravity at the rests was not the stated one,
-#: and that the samples are of another unit.
+#: Names of conclusions that a user can override: gravity is not as stated; samples of another
+#: unit.
 OVERRIDES = ('gravity', 'unit')
 #: Limits of the RMS of |f| - g over the rests of a start: relative to gravity (1 mg, as after a
 #: shock), and in claimed sd (30, some milli-g for a poor sensor). An RMS above both limits is

@@ -146,9 +146,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
     # The RMS of a week responds late to a change. A unit is therefore outside its claim after one
-    # day above the limit if the error at the last rest by the ageing model is above the limit,
-    # too, and within its claim after two days within the limit if this error is within the limit,
-    # too.
+    # day above the limit if the error by the ageing model at the last rest is above it, too; and
+    # within its claim after two days within the limit if this error is within the limit, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -174,8 +173,7 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
 
 def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
-    Return, for each day, the index of the first day of the week that ends on it, and the robust
-    RMS of this week.
+    Return, for each day, the index of the first day, and the robust RMS, of the week up to it.
 
     A week has at least two days with rests, if necessary the preceding day with rests. The largest
     daily RMS of a week, perhaps of a disturbed day, is replaced by the second largest.

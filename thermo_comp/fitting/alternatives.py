@@ -73,8 +73,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, closes='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # The comparison by left-out halves limits the number of columns, which is the same with both
-    # detectors.
+    # Left-out halves limit the number of columns, but both detectors have the same columns.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 

@@ -373,8 +373,7 @@ def _norm_evidence(
     regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
-    Return the log evidence of the mean norms of the mountings for k values of the sd of mounting
-    offsets, shape (k,).
+    Return the log evidence of the mountings' mean norms for k sds of mounting offsets, shape (k,).
 
     `by_drifts`: root of the unit's covariance at the largest offset sd, at which drifts alone
     determine the thermal weights; only the rows of these weights are used

@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the covariance of a triad's constants by the directions of a test's positions, and the next
-direction to record.
+Owns the covariance of a triad's constants by the positions of a test, and the next position.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
 bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. The equations
@@ -119,8 +118,7 @@ def rough_centre(means: Floats) -> Floats:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The origin is the centre if the sd of the norms is below 30 % of the readings' RMS distance
-    # from their mean.
+    # The origin is the centre if the norms' sd is below 30 % of the RMS distance from the mean.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
@@ -158,9 +156,8 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the index of the best set of rests; each set has mean readings of shape (n, 3).
 
     The sd of the constants follows from the directions of the rests of a set and from the
-    residuals of |f|. The best set is the first set whose sd is within 2 % of the smallest sd,
-    because earlier sets have stricter thresholds of a rest. If no set has six attitudes, the first
-    set is the best.
+    residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd, because
+    earlier sets have stricter thresholds; it is the first of all if no set has six attitudes.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
     counts = [len(distinct_directions(up)) for up in ups]
@@ -260,6 +257,5 @@ def _spiral(n: int) -> Floats:
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
-# Unit vectors: 26 to faces, edges and corners of a cube, then 500 evenly over the sphere, 8
-# degrees apart.
+# Unit vectors: 26 to faces, edges and corners of a cube, then 500 at intervals of 8 degrees.
 _SPHERE = np.concatenate([_cube(), _spiral(500)])

@@ -307,9 +307,8 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
 
 def check_scale(fit: Fit) -> None:
     """
-    Refuse scale factors that too few attitudes determine and that deviate from the prior's by more
-    than six sd, which no triad's do. The fit then attributes drifts, steps or motions in the bags
-    to a scale factor.
+    Refuse scale factors, in a fit of few attitudes, that deviate by more than six sd from the
+    prior: the fit attributes drifts, steps or motions in the bags to a scale factor.
     """
     state, prior = fit.posterior.state, fit.posterior.prior
     if prior.informative or len(distinct_directions(state.up)) >= POSITIONS_NEEDED:

@@ -132,8 +132,7 @@ class Reduced:
     of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
         from the prior mean, shape (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
-    positions: the blocks of the positions; the remaining unknowns are those of the bag, then those
-        of the unit
+    positions: the blocks of the positions; remaining unknowns: of the bag, then of the unit
     shares: contribution of each position to the block of its bag, with off-diagonal blocks and
         gradients, shape (n_positions, r, r + n + 1); and to the diagonal of this block before the
         elimination of the positions, shape (n_positions, r)

@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the statistics that a fit reports: the residuals of each position, the residuals of
-corrections with constants, with curves and with the response, and the contribution of each group
-of columns.
+Owns the statistics that a fit reports: residuals of each position; residuals after correction with
+constants, with curves and with the response; and the contribution of each group of columns.
 
 Each position has two residuals: in sample, by the fit of all positions; and left out, by a fit
 without this position, which estimates the error in a new attitude.

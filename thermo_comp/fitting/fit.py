@@ -50,10 +50,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class FitResult:
-    """
-    A calibration with its residuals and findings; `least_known`: the direction of the largest sd
-    of |f|; `rates`: residuals of the gyroscope.
-    """
+    """A calibration with its residuals and findings; `rates`: residuals of the gyroscope."""
 
     calibration: Calibration
     fit: Fit
@@ -241,10 +238,7 @@ def _fit_one_environment(
 def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
-    """
-    Repeat a fit that extrapolates to settled temperatures, or in which supports may tilt slowly,
-    see `refit_checks`.
-    """
+    """Repeat a fit whose settled bias is uncertain or whose supports may tilt (`refit_checks`)."""
     if options.prior is not None or options.model == 'golovach':
         return result
     if refit_checks.extrapolates(result.fit):

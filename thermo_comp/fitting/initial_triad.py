@@ -77,8 +77,7 @@ def constant_calibration(
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, misalignment_sd))
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # The best ellipsoid for scattered points may be very large, with a far centre; such a fit is
-    # refused.
+    # Scattered points may give a very large ellipsoid with a far centre, which is refused.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(

@@ -54,8 +54,7 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     remaining windows, ``remaining.T @ remaining``, shape (n, n), both in units of the fit's root
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # Combinations are left out if the left-out windows have less than 1e-6 of the information
-    # about them.
+    # Use combinations about which the left-out windows have more than 1e-6 of the information.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

@@ -48,8 +48,7 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     # A bag with known |f| is not joined, because times of |f| count from the start of the bag.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
-    # The overlap is limited to a tenth of the part: short recordings whose stamps all begin at 0
-    # overlap by more.
+    # The overlap is at most a tenth of a part: recordings whose stamps all begin at 0 exceed this.
     overlap_s = min(CONTINUED_S, 1e-10 * (part.end_ns - part.start_ns))
     is_next = -overlap_s < gap_s < max(CONTINUED_S, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)

@@ -47,8 +47,7 @@ class Jump:
     step: change of the reading of each axis [input units]
     along: change of the norm of the reading, that is, along the specific force [input units]
     temperature_change, temperature_change_sd: step of the board temperature at the time of the
-        jump, fitted together with a linear drift, and the sd of this step [K]; NaN if there are
-        too few readings
+        jump, fitted with a linear drift, and sd of this step [K]; NaN with too few readings
     """
 
     time: float

@@ -133,11 +133,9 @@ USUAL_FORCE = ForceOptions()
 
 def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce | None:
     """
-    Return the known |f| of a bag from the user's options (`asked`), else from the metadata of the
-    bag; None for gravity.
+    Return the known |f| of a bag from the user's options (`asked`) or its metadata; None for g.
 
-    Raises FitError if the text of |f| cannot be parsed, or the topic of the rotation rate has no
-    messages.
+    Raises FitError for a text of |f| that cannot be parsed, and for a rotation topic without data.
     """
     metadata = info.metadata
     try:
@@ -164,8 +162,7 @@ def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownFo
 def parse_sections(text: str) -> tuple[Section, ...]:
     """
     Read |f| from a text: a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, with times
-    in seconds since the bag's first sample and |f| in m/s^2. A semicolon also ends a line; a #
-    begins a comment.
+    since the bag's first sample [s]. A semicolon also ends a line; a # begins a comment.
     """
     lines = text.replace(',', ' ').replace(';', '\n').split('\n')
     rows = [_numbers(words) for line in lines if (words := line.split('#')[0].split())]

@@ -9,8 +9,7 @@ halves detect columns that interpolate between the sections of one program but w
 another program. The left-out windows are corrected as the node would correct them: with the unit's
 parameters alone, initial lag states at their prior mean, no mounting offsets and no tilts of the
 support. The errors are the drift (the force along each axis less its mean over the position, which
-does not depend on the attitude) and ``|f| - g`` of the position, if the other positions determine
-``|f|``.
+does not depend on the attitude) and, if the other positions determine |f|, ``|f| - g``.
 
 A model is better than another model if its error is smaller by more than the standard error over
 the folds, both for positions and for sections of the program. A model that describes only one

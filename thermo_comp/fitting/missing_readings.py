@@ -25,8 +25,7 @@ class _Missing(NamedTuple):
 
     n_still: all samples
     n_unsettled: samples before the estimate of the board temperature is accurate
-    n_between: later samples without a temperature, while all thermometers have begun and none has
-        ended
+    n_between: later samples without a temperature, between first and last readings
     """
 
     n_still: float

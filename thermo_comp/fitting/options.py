@@ -57,10 +57,8 @@ class FitOptions:
     gravity: local gravity [m/s^2]; a value that does not occur on Earth raises FitError
     model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper: a
         linear static and a quadratic dynamic set, no response
-    static_curve, dynamic_curve: families of the curves of the static and the dynamic set, or None
-        for the default of `model`
-    groups, forced: groups of columns that the model may have (None: all), and groups that it keeps
-        without a selection
+    static_curve, dynamic_curve: families of static and dynamic curve, or None for the model's
+    groups, forced: groups of columns that the model may have (None: all), and that it must have
     prior: calibration of this unit or of its type, whose columns are used without a selection
     ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
         calibration; if both are 0, the change is estimated from the bags

@@ -48,8 +48,7 @@ class PartCurves(NamedTuple):
 
 def curves_of(parts: Sequence[Part], columns: Sequence[Column], n_curves: int) -> PartCurves:
     """
-    Return the curves over the temperature of the part of each axis, or none if a column that they
-    need is missing.
+    Return the curves over the temperature of each axis's part; none if a column is missing.
 
     `n_curves`: number of columns of the static and dynamic set, of which the first are t, t^2, t^3
     """

@@ -46,8 +46,7 @@ class _Shape(NamedTuple):
 
     n_nodes: largest number of nodes of the spline of the bias
     most_noise: largest ratio of the RMS residual to the noise at which noise explains the residual
-    has_stress: whether bias and scale also have terms m and m x, for the thermal stress between
-        the part and the board
+    has_stress: whether bias and scale have terms m and m x, for stress between part and board
     has_gradient: whether the bias also has a term in the gradient T_case - T_board
     """
 

@@ -175,8 +175,7 @@ def _without_range(column: Column) -> Column:
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return columns of the bank of time constants, with factors, whose weighted sum approximates the
-    given column.
+    Return columns of the bank of time constants, with factors, whose sum approximates a column.
 
     Parts of two units of a type have different time constants, so a lag is interpolated between
     the lags of the bank, which is common to all units; a lag of 0 s has the value 0. A lag of two
@@ -217,8 +216,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return [(shortest, share**column.term.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
-    # The factors of four lags of the bank are Lagrange polynomials in the logarithm of the time
-    # constant.
+    # The factors of four lags of the bank are Lagrange polynomials in log time constant.
     first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
     near = FINE_TAUS[first : first + 4]
     result = []

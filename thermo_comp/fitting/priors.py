@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the informative prior of a fit, from an earlier calibration of the unit or from a prior of its
-type (`population`).
+Owns the informative prior of a fit, from a calibration of the unit or its type (`population`).
 
 Values and covariance of all parameters of the calibration are mean and covariance of the Gaussian
 prior of the regression, which has the calibration's columns. The covariance is increased by the
@@ -98,11 +97,9 @@ def informative_priors(
     options: FitOptions,
 ) -> Iterator[InformativePrior]:
     """
-    Return several priors from a calibration, for different amounts of ageing; the fit compares
-    them by evidence.
+    Return priors from a calibration for several amounts of ageing; the fit compares the evidence.
 
-    The fit begins with the last prior, which is the widest. Raises FitError if the calibration has
-    no covariance.
+    The fit begins with the last, widest prior. FitError if the calibration has no covariance.
     """
     if calibration.posterior is None:
         raise FitError(

@@ -202,8 +202,7 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # Forward selection chooses at most 60 bend columns: a bump in the bias of one axis
-            # needs 20 columns.
+            # Forward selection of up to 60 bend columns: a bump in the bias of an axis needs 20.
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)

@@ -118,8 +118,7 @@ def quantum_of(values: Floats) -> float:
 
 
 def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
-    # Second differences of readings do not depend on a linear ramp; for white noise of sd s their
-    # sd is s sqrt(6).
+    # Second differences of readings contain no linear ramp; white noise of sd s gives s sqrt(6).
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
@@ -135,9 +134,8 @@ def _flicker(recorded: Sequence[Readings]) -> float:
     """
     Return the sd of the noise of readings whose quantum is much larger than the noise [K].
 
-    While the temperature passes the edge between two rounded values at the rate r, readings at
-    intervals h with noise of sd s change between these values ``2 s / (r h sqrt(pi))`` times, and
-    at least once.
+    While the temperature passes the edge between two rounded values at the rate r, readings with
+    interval h and noise of sd s change at least once, and ``2 s / (r h sqrt(pi))`` times.
     """
     moves = inverse_rates = 0.0
     for readings in recorded:
@@ -281,8 +279,7 @@ def thermal_states(
     """
     Run a tracker over a bag; evaluate its thermal state at intervals of `step_s`.
 
-    Returns the time of the first state [s], the states, and whether the readings before each state
-    are recent enough.
+    Returns the time of the first state [s], the states, and whether each has recent readings.
     """
     readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
     reading = next(readings, None)

@@ -78,8 +78,7 @@ class Whitener:
         self, series: Floats, weight: Floats, noises: Sequence[Noise]
     ) -> Iterator[tuple[Ints, Bools, Floats, Floats]]:
         """
-        Run the Kalman filter over series, shape (n, m), for k noises with the same number of
-        processes.
+        Run the Kalman filter over series, (n, m), for k noises with equal numbers of processes.
 
         Yields for step j: number of the j-th window of each position, whether the position has j
         windows, innovations, (k, n_positions, m), and their variances [sigma^2], (k, n_positions).

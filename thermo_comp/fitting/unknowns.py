@@ -40,8 +40,7 @@ class Windows:
     """
     The data of a fit: windows sorted by position and time, with every column of the table.
 
-    position, bag: numbers from 0 of each window's position and bag; no position extends over two
-        bags, shape (n,)
+    position, bag: number of each window's position (within one bag), and bag, from 0, shape (n,)
     section: number of the section of the program, from 0, see `windows.N_SECTIONS`, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: number of samples divided by the median number of a window, shape (n,)
@@ -55,8 +54,7 @@ class Windows:
     start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
     in_scale: whether each column may act on the scale as well as on the bias, shape (m,)
-    tilt: functions of temperature to which the tilt of a support is proportional, each divided by
-        its RMS, shape (n, k)
+    tilt: functions of temperature, of RMS 1, of which a support's tilt is a sum, shape (n, k)
     forces: known |f| and nonlinear terms, or None if |f| is gravity in all positions
     undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,), or None if the
         fit estimates them
@@ -234,14 +232,12 @@ class Prior:
     sigma: sd of the white noise of a window of weight 1 [m/s^2], shape (3,)
     least_sigma: lower bound of sigma [m/s^2]; by default it is below the noise of any sensor
     noise: slow noise
-    offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd [m/s^2]; 0 if both
-        are constant
+    offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd, 0: constant [m/s^2]
     misalignment_scale: value of misalignment_sd before the data are used [rad]
     unseen_misalignment_sd: sd of the elements of M [rad] in the published covariance, if positions
         near the faces do not determine M and `misalignment_sd` is a smaller constant; else 0
     tilt_sd: sd of the coefficients of the tilts of a support [rad], see `Windows.tilt`
-    pose_sd: sd of the attitude of a position about its pose [rad]; the prior of attitudes without
-        a pose is flat
+    pose_sd: sd of attitudes about their pose [rad]; the prior of attitudes without pose is flat
     start_variance_ratio: variance of the initial lag states / their variance in the node's prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive coefficient, shape (2 k,)
@@ -280,8 +276,7 @@ class State:
     misalignment: elements of the inverse of M below the diagonal, shape (3,)
     up: upward unit vector of each position, its attitude, shape (n_positions, 3)
     offset: bias offset of each position [m/s^2], shape (n_positions, 3)
-    tilt: coefficients of the tilts of the support along the tangents of the attitude [rad], shape
-        (n_positions, k, 2)
+    tilt: coefficients of the support's tilts along the tangents [rad], shape (n_positions, k, 2)
     start: initial lag states of each bag, in units of their sd, shape (n_bags, r)
     turn_on: bias offset of each bag's turn-on [m/s^2], shape (n_bags, 3) or (n_bags, 0)
     nonlinear: nonlinear coefficients in the order of `Forces`, shape (3, 2 k)

@@ -396,8 +396,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     """Run the tracker over the readings of a bag."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
-        # Without readings assume that the unit has been at the reference temperature for 1e9 s, so
-        # that all lags are 0.
+        # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.
         still = np.zeros((2, Layout(spec).width))
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9

@@ -121,8 +121,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         if abs(z) > spread.limit
     ]
     wide = Verdict.WIDE.value
-    # The verdict WIDE contains a number, which is replaced so that all such units are counted
-    # together.
+    # The verdict WIDE contains a number, which is replaced to count all such units together.
     texts = (str(row['verdict']) for row in rows)
     verdicts = (f'{wide} little' if text.startswith(wide) else text for text in texts)
     return Summary(

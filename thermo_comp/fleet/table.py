@@ -34,8 +34,7 @@ Row = Mapping[str, Cell]
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
 # Characters with which a formula in a spreadsheet begins.
 _FORMULA = ('=', '+', '-', '@')
-# Names of findings of incomplete data, with which a part of the calibration follows from the
-# prior.
+# Names of findings of incomplete data: a part of the calibration then follows from the prior.
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
@@ -182,8 +181,7 @@ def fitted_cells(
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
-    # Without a prior, few positions do not separate the slopes of bias and scale: leave out the
-    # sd.
+    # Without a prior, few positions do not separate the slopes of bias and scale: omit their sd.
     is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
     for quantity, unit, slope, sd in _slopes(calibration):
         parts[f'{quantity}_slope_{{0}}_{unit}'] = slope
@@ -228,8 +226,7 @@ def fitted_cells(
 def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats]]:
     """
     Yield, for bias and for scale: name, unit, slopes of the static curves at T_ref and their sd,
-    (3,). The sd is NaN for an axis whose curve the fit has left out: the slope 0 is no
-    measurement.
+    (3,). The sd is NaN if the fit has left out the curve of an axis: its slope is not measured.
     """
     layout, posterior = parameter_layout(calibration), calibration.posterior
     K = np.array([axis.scale_factor for axis in calibration.axes])

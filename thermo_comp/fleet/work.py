@@ -182,10 +182,7 @@ def _uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def connected(scheduler: str | None = None, n_workers: int | None = None) -> Iterator[Any]:
-    """
-    Yield a client of the cluster at the address `scheduler`, or of a new local cluster. Raises
-    ThermoCompError if a worker has another version of thermo_comp.
-    """
+    """Yield a client of the cluster at the address `scheduler`, or of a new local cluster."""
     import dask
     from distributed import Client
     from distributed.utils import get_mp_context
