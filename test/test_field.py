@@ -360,7 +360,7 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'
     again = cli('evaluate', log, '-c', new)
-    assert '240 windows took part in the last update' in again.stdout
+    assert '240 windows were used by the last update' in again.stdout
     again = cli('update', new, log, '-o', tmp_path / 'newer.yaml', code=1)
     assert 'has been updated with all of these rests' in again.stderr
 

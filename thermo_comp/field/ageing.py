@@ -34,8 +34,7 @@ from .series import Series
 #: of bias and of scale times g, per root day, and for the scatter of a rest. Prior sd of the
 #: natural logarithm of each sd in `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
-#: Centre of the prior of the sd of the lag states at a start, relative to the sd that the
-#: calibration assumes.
+#: Centre of the prior of the sd of lag states at a start, relative to that of the calibration.
 _LAG_SHARE = 1.0
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G

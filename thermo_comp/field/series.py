@@ -152,7 +152,7 @@ def read_rests(
     first_ns = begin * _DAY_NS + 1e9 * is_update
     later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
     if is_update and not is_for_update:
-        notes.append(f'{counted(len(rests) - len(later), "window")} took part in the last update')
+        notes.append(f'{counted(len(rests) - len(later), "window")} were used by the last update')
     elif is_update and not later:
         raise RecordingError(
             'the calibration has been updated with all of these rests: update it again once the '

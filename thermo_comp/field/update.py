@@ -3,9 +3,9 @@
 """
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
-A rest determines the error along gravity alone, so only axes along gravity are determined. An axis
-is updated only if the rests reduce the sd of some combination of its bias and scale to 0.6 of its
-sd before the update. Axes that are not updated keep their values, with an increased covariance.
+A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
+An axis is updated only if the rests reduce the sd of some combination of its bias and scale to 0.6
+of its sd before the update. Other axes keep their values, with an increased covariance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,8 +27,7 @@ from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import Series, last_rest, valid_since
 
-#: Names of conclusions that a user can override: gravity is not as stated; samples of another
-#: unit.
+#: Names of conclusions that a user can override: another gravity than stated, another unit.
 OVERRIDES = ('gravity', 'unit')
 #: Limits of the RMS of |f| - g over the rests of a start: relative to gravity (1 mg, as after a
 #: shock), and in claimed sd (30, some milli-g for a poor sensor). An RMS above both limits is
@@ -72,9 +71,8 @@ class Judged:
     Score of an update on left-out rests.
 
     over, n: kind of the folds ('days' or 'starts'), and their number
-    before, after: RMS of ``|f| - g`` over all folds with the old calibration, and with an update
-    by
-        the rests before each fold [m/s^2]
+    before, after: RMS of ``|f| - g`` over all folds, with the old calibration and with an update
+        by the rests before each fold [m/s^2]
     gain, gain_sd: mean over the folds of the decrease of the mean square of ``|f| - g`` by the
         update, and the standard error of this mean [m^2/s^4]
     n_worse: number of folds whose mean square increases by more than `gain_sd`
@@ -306,7 +304,7 @@ def refuse_another_unit(result: Update) -> None:
         raise FitError(
             f'on {day} |f| differs from the gravity {series.gravity[at]:.5f} m/s^2 by '
             f'{ug_text(rms[worst])} RMS, expected at most {ug_text(largest[worst])} for this unit '
-            'from ageing: samples of another unit, another gravity, or damage (override with '
+            'with ageing: samples of another unit, wrong gravity, or damage (override with '
             '--allow unit)'
         )
 
@@ -377,10 +375,11 @@ def change_texts(result: Update) -> list[str]:
     if undetermined:
         lines.append(
             f'the rests do not determine {", ".join(undetermined)}: these axes keep their values, '
-            'with an aged uncertainty; rests in other attitudes would determine them'
+            'with an uncertainty that includes ageing; rests in other attitudes would determine '
+            'these axes'
         )
     if result.n_outliers:
         lines.append(
-            f'left out, as they contradict all other rests: {counted(result.n_outliers, "rest")}'
+            f'left out, because all other rests contradict: {counted(result.n_outliers, "rest")}'
         )
     return lines

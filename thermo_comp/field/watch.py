@@ -173,10 +173,10 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
 
 def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
-    Return, for each day, the index of the first day, and the robust RMS, of the week up to it.
+    Return the index of the first day, and the robust RMS, of the week that ends on each day.
 
-    A week has at least two days with rests, if necessary the preceding day with rests. The largest
-    daily RMS of a week, perhaps of a disturbed day, is replaced by the second largest.
+    If a week has only one day with rests, the preceding day with rests is added. The largest daily
+    RMS of a week, perhaps of a disturbed day, is replaced by the second largest.
     """
     n = np.arange(len(day))
     first = np.minimum(

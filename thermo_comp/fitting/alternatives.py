@@ -28,8 +28,8 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior or, without a prior, a model with all columns that the
-    thermometers of the bags allow.
+    Return the model of the prior or, without a prior, a model with all columns for which the bags
+    have thermometers.
 
     `parts`: the lag of each axis, or None for the bank of time constants
     """
@@ -118,8 +118,8 @@ def _better(fit: Fit | None, other: Fit) -> Fit:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the chosen model has a static and a dynamic set, or another such model has a score
-    within one standard error of the chosen model's, and less than 80 % of its white noise.
+    Whether the chosen model has two sets, or a model with two sets has a score within one standard
+    error of the chosen model's and, on each axis, less than 80 % of its white noise.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

@@ -80,7 +80,7 @@ def claim_of(
     `Selected` and `jackknife`
     """
     # All rests of a mounting share an offset, but the regression has an offset for each rest: with
-    # `n_rests` times the variance, the mean offset of a mounting's rests has the right variance.
+    # `n_rests` times the variance, the mean over a mounting's rests has the offset's variance.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -153,7 +153,7 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     calibration, 0 without one; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
     """
     if known_sd:
-        # The test of the prior calibration, with 12 positions, determined this sd within 1.5:1.
+        # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, _student(np.log(ratio) / np.log(1.5))
     # `least`: smallest usual sd, relative to `scale`. By data sheets, the bias of navigation grade
@@ -183,7 +183,7 @@ def _widened(
     regression: Regression, posterior: Posterior, candidates: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
     """
-    Return the covariance including columns that the data do not determine, and its layout first.
+    Return layout and covariance, with the columns that the data do not determine.
 
     `candidates`: prior sd of the columns, shape (2, m); `of_means`: fit to the positions' means
     """
@@ -238,7 +238,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures the lags are thermometer errors, and bound no weight of a lag.
+        # At constant temperatures only thermometer errors change the lags: no bound on weights.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
@@ -269,8 +269,8 @@ def _over_mountings(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
     """
-    Return the covariance of the unit's unknowns, and the RMS of the offset sd [m/s^2], over the
-    mixture of fits with the sds of mounting offsets `tried`, (k,), of log prior density (k,).
+    Return the covariance of the unit's unknowns, and the RMS of the offset sd [m/s^2], by a
+    mixture of fits with the sds `tried` of mounting offsets, (k,), and their log prior density.
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the covariance of a triad's constants by the positions of a test, and the next position.
+Owns the covariance of a triad's constants after a test, and the choice of its next position.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
 bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. The equations

@@ -381,7 +381,7 @@ def judge_result(
             'a static and a dynamic set fitted without the prior'
         )
     elif is_changed:
-        contradiction = 'the parameters differ from its values by far more than its sds'
+        contradiction = 'the parameters differ from those of the prior by far more than its sd'
     if contradiction:
         yield advice(
             'prior',

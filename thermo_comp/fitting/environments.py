@@ -44,7 +44,7 @@ def _is_far_above(square: Floats | float, usual: float) -> Bools:
 
 def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Return a list of the number of the bag that may be of another environment, or [].
+    Return, in a list, the number of a bag that may be of another environment; [] if none may.
 
     A bag is suspect if its left-out drift is far above both the median over the bags and the white
     noise of a window. A bag is also suspect if its drift is the only one that the other bags do

@@ -350,13 +350,13 @@ def _fit(
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """Return the bags without topics that copy the board's thermometer, and findings on them."""
+    """Return the bags without copies of the board's thermometer; and findings on raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name
         raise FitError(
             f'{name}: no board temperature, which the other bags have: leave out this bag, or '
-            'name its topic with --topic board=TOPIC'
+            'name the topic of its board temperature with --topic board=TOPIC'
         )
     serial = check_serial([bag.source for bag in bags], options)
     findings = enforce(raw_checks.judge_prior(serial, options.prior), options)

@@ -199,7 +199,7 @@ def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, fl
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, sd, slope, bend + 0.1)
-    # Bounds of the offset sd: 1e-4 of the prior's scale, and 5 mg (0.05 m/s^2) of cheapest MEMS.
+    # Bounds of the offset sd: 1e-4 of the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
     new = float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
     return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
 
@@ -361,7 +361,7 @@ def downweigh(regression: Regression, posterior: Posterior) -> None:
 def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
     """Return factors of at most 1 for the windows' weights, from residuals of shape (n, 3)."""
     size = residual * np.sqrt(weight)[:, None]
-    side = 3  # number of windows on each side, whose median is the local level
+    side = 3  # number of windows before, and after, a window for the median, its local level
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 2 * side:
             around = np.pad(part, ((side, side), (0, 0)), mode='reflect')

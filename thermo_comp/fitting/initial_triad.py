@@ -174,7 +174,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     change = within_positions(windows.board[:, :1], windows.position)
     power = np.maximum(np.add.reduceat(change**2, first), 1e-12)
     along = np.add.reduceat(change * drift, first)
-    # The mean of `along**2 / power` of a position under white noise alone is its variance.
+    # Under white noise alone, the mean of `along**2 / power` of a position is the noise variance.
     square = along**2 / power - white_noise_of(windows, scale) ** 2
     slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
     variance = float(windows.board[:, 1].mean()) - beyond_noise * windows.board_noise**2

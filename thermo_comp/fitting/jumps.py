@@ -159,9 +159,8 @@ def _examine(
     size = float(np.linalg.norm(step))
     along_sd = float(np.sqrt((middle / norm) ** 2 @ step_sd**2))
     needed_rad = float(np.sqrt(max(size**2 - along**2, 0.0))) / norm
-    # A step is not a rotation if the gyroscope measured less than a third of the angle that would
-    # explain it, or if |a| changed by more than 20 % of it: a rotation by d changes |a| by at most
-    # 2 d times the error of scale and misalignment (10 %).
+    # A step is not a rotation if the gyroscope measured less than a third of the step's angle, or
+    # if |a| changed: a rotation by d changes |a| by at most 2 d times the sensor's error (10 %).
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )

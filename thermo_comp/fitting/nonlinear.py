@@ -185,7 +185,7 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return `Folds.gain_of` for left-out norms, by the coefficients `dropped`."""
+        """Return the log ratio (`Folds.gain_of`) of left-out norms without and with `dropped`."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:

@@ -57,7 +57,7 @@ class FitOptions:
     gravity: local gravity [m/s^2]; a value that does not occur on Earth raises FitError
     model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper: a
         linear static and a quadratic dynamic set, no response
-    static_curve, dynamic_curve: families of static and dynamic curve, or None for the model's
+    static_curve, dynamic_curve: families of static and dynamic curve; None: default of `model`
     groups, forced: groups of columns that the model may have (None: all), and that it must have
     prior: calibration of this unit or of its type, whose columns are used without a selection
     ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
@@ -149,9 +149,7 @@ class FitOptions:
                     raise ValueError(f'`{name}` must be one of {", ".join(words)}, got {word!r}')
 
     def nonlinear_sd(self, kind: Kind) -> float:
-        """
-        Return the prior sd of a nonlinear term [g/g^2], or of the cube [g/g^3].
-        """
+        """Return the prior sd of a nonlinear term [g/g^2], or of the cube [g/g^3]."""
         if kind == 'cube':
             # Limits of K3 in data sheets of quartz pendulums are a few ug/g^3.
             return 1e-5 if self.k3_sd is None else self.k3_sd

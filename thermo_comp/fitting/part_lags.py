@@ -240,7 +240,7 @@ class _PartCurves:
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # A second stage or another share would not reduce this residual to the limits.
+                # Neither a second stage nor another share would reduce this residual enough.
                 return best
             lags = [self._searched(axis, _in_two_stages(one_stage), _Steps(0.2, 0.4))]
             if best.lead_s:

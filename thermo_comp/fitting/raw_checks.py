@@ -151,8 +151,7 @@ class _DeadAxis(NamedTuple):
 def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     """Return why the readings of axes are constant: clipped at the full scale, or dead."""
     largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
-    # The relative tolerance allows for the limits of a two's complement code, such as -32768 and
-    # 32767, whose magnitudes differ by one.
+    # The limits of a two's complement code, such as -32768 and 32767, differ in size by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
@@ -188,7 +187,7 @@ def constant_axes(bags: Sequence[ReducedBag], usual: Bools) -> Iterator[_DeadAxi
             for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
                 hours = (rest.end_ns - rest.start_ns) / 3600e9
                 value = float(rest.mean[0, axis])
-                text = f'{"xyz"[axis]} reads {value:g} to the bit for {hours:.2g} h'
+                text = f'{"xyz"[axis]} reads exactly {value:g} for {hours:.2g} h'
                 yield _DeadAxis(bag.source.name, int(axis), value, text)
 
 

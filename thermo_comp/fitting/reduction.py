@@ -54,7 +54,7 @@ class StillInterval:
     start_ns, end_ns: stamps of the middles of the interval's first and last cell
     begin_s: start of the interval's first window, since the bag's first sample [s]
     n_whole: number of windows of full length; a shorter last window may follow them
-    time, count, mean: of each window: time since the bag's first sample [s], samples, their mean
+    time, count, mean: by window, mean time since the first sample [s], number and mean of samples
     sample_sd: root of the median over the cells of the variance of single samples, shape (3,)
     rounding_sd: sd of the error of the mean by rounding; 0 if samples have noise, shape (3,)
     angular_rate: mean angular rate of each window [rad/s], or None if samples of the bag lack it
@@ -121,7 +121,7 @@ class ReducedBag:
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """The bags of this recording, as a calibration states them."""
+        """The bags of this recording, for the provenance of a calibration."""
         name, sha256 = self.source.name, self.source.sha256 or ''
         return self.parts or (Source(name, sha256, self.n_samples),)
 

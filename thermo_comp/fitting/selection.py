@@ -75,7 +75,7 @@ class Selected:
 
     @property
     def lacks_effects(self) -> bool:
-        """Whether the left-out drift exceeds twice the sum of white and slow noise of a window."""
+        """Whether the left-out drift exceeds twice the noise of a window, white and slow."""
         prior = self.posterior.prior
         noise = float(prior.sigma.mean() * np.sqrt(1.0 + prior.noise.variance))
         return self.score.rms > 2.0 * noise
@@ -148,7 +148,7 @@ class Growth:
         Fit the model `before` with further groups, beginning from the fit of `before`.
 
         `most`: largest typical prior sd of the new columns, shape (2, m), see `_typical`, or None
-        if there are no new columns
+        to use the typical sd of `before` for the new columns
         """
         typical = before.typical if most is None else self._typical(before, groups, most)
         posterior = before.posterior
@@ -194,7 +194,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model with the three sets of groups of the largest possible evidence."""
+        """Fit the chosen model plus one set of groups, for the three sets of largest gain."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []

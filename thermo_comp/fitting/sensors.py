@@ -135,7 +135,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
     Return the sd of the noise of readings whose quantum is much larger than the noise [K].
 
     While the temperature passes the edge between two rounded values at the rate r, readings with
-    interval h and noise of sd s change at least once, and ``2 s / (r h sqrt(pi))`` times.
+    interval h and noise of sd s change ``2 s / (r h sqrt(pi))`` times, but at least once.
     """
     moves = inverse_rates = 0.0
     for readings in recorded:

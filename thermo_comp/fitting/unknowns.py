@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 #: Built-in prior sd of a bias [m/s^2]: 100 mg, above the data sheets of consumer MEMS.
 BIAS_SD = 1.0
-#: Built-in prior sd of a relative scale factor.
+#: Built-in prior sd of an axis' scale factor, relative to the mean of the axes.
 SCALE_SD = 0.05
 #: Typical sd of the attitude of a unit that is returned to a pose by hand [rad].
 POSE_SD = 1e-3

@@ -34,7 +34,7 @@ from .unknowns import Windows
 #: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
 #: slope at a temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
-#: Groups of columns that, added to the curve, make it a curve over a part's temperature.
+#: Groups whose columns, with those of the curve, form the curves over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
 #: Groups of columns linear in a difference of temperatures; groups of the products of such a
 #: difference with temperature, and of its squares.
@@ -74,7 +74,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of static and dynamic curve; a shared dynamic curve has the larger family."""
+        """Families of static and dynamic curve; a shared dynamic curve gets the higher order."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 

@@ -100,7 +100,7 @@ _TABLE = (
     ('dynamic_ug', 'number', 'RMS of |f| - g at rest in the dynamic regime, corrected'),
     ('all_ug', 'number', 'RMS of |f| - g at rest in both regimes, corrected'),
     ('peak_ug', 'number', 'largest magnitude of |f| - g of a window at rest, corrected'),
-    ('unseen_ug', 'number', 'RMS of |f| - g, else of the drift, by fits without the position'),
+    ('unseen_ug', 'number', 'RMS of |f| - g, or of the drift, of positions left out in turn'),
     ('claimed_ug', 'number', 'RMS over the windows of the claimed standard deviation of |f|'),
     ('cpu_s', 'number', 'processor time of reading and fit'),
     ('tool_version', 'text', 'version of thermo_comp that fitted the unit'),
