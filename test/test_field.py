@@ -245,7 +245,7 @@ def test_samples_of_another_unit_are_refused(first):
         for (s, r), day in zip(history.rests, history.day, strict=True)
     ]  # fmt: skip
     result = update(series_of(mixed, unit), unit)
-    with pytest.raises(FitError, match=r'at most 1 mg for this unit from ageing: samples'):
+    with pytest.raises(FitError, match=r'at most 1 mg for this unit with ageing: samples'):
         refuse_another_unit(result)
 
 
