@@ -110,8 +110,8 @@ def read_rests(
 
     Returns the rests, the source of an update aged by `ahead` days, and notes for the user.
 
-    Rests before the date of the calibration are left out, unless all rests are before it. Rests
-    that an earlier update used are left out only if `is_for_update`. No rest: RecordingError.
+    Rests before the date of the calibration are left out, unless all are. Rests used by an earlier
+    update are left out only if `is_for_update`. Raises RecordingError if no rest remains.
     """
     files: list[Path] = []
     for path in paths:

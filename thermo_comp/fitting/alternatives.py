@@ -112,7 +112,7 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _better(fit: Fit | None, other: Fit) -> Fit:
-    """Return `other` if it is better than `fit` on left-out data, or there is no `fit`."""
+    """Return `other` if it is better than `fit` on left-out data, or if `fit` is None."""
     return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit
 
 

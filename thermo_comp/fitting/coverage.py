@@ -157,7 +157,7 @@ def best_rests(candidates: list[Floats]) -> int:
 
     The sd of the constants follows from the directions of the rests of a set and from the
     residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd, because
-    earlier sets have stricter thresholds; it is the first of all if no set has six attitudes.
+    earlier sets have stricter thresholds. If no set has six attitudes, the first set is the best.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
     counts = [len(distinct_directions(up)) for up in ups]

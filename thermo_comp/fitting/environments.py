@@ -47,8 +47,8 @@ def contradicting_bag(fit: Fit) -> list[int]:
     Return, in a list, the number of a bag that may be of another environment; [] if none may.
 
     A bag is suspect if its left-out drift is far above both the median over the bags and the white
-    noise of a window. A bag is also suspect if its drift is the only one that the other bags do
-    not determine, and the median left-out drift is far above the noise.
+    noise of a window. If the other bags do not determine the drift of exactly one bag, and the
+    median left-out drift is far above the noise, this bag is suspect.
     """
     square = _square_of_bags(fit)
     known = np.isfinite(square)

@@ -367,7 +367,7 @@ def _judged(
 
 def _unusable(error: ValueError, up: Floats) -> FitError:
     if 'misalignment' in str(error):
-        # Many positions leave no doubt of the misalignment: the samples are not of a triad.
+        # If the positions determine the misalignment, these samples are not those of a triad.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'in the fit the angle between two of the axes is less than 60 degrees, which no '

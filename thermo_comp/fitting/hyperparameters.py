@@ -361,7 +361,7 @@ def downweigh(regression: Regression, posterior: Posterior) -> None:
 def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
     """Return factors of at most 1 for the windows' weights, from residuals of shape (n, 3)."""
     size = residual * np.sqrt(weight)[:, None]
-    side = 3  # number of windows before, and after, a window for the median, its local level
+    side = 3  # number of windows before, and after, a window, whose median is its local level
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 2 * side:
             around = np.pad(part, ((side, side), (0, 0)), mode='reflect')

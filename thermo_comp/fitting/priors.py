@@ -99,7 +99,7 @@ def informative_priors(
     """
     Return priors from a calibration for several amounts of ageing; the fit compares the evidence.
 
-    The fit begins with the last, widest prior. FitError if the calibration has no covariance.
+    The fit begins with the last, widest prior. A calibration without covariance raises FitError.
     """
     if calibration.posterior is None:
         raise FitError(

@@ -28,8 +28,8 @@ def union(ranges: Iterable[Range]) -> Range:
 def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range:
     """
     Return the valid range of a quantity that is proportional to a power (`order`) of a heat flow:
-    the range of its values with a margin, times 2^order for ramps of twice the rate, because heat
-    flow is proportional to the rate. The range of a temperature (order 0) is not multiplied.
+    the range of its values with a margin, extended by a factor 2^order to ramps of twice the rate,
+    as heat flow is proportional to the rate. The range of a temperature (order 0) is not extended.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))

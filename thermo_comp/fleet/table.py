@@ -275,7 +275,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read a table of an earlier run; missing columns are empty. Other files: ThermoCompError."""
+    """Read a table of an earlier run, ThermoCompError if it is none; missing columns are empty."""
     from pyarrow import ArrowException, parquet
 
     try:
