@@ -111,7 +111,7 @@ class TestUsage:
 def test_a_prior_with_curves_that_differ_by_axis_is_refused(cli, tmp_path):
     prior = ROOT / 'config' / 'calibration.example.yaml'
     words = ('fit', bag(tmp_path / 'bag'), '-o', tmp_path / 'o.yaml', '--gravity', '9.81')
-    refused(cli, 1, r'the curves of the prior differ from axis to axis', *words, '--prior', prior)
+    refused(cli, 1, r'the curves of the prior have different forms', *words, '--prior', prior)
 
 
 class TestBags:

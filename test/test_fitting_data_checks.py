@@ -119,7 +119,9 @@ def test_rests_on_a_desk_with_a_prior_of_the_unit_need_no_chamber(good):
     findings = findings_of(desk, up, prior=prior)
     assert not {'ramps', 'soaks', 'soak'} & {*findings}
     assert findings['span'].level == 'good'
-    assert 'that of the prior, 5 to 35 degC' in findings['span'].message
+    assert (
+        'the prior gives the effect of temperature from 5 to 35 degC' in findings['span'].message
+    )
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)

@@ -417,7 +417,7 @@ def test_an_axis_that_is_dead_in_a_rest_is_named(tmp_path):
     density = (5.0 / K * np.sqrt(0.1),) * 3
     noisy = corrected_by(SLOPE, noise_density_m_s2_sqrt_hz=density)
     noisy = dataclasses.replace(noisy, unit=dataclasses.replace(noisy.unit, cycle_time_s=0.1))
-    with pytest.raises(RecordingError, match=r'dead\.mcap: y reads 0 to the bit for 0\.'):
+    with pytest.raises(RecordingError, match=r'dead\.mcap: y reads exactly 0 for 0\.'):
         judged(bag, noisy)
     # An axis whose noise is below the step of the converter may repeat one number.
     assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the ageing model of a unit: a Gaussian model of ``|f| - g`` at rest, with variances estimated
-by evidence.
+Owns the ageing model of a unit: a Gaussian model of ``|f| - g`` at rest, fitted by evidence.
 
-``|f| - g`` of rest i at time t_i after start k of the node is ``H_i delta + B_i b(t_i) + S_i
-s(t_i) + B_i o_k + L_i l_k + lack + e_i``: delta is the error of the calibration (its posterior), b
-and s are random walks of bias and scale since the calibration, o_k is a bias offset, l_k are the
-unknown lag states at the start, lack is the lack of fit of the calibration, e is independent
-noise. The matrices H_i, B_i, S_i and L_i are derivatives of ``|f|``. The slopes of the bias over
-temperature are random walks of a fixed sd per root day. Jumps of the levels (bias and scale of
-each axis) or of gravity, and a change of the bias curves over temperature, are added singly while
-the log Bayes factor of the next is at least 5. The variances of walks, offsets, lag states and
-noise maximise the marginal likelihood, with wide priors.
+``|f| - g`` of rest i at time t_i, recorded after start k of the node, is ``H_i delta + B_i b(t_i)
++ S_i s(t_i) + B_i o_k + L_i l_k + lack + e_i``: delta is the error of the calibration parameters,
+with the calibration's covariance; b and s are random walks of bias and scale since the
+calibration, o_k is the bias offset of start k, l_k are the unknown lag states at start k, lack is
+the lack of fit of the calibration, e_i is independent noise. The matrices H_i, B_i, S_i and L_i
+are derivatives of ``|f|``. The slopes of the bias over temperature are random walks of a fixed sd
+per root day. Jumps of the levels (bias and scale of each axis) or of gravity, and a change of the
+slope of the bias over temperature, are added one at a time while the log Bayes factor of the next
+change is at least 5. The variances of random walks, offsets, lag states and scatter maximise the
+marginal likelihood times wide priors.
 """
 
 from __future__ import annotations
@@ -30,42 +30,42 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import Series
 
-#: Centres of priors of sds, relative to the centre for the turn-on offset: random walk of bias and
-#: of scale times g per root day, and scatter of a rest. Prior sd of the logarithm of each sd in
-#: `Ageing` (1 sd is a factor of 5).
+#: Centre of the prior of an sd, relative to that of the turn-on offset's sd: for the random walks
+#: of bias and of scale times g, per root day, and for the scatter of a rest. Prior sd of the
+#: natural logarithm of each sd in `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
-#: Centre of the prior of the sd of the lag states at a start, relative to the sd that the
-#: calibration assumes; a unit in thermal equilibrium before its start has smaller lags.
+#: Centre of the prior of the sd of lag states at a start, relative to that of the calibration.
 _LAG_SHARE = 1.0
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
 #: Prior standard deviations tried for a jump of the levels, or of gravity [m/s^2].
 _JUMPS = (50.0 * MICRO_G, 500.0 * MICRO_G, 5000.0 * MICRO_G)
 #: Prior sd of a jump in the three biases, and in the three scales times g, relative to `_JUMPS`: a
-#: shock changes scales less than biases.
+#: shock changes a scale times g less than a bias.
 _JUMP_SHARES = np.repeat([1.0, 0.1], 3)
-#: Smallest log Bayes factor at which a change is added to the model (150:1), and of a jump of
-#: gravity against a jump of the levels (20:1).
+#: Smallest log Bayes factor at which a change is added to the model (odds 150:1), and smallest log
+#: Bayes factor of a jump of gravity against a jump of the levels (odds 20:1).
 _LEAST_GAIN, _LEAST_LEAD = 5.0, 3.0
 #: Prior standard deviations tried for a change of a curve's slope [m/s^2 per K].
 _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
-#: Random walk of the curves' slopes [m/s^2 per K per root day]: the smallest of `_BENDS` is the sd
-#: after a year.
+#: Random walk of the slopes of the bias curves [m/s^2 per K per root day]: after one year, its sd
+#: is the smallest of `_BENDS`.
 _SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
-#: Largest number of rows (equations) per start of the node in the solution, and in the search for
-#: the variances; largest number of all rows in the search, whose time grows with the cube of rows.
+#: Largest number of rows (equations) per start of the node, in the solution and in the search for
+#: the variances; largest number of all rows in that search, because its computing time grows with
+#: the cube of this number.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
 
 
 @dataclass(frozen=True)
 class Ageing:
     """
-    Standard deviations of the ageing model [m/s^2]; `lags` is relative.
+    Standard deviations of the ageing model [m/s^2], except for the ratio `lags`.
 
-    bias, scale: random walk of the bias, and of the scale times g, per root day
-    turn_on: bias offset of a start of the node
-    rest: scatter from rest to rest
-    lags: unknown lag states at a start, relative to the sd that the calibration assumes
+    bias, scale: of the random walk of the bias, and of the scale times g, per root day
+    turn_on: of the bias offset of a start of the node
+    rest: of the scatter from rest to rest
+    lags: ratio of the sd of the lag states at a start to the sd that the calibration assumes
     """
 
     bias: float
@@ -80,8 +80,9 @@ class Change:
     """
     A jump of levels or gravity at `time` [days since 1970], or a change of the bias curves' slope.
 
-    sd: prior standard deviation of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
-    may_be_gravity: whether a jump of gravity explains a jump of the levels almost as well
+    time: time of a jump; None for a change of slope, which holds for all rests
+    sd: prior sd of the change of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
+    may_be_gravity: whether a jump of gravity explains the rests almost as well as one of levels
     """
 
     kind: Literal['levels', 'gravity', 'curve']
@@ -91,7 +92,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return derivatives w.r.t. levels (n, 6), gravity (n, 1) or curve slopes (n, 3)."""
+        """Return the derivatives by levels (n, 6), gravity (n, 1) or slopes of the bias (n, 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -101,12 +102,13 @@ class Change:
 @dataclass(frozen=True)
 class Rows:
     """
-    Equations of the rests, in order of the node's starts, at most `_ROWS` per start: orthogonal
-    sums of the rests of a start, with all their information about the six levels.
+    Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
+    combinations of the rests of a start, with all their information about the six levels.
 
-    noise, scatter: variance of the noise, and factor of the rests' scatter variance in a row
+    y: combination of the values ``|f| - g`` of the rests [m/s^2]; `by_...`, lack: see `Series`
+    noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row
     rank: number of the row within its start
-    warmth: board temperature less the reference temperature [K]
+    warmth: mean board temperature at the rests of a start less the reference temperature [K]
     """
 
     time: Floats
@@ -124,7 +126,7 @@ class Rows:
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives w.r.t. a jump of levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
+        """Derivatives by a jump of levels, times `_JUMP_SHARES`, and by one of gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
@@ -133,7 +135,7 @@ class Rows:
 
 
 def rows_of(series: Series, scatter: float) -> Rows:
-    """Return the equations of rests, weighted by noise and an initial scatter [m/s^2]."""
+    """Return the equations of rests, weighted by noise and an assumed sd `scatter` [m/s^2]."""
     parts: list[tuple[Floats, ...]] = []
     variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
@@ -142,11 +144,10 @@ def rows_of(series: Series, scatter: float) -> Rows:
         Q = np.eye(len(at))
         if len(at) > _ROWS:
             Q = np.linalg.svd(series.by_level[at] * weight[:, np.newaxis], full_matrices=False)[0]
-        # The factor Q of the singular value decomposition is orthogonal, so the sum of n equal
-        # rests is sqrt(n) times a single rest.
+        # The columns of Q are orthonormal: a row made of n equal rests is sqrt(n) times one rest.
         Q = Q * weight[:, np.newaxis]
         n, warmth = Q.shape[1], series.temperature[at].mean() - series.reference_temperature
-        # A change of gravity changes |f| equally in all attitudes.
+        # A change of gravity changes |f| by the same value in all attitudes.
         ones = np.ones(len(series))
         levels = (series.by_parameter, series.by_level, ones)
         summed = (series.residual, *levels, series.by_start, series.lack)
@@ -163,12 +164,12 @@ def rows_of(series: Series, scatter: float) -> Rows:
     searched = rows.start[rows.rank < _SEARCH_ROWS]
     if len(searched) <= _MOST_ROWS:
         return rows
-    # The oldest starts are left out: they have little information about the present state.
+    # The oldest starts are left out: they have little information about the levels of today.
     return rows.at(rows.start > searched[-_MOST_ROWS])
 
 
 class Model:
-    """The covariance of the rows as a function of the sds in `Ageing`, with given changes."""
+    """The covariance of the rows by the sds in `Ageing`; the walks begin at the day `since`."""
 
     def __init__(
         self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
@@ -189,7 +190,8 @@ class Model:
             np.diag(rows.scatter),
             np.where(is_same, rows.by_start @ rows.by_start.T, 0.0),
         ]
-        # The lack of fit is correlated over temperature: a Gaussian of 10 K sd.
+        # The correlation of the lack of fit at two temperatures is a Gaussian function of their
+        # difference, with an sd of 10 K.
         near = np.exp(-0.5 * (np.subtract.outer(rows.warmth, rows.warmth) / 10.0) ** 2)
         self.base = rows.by_parameter @ self.prior @ rows.by_parameter.T
         self.base += near * (rows.lack @ rows.lack.T) + np.diag(rows.noise)
@@ -200,14 +202,14 @@ class Model:
             self.base += change.sd**2 * columns @ columns.T
 
     def covariance(self, ageing: Ageing) -> Floats:
-        """Return the covariance of the model's rows."""
+        """Return the covariance of the rows."""
         result: Floats = self.base.copy()
         for sd, part in zip(vars(ageing).values(), self.parts, strict=True):
             result += sd**2 * part
         return result
 
     def fitted(self, centre: Ageing) -> tuple[Ageing, Floats]:
-        """Maximise the posterior density of the variances; return also the inverse covariance."""
+        """Return the sds of the largest posterior density, and the inverse covariance of rows."""
         middle = np.log(list(vars(centre).values()))
 
         def loss(logs: Floats) -> tuple[float, Floats]:
@@ -223,8 +225,8 @@ class Model:
             ]
             return float(value), np.array(slope) + shift / _LOG_SD
 
-        # The evidence has almost no gradient where variances are small, so the search has two
-        # initial points: most scatter is due to the starts, or most scatter to the random walks.
+        # The gradient of the evidence is almost 0 where a variance is small, so the search begins
+        # at two points: with most of the scatter due to the turn-ons, and due to the random walks.
         steps = np.abs(np.diff(self.rows.y[self.rows.rank == 0]))
         step = max(float(np.median(steps)), centre.rest)
         bounds = middle - 5.0 * _LOG_SD, middle + 5.0 * _LOG_SD
@@ -246,12 +248,12 @@ class Model:
         return ageing, self.inverse(ageing)
 
     def inverse(self, ageing: Ageing) -> Floats:
-        """Return the inverse covariance of the model's rows."""
+        """Return the inverse of `covariance`."""
         factor = cho_factor(self.covariance(ageing), lower=True)
         return np.asarray(cho_solve(factor, np.eye(len(self.rows.y))))
 
     def log_covariance(self, ageing: Ageing) -> Floats:
-        """Return the covariance of the logarithms of the sds, by Fisher information and prior."""
+        """Return the covariance of the log sds of `Ageing`, by Fisher information and prior."""
         inverse = self.inverse(ageing)
         parts = [
             2.0 * sd**2 * inverse @ part
@@ -262,7 +264,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centres of the priors, from the fit's residual sd or else the noise in 1 Hz."""
+    """Return the centres of the priors, from the residual sd of the fit or the noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -276,8 +278,8 @@ def learn(
     Estimate the ageing model by evidence, without starts that contradict all other starts.
 
     At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
-    of the node is left out if one of its rows is more than 5 sd from the prediction of all other
-    rows. Returns the variances, the model of all rows, and the rests used.
+    of the node is left out if one of its rows is more than 5 sd from the prediction by all other
+    rows. Returns the sds of the model, the model with all rows, and the rests used.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)
@@ -299,7 +301,7 @@ def learn(
         bad = rows.start[np.abs(left_out) > 5.0]
         at = np.flatnonzero(is_used)
         is_bad = np.isin(used.start, bad)
-        # If more than 10 % of the rests are outliers, the model is wrong: keep all rests.
+        # If more than 10 % of the rests would be left out, the model is wrong: keep all rests.
         if not len(bad) or is_bad.sum() > 0.1 * len(used):
             break
         is_used[at[is_bad]] = False
@@ -307,7 +309,7 @@ def learn(
 
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
-    """Return the most probable change, or None if no change has enough evidence."""
+    """Return the most probable change, or None if all log Bayes factors are too small."""
     best: dict[str, Change] = {}
     for change in candidates:
         if change.log_bayes_factor > _gain(best.get(change.kind)):
@@ -329,7 +331,7 @@ def _gain(change: Change | None) -> float:
 
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
     """
-    Yield possible jumps before each start, and a change of the curves, with log Bayes factors.
+    Yield jumps before each start, and a change of the bias slopes, with their log Bayes factors.
     """
     rows = model.rows
     alpha, by_jump = inverse @ rows.y, rows.by_jump
@@ -341,7 +343,7 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
         for i in range(width):
             precision[:, :, i, j] = np.add.reduceat(by_jump[:, [i]] * half, first, axis=0)
     gradient = np.add.reduceat(by_jump * alpha[:, np.newaxis], first, axis=0)
-    # A jump before a start also shifts all later starts.
+    # A jump before a start shifts |f| at this start and at all later starts.
     after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
     gradient = np.cumsum(gradient[::-1], axis=0)[::-1]
     known = {(change.kind, change.time) for change in model.changes}
@@ -362,9 +364,7 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
 
 
 def _log_bayes_factor(precision: Floats, gradient: Floats, sd: float) -> float:
-    """
-    Return the gain in log evidence from a change of prior sd `sd`, marginal over other unknowns.
-    """
+    """Return the gain in log evidence by a change whose unknowns have the prior sd `sd`."""
     inner = np.eye(len(gradient)) + sd**2 * precision
     gain = 0.5 * sd**2 * gradient @ np.linalg.solve(inner, gradient)
     return float(gain - 0.5 * np.linalg.slogdet(inner)[1])
@@ -376,10 +376,10 @@ class Solution:
     Change of the calibration file's parameters due to the rests, with the covariances.
 
     shift: change of the parameters
-    prior, posterior: covariances at the time of the last rest, without and with use of the rests
-    future: covariance that is added during the time of use after the last rest
-    gains, innovations: the shift is ``gains.T @ innovations``; the shift due to the first rows
-        is the sum over these rows
+    prior, posterior: covariances at the time of the last rest, before and after the rests are used
+    future: covariance that ageing adds during the time of use after the last rest
+    gains, innovations: factors of the shift ``gains.T @ innovations``, with a row for each
+        equation; the shift due to the first equations is the product of the first rows
     gravity: jumps of gravity, each with its size and the sd of the size [m/s^2]
     """
 
@@ -392,7 +392,7 @@ class Solution:
     gravity: tuple[tuple[Change, float, float], ...] = ()
 
     def before(self, row: int) -> Floats:
-        """Return the shift that follows from the first rows only."""
+        """Return the shift due to the equations before `row`."""
         return np.asarray(self.gains[:row].T @ self.innovations[:row])
 
 
@@ -400,9 +400,8 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     """
     Condition the parameters of the calibration on the rests.
 
-    `to_file`, `bend`: derivatives of the file's parameters w.r.t. the six levels,
-    (n_parameters, 6), and w.r.t. the bias slope of each axis, (n_parameters, 3).
-    `ahead`: days of use after the last rest
+    `to_file`, `bend`: derivatives of the n parameters of the file by the six levels, (n, 6), and
+    by the bias slope of each axis, (n, 3); `ahead`: days of use after the last rest
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

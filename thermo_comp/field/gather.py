@@ -5,10 +5,10 @@ Owns the detection of rests in a stream of samples: windows of 10 s without moti
 
 Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds with
 at least five samples, which is one second at 5 Hz or more. A cell is still if its standard
-deviation is that of the noise and its mean agrees with the means of the previous cell and of the
-window's first cell. Successive still cells that span 10 s form a window. In a long rest all
-windows of the first ten minutes are kept, then a window per minute up to an hour, then a window
-per five minutes.
+deviation is that of the noise, and its mean agrees with the means of the preceding cell and of the
+first cell of the window. Successive still cells that span 10 s form a window. In a long rest all
+windows of the first ten minutes are kept, then one window per minute up to an hour, then one
+window per five minutes.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ _SPACING = ((360, 30), (60, 6), (0, 1))
 
 @dataclass
 class _Cell:
-    """Sums, over the seconds `begin` to `last`, of the samples less the first sample, `origin`."""
+    """Sums of samples, less the first sample `origin`, over the seconds `begin` to `last`."""
 
     begin: int
     last: int
@@ -46,8 +46,8 @@ class _Cell:
         return np.asarray(self.origin + self.total / self.n)
 
 
-#: A function that returns the thermal state and the remaining shares of the unknown initial lag
-#: states, or None before the first temperature reading.
+#: A function that returns the thermal state, and the fractions of the unknown initial lag states
+#: that have not yet decayed, or None before the first temperature reading.
 StateNow = Callable[[], tuple[Sequence[float], Sequence[float]] | None]
 
 
@@ -63,7 +63,7 @@ class RestFinder:
         cycle_s: float = 0.0,
     ) -> None:
         # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample
-        # [m^2/s^4], by axis, at one sample per `cycle_s`; faster samples have more noise.
+        # [m^2/s^4] of each axis, at one sample per `cycle_s`; at a higher rate it is larger.
         self._scale, self._noise, self._full_scale = scale, float(noise.sum()), full_scale
         self._state_now, self._cycle_s = state_now, cycle_s
         self._cell: _Cell | None = None
@@ -74,7 +74,7 @@ class RestFinder:
 
     def add(self, stamps: Stamps, samples: Floats) -> list[Rest]:
         """
-        Take samples with rising stamps, (n, 3), or (n, 6) with angular rates; return new rests.
+        Add samples with rising stamps, (n, 3), or (n, 6) with angular rates; return new rests.
         """
         rests: list[Rest] = []
         seconds = stamps // _SECOND_NS

@@ -3,10 +3,10 @@
 """
 Owns the record of a rest, one line of text with a checksum, and the thinning of rest logs.
 
-A rest log is a folder with a file per day (UTC). Each line of a rest log is a CRC-32 in
-hexadecimal, a blank, and JSON. A JSON object describes a start of the node, a JSON list a window
-at rest since the last start. Lines with a wrong checksum are skipped, because a killed process, a
-power failure or a full disk damages only the line that is being written.
+A rest log is a folder with one file per day (UTC). Each line of a file is a CRC-32 in hexadecimal,
+a blank, and JSON: an object describes a start of the node, a list describes a window at rest after
+the start above it. Lines with a wrong checksum are skipped; if a process is killed, the power
+fails, or the disk is full, only the line being written is damaged.
 """
 
 import json
@@ -21,16 +21,16 @@ from ..thermal.state import Layout
 #: Suffix of the files of a rest log; the name of a file is the day, as in 2026-11-25.rests.
 SUFFIX = '.rests'
 
-#: First bytes after the checksum, in the record of a start and in the record of a rest.
+#: First two bytes after the checksum, in the line of a start and in the line of a rest.
 _OF_START, _OF_REST = b' {', b' ['
 
 
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node, or a later change of calibration with the `start_ns` of the node's start.
+    A start of the node, or a later change of its calibration, with the same `start_ns`.
 
-    `start_ns` identifies a start and is no date: many computers set their clock after the start.
+    `start_ns` identifies a start; it is no date, as many computers set their clock only later.
     """
 
     start_ns: int
@@ -44,10 +44,10 @@ class Start:
 @dataclass(frozen=True)
 class Rest:
     """
-    One window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of
-    samples; `mean`, `sd` of the samples [input units]; `state`: mean thermal state, laid out by
-    the `thermal.state.Layout` of `Start.memory`; `shares`: share of each lag's unknown initial
-    value that remains; `rate`: mean angular rate [rad/s], empty if unknown.
+    A window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of samples;
+    `mean`, `sd`: of the samples [input units]; `state`: mean thermal state, in the order of the
+    `thermal.state.Layout` of `Start.memory`; `shares`: fraction of the unknown initial state of
+    each lag that has not yet decayed; `rate`: mean angular rate [rad/s], empty if unknown.
     """
 
     stamp_ns: int
@@ -62,8 +62,8 @@ class Rest:
 def encode(record: Start | Rest) -> bytes:
     """Return a start or a rest as a line of a rest log."""
     if isinstance(record, Start):
-        # Earlier releases cannot read angular rates and the newer fields of lags and plays: such
-        # fields are written only if they differ from their defaults.
+        # Earlier releases cannot read rates and the newer fields of lags and plays: such fields
+        # are written only if their values differ from the defaults.
         sensors, lags, plays, rates = vars(record.memory).values()
         memory = [sensors, *([_shortened(each) for each in all_] for all_ in (lags, plays))]
         data: Any = {**vars(record), 'memory': [*memory, rates] if rates else memory}
@@ -78,7 +78,7 @@ def encode(record: Start | Rest) -> bytes:
 
 
 def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
-    """Return the fields of a lag or play, without the last fields that have default values."""
+    """Return the fields of a lag or play, without trailing fields that have default values."""
     values, defaults = tuple(quantity), [*type(quantity)._field_defaults.values()]
     while defaults and values[-1] == defaults.pop():
         values = values[:-1]
@@ -86,7 +86,7 @@ def _shortened(quantity: Lag | Play) -> tuple[Any, ...]:
 
 
 def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
-    """Return a file's rests, each with its start of the node, and the number of damaged lines."""
+    """Return the rests of a file, each with the node's start, and the number of damaged lines."""
     rests: list[tuple[Start, Rest]] = []
     start: Start | None = None
     n_damaged = 0
@@ -102,7 +102,7 @@ def decode(content: bytes) -> tuple[list[tuple[Start, Rest]], int]:
             elif start is not None:
                 rests.append((start, _rest(data, start.memory)))
         except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
-            # A line with a valid checksum can have invalid content.
+            # The content is invalid in spite of a valid checksum.
             n_damaged += 1
     return rests, n_damaged
 
@@ -143,7 +143,7 @@ def _quantity(cls: type[Any], values: Sequence[Any]) -> Any:
 
 
 def _number(value: float) -> float:
-    # A magnitude of 1e12 or more is damage: it is far above any sample.
+    # Numbers of 1e12 or more, far above any sample, are invalid.
     if not abs(value) < 1e12:
         raise ValueError(value)
     return float(value)
@@ -162,8 +162,8 @@ def counted_rests(content: bytes) -> int:
 
 def thinned(content: bytes) -> bytes:
     """
-    Drop every second rest of a file, and lines that begin like no record; checksums are not
-    verified. The first rest of each start is kept.
+    Drop every second rest of a file, and lines that are neither starts nor rests; checksums are
+    not verified. The first rest of each start is kept.
     """
     kept: list[bytes] = []
     n = 0
@@ -182,10 +182,10 @@ def rests_of(
     contents: Iterable[bytes], is_wanted: Callable[[Start], bool]
 ) -> tuple[list[tuple[Start, Rest]], int]:
     """
-    Decode several files into rests without duplicates, in order of the starts and of the stamps.
+    Decode several files into rests without duplicates, sorted by start, then by stamp.
 
-    Starts are in order of the stamp of their last rest, because `start_ns` and the first stamps
-    may have been taken before the computer's clock was set.
+    The starts are sorted by the stamp of their last rest, because `start_ns` and the first stamps
+    may be older than the setting of the computer's clock.
     """
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
     n_damaged = 0

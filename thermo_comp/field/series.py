@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns rests as measurements of a calibration: ``|f| - g``, its derivatives w.r.t. all parameters.
+Owns rests as measurements of the error of a calibration: ``|f| - g`` and its derivatives.
 
-A rest at an unknown attitude measures one number, |f|. With x the axes' forces before the matrix
-M, f = M x, u = f / |f| and v = M^T u, an error d_bias [input units] and d_scale [relative] of axis
-i changes |f| by ``-v_i (d_bias + K_i x_i d_scale) / scale_i``. To first order ``|f| - g`` is the
-matrix H of derivatives times the true less the calibrated parameters, plus noise.
+A rest at an unknown attitude measures one number, |f|. Let x be the forces along the axes, f = M
+x, u = f / |f| and v = M^T u. If the bias of axis i in the calibration is too large by d_bias
+[input units] and its scale by d_scale [relative], |f| changes by ``-v_i (d_bias + K_i x_i d_scale)
+/ scale_i``. To first order ``|f| - g`` is the matrix H of derivatives by all parameters times the
+true less the calibrated parameters, plus noise.
 """
 
 from __future__ import annotations
@@ -36,22 +37,23 @@ from ..unit.provenance import Source
 from .rest import SUFFIX, Rest, Start, rests_of
 
 _DAY_NS = 86_400e9
-#: Parts of the name of an update's source: texts before the time of the last rest, and before the
-#: number of days by which the covariance was aged.
+#: Texts in the name of an update's source: before the time of the last rest, and before the number
+#: of days of ageing by which the covariance was increased.
 _UNTIL, _AGED = 'rests until ', ', claim aged '
 
 
 @dataclass(frozen=True)
 class Series:
     """
-    Rests in order of the starts, (n,) and (n, ...); accelerations and their sd in m/s^2.
+    n rests in the order of the node's starts; accelerations and their sd in m/s^2.
 
-    `time`: days since 1970; `start`: number of the node's start, from 0 in order;
-    `direction`, `force`, `by_parameter`: v, x and H of the module's equations; `gravity`: stated
-    g; `residual`: ``|f| - g``; `by_level`: derivatives w.r.t. each axis' bias, and each axis'
-    scale times g, (n, 6); `noise`: variance of a rest due to noise of samples and thermometers;
-    `by_start`: derivatives w.r.t. unknown lag states at the node's start, of unit variance each;
-    `lack`: sd of the lack of fit of each axis times `direction`; `claim`: claimed sd of `residual`
+    `time`: days since 1970; `start`: number of the node's start, from 0; `direction`, `force`,
+    `by_parameter`: v, x and H, see this module's docstring; `gravity`: stated g; `residual`: ``|f|
+    - g``; `by_level`: derivatives of |f| w.r.t. the bias, and the scale times g, of each axis, (n,
+    6); `noise`: variance of |f| in a rest due to noise of samples and thermometers; `by_start`:
+    derivatives of |f| w.r.t. unknown lag states at the start, scaled to unit variance; `lack`: sd
+    of the lack of fit of each axis times `direction`; `claim`: claimed sd of `residual`;
+    `n_windows`: number of windows averaged to a rest
     """
 
     time: Floats
@@ -76,12 +78,12 @@ class Series:
 
     @property
     def day(self) -> Ints:
-        """Day of each rest's start of the node, in days since 1970."""
+        """Day on which the node started, for each rest [days since 1970]."""
         _, first = np.unique(self.start, return_index=True)
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
     def at(self, chosen: Bools | slice) -> Series:
-        """Return the selected rests; the starts of these rests are numbered from 0."""
+        """Return the selected rests, with their starts numbered from 0 again."""
         parts: dict[str, Any] = {
             name: value[chosen]
             for name, value in vars(self).items()
@@ -106,11 +108,10 @@ def read_rests(
     """
     Read the rest logs of a calibration's unit.
 
-    Returns the rests, the provenance of an update aged `ahead` days, and notes for the user.
+    Returns the rests, the source of an update aged by `ahead` days, and notes for the user.
 
-    Rests before the calibration are left out, unless all rests are before the calibration. Rests
-    that an earlier update used are left out if `is_for_update`, else kept. Raises RecordingError
-    if no rest is left.
+    Rests before the date of the calibration are left out, unless all are. Rests used by an earlier
+    update are left out only if `is_for_update`. Raises RecordingError if no rest remains.
     """
     files: list[Path] = []
     for path in paths:
@@ -132,7 +133,7 @@ def read_rests(
         return is_own
 
     try:
-        # The node writes at most 320 kB a day; a file of up to 64 MB is read.
+        # The node writes at most 320 kB a day; larger files than 64 MB are refused.
         contents = [read_bounded(file, 1 << 26) for file in files]
     except (OSError, ValueError) as error:
         reason = getattr(error, 'strerror', None) or str(error)
@@ -142,16 +143,16 @@ def read_rests(
     if others:
         notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
     if not rests:
-        found = ': the files hold no rest'
+        found = ': the files contain no rests'
         if others:
             found = f': the rests are of {", ".join(sorted(others))}'
         raise RecordingError(f'no rest of unit {wanted}{found}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
-    # The time in the name of an update's source is rounded down to a second.
+    # The name of an update's source has the time of the last rest rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
     later = [(start, rest) for start, rest in rests if rest.stamp_ns > first_ns]
     if is_update and not is_for_update:
-        notes.append(f'{counted(len(rests) - len(later), "window")} took part in the last update')
+        notes.append(f'{counted(len(rests) - len(later), "window")} were used by the last update')
     elif is_update and not later:
         raise RecordingError(
             'the calibration has been updated with all of these rests: update it again once the '
@@ -170,25 +171,25 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Return an update's source, whose name holds the time of the last rest and `ahead`."""
+    """Return an update's source, whose name has the time of the last rest and `ahead` [days]."""
     end = np.datetime64(max(rest.stamp_ns for _, rest in rests), 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
 
 
 def last_rest(source: Source) -> str:
-    """Return the date of the last rest of an update's source (UTC); '' for a bag."""
+    """Return the date of the last rest of an update's source (UTC); '' for other sources."""
     name = source.name
     return name.removeprefix(_UNTIL).partition(_AGED)[0] + 'Z' if name.startswith(_UNTIL) else ''
 
 
 def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     """
-    Return the start of a calibration's validity [days since 1970], the time up to which its
-    covariance is aged, and whether it is an update.
+    Return the time at which a calibration was determined, the time up to which its covariance
+    includes ageing [both in days since 1970], and whether it is an update.
 
-    Validity begins at the last rest of an update, else at the end of the test or at the file's
-    date, or -inf without a date.
+    The first time is that of the last rest of an update, else the date of the test or of the file,
+    or -inf without a date.
     """
     names = [
         source.name for source in calibration.provenance.sources if source.name.startswith(_UNTIL)
@@ -200,7 +201,7 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
         ahead = float(aged.removesuffix(' d') or 0.0)
     except ValueError:
         return -np.inf, -np.inf, False
-    # With a covariance aged by a century or more the calibration file would be invalid.
+    # Dates or times of ageing that `update` cannot have written, such as a century, are ignored.
     if np.isnat(moment) or not 0.0 <= ahead < 36525.0:
         return -np.inf, -np.inf, False
     begin = int(moment.astype(np.int64)) / _DAY_NS
@@ -210,7 +211,10 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
 ) -> Series:
-    """Evaluate rests at logged or given gravity; raises RecordingError if a lag is not logged."""
+    """
+    Compute ``|f| - g`` and its derivatives at rests, with the logged g or with `gravity`. Raises
+    RecordingError if the log does not have the lags of the calibration.
+    """
     correction = Correction(calibration)
     layout, K = Layout(correction.memory), correction.K[:, 0]
     places = {spec: _places(spec, correction.memory) for spec in {s.memory for s, _ in rests}}
@@ -267,16 +271,15 @@ def series_of(
 
 
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
-    """Return the indices of the state elements, and of the lags, of `wanted` within `memory`."""
+    """Return the indices, in `memory`, of the state elements and of the lags of `wanted`."""
     try:
         logged, target = Layout(memory).numbers, Layout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)
         return places, np.array([memory.lags.index(lag) for lag in wanted.lags], np.int64)
     except ValueError as error:
         raise RecordingError(
-            'the rests were logged with a calibration that has other columns; their thermal state '
-            'does not contain the lags of this calibration: log rests while the node uses this '
-            'calibration'
+            'the rests were logged with another calibration, and their thermal state does not '
+            'contain the lags of this calibration: log rests while the node uses this calibration'
         ) from error
 
 
@@ -288,11 +291,12 @@ def _numbered(start: Ints) -> Ints:
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     """
-    Assign windows to groups of consecutive windows that are averaged, at most 60.
+    Return the number of the group of each window; the at most 60 consecutive windows of a group
+    are averaged to one rest.
 
-    All windows of a group belong to the same start of the node. Direction and temperature of a
-    group's windows differ by less than 1e-3 rad and 1 K from those of the first window. An angle
-    between vectors reduces the norm of their mean by a share of at most half the squared angle.
+    The windows of a group belong to one start of the node, and differ from the first window of the
+    group by less than 1e-3 rad and 1 K. If vectors differ by an angle, the relative decrease of
+    the norm of their mean is at most half the squared angle.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)
@@ -331,8 +335,8 @@ def _uncertainty(
     weight, unknown = states[:, WEIGHT], states[:, UNKNOWN]
     regimes = np.array([1.0 - weight, weight])
     unexplained = correction.curves.unexplained(states[:, BOARD])
-    # The ageing model has terms for residual and lack of fit, so the variances of both are
-    # subtracted: those of static and dynamic set while the regime is unknown.
+    # The ageing model has separate terms for the residual sd and the lack of fit, so both
+    # variances are subtracted here, those of both sets if the regime is unknown.
     of_sets = regimes + unknown * regimes[::-1]
     slow -= (v.T**2 * (of_sets[:, np.newaxis] * unexplained).sum(axis=0)).sum(axis=0)
     residual = [[a.residual_sd_m_s2**2 for a in part.axes()] for part in calibration.regime_sets()]
@@ -348,7 +352,7 @@ def _variance_along(
     u: Floats,
     x: Floats,
 ) -> Floats:
-    """Return the error variance of a sample, with its noise, along the force's directions u."""
+    """Return the variance of the error of a sample along u, including the sample's noise, (n,)."""
     columns = states.T
     parts = slow.at(columns, shares.T)
     line = list(correction.line(columns, columns, parts, np.zeros(len(states))))

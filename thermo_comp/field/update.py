@@ -3,9 +3,9 @@
 """
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
-A rest determines the error along gravity alone, so the attitudes decide which axes are determined.
+A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
 An axis is updated only if the rests reduce the sd of some combination of its bias and scale to 0.6
-of the prior sd; the other axes keep their values, with an increased covariance.
+of its sd before the update. Other axes keep their values, with an increased covariance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,26 +27,26 @@ from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import Series, last_rest, valid_since
 
-#: Names of the conclusions that a user can override: another gravity than stated at the rests, and
-#: samples of another unit.
+#: Names of conclusions that a user can override: another gravity than stated, another unit.
 OVERRIDES = ('gravity', 'unit')
-#: Largest RMS of |f| - g of a start, relative to gravity (a shock of 1 mg) and in claimed sd (some
-#: milli-g for a poor sensor); the RMS of rests of another unit exceeds both limits.
+#: Limits of the RMS of |f| - g over the rests of a start: relative to gravity (1 mg, as after a
+#: shock), and in claimed sd (30, some milli-g for a poor sensor). An RMS above both limits is
+#: taken for that of another unit.
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
-#: Default time after the last rest for which the covariance is aged [days].
+#: Default time of use after the last rest, for which the covariance includes ageing [days].
 AHEAD_DAYS = 1.0
 
 
 @dataclass(frozen=True)
 class AxisChange:
     """
-    Changes of an axis' constants by an update, each with its posterior sd; for an axis that the
-    rests do not determine, the changes are 0 and the sds are prior sds.
+    Changes of the bias and scale of an axis by an update, each with its posterior sd; for an axis
+    that the rests do not determine, the changes are 0 and the sds are those before the update.
 
-    bias: change of the bias at the temperature of the rests [m/s^2]
+    bias: change of the bias at the mean temperature of the rests [m/s^2]
     scale: relative change of the scale
-    curve: change of the bias curve over the temperatures of the rests [m/s^2]
-    reading: change of the reading by bias plus scale at the mean force of the rests [m/s^2]
+    curve: change of the difference of the bias between warm and cool rests [m/s^2]
+    reading: change of the reading due to bias and scale, at the mean force of the rests [m/s^2]
     claimed_sd: sd of the reading that the old calibration claims [m/s^2]
     present_sd: sd of the reading with the old calibration at the last rest, with ageing [m/s^2]
     """
@@ -70,11 +70,12 @@ class Judged:
     """
     Score of an update on left-out rests.
 
-    over, n: kind of the folds, days or starts, and their number
-    before, after: RMS of ``|f| - g`` over all folds with the calibration, and with an update from
-        the folds before each fold [m/s^2]
-    gain, gain_sd: mean over the folds of the decrease of the mean square, and the standard error
-        of this mean [m^2/s^4]
+    over, n: kind of the folds ('days' or 'starts'), and their number
+    before, after: RMS of ``|f| - g`` over all folds, with the old calibration and with an update
+        by the rests before each fold [m/s^2]
+    gain, gain_sd: mean over the folds of the decrease of the mean square of ``|f| - g`` by the
+        update, and the standard error of this mean [m^2/s^4]
+    n_worse: number of folds whose mean square increases by more than `gain_sd`
     """
 
     over: str
@@ -87,7 +88,7 @@ class Judged:
 
     @property
     def is_better(self) -> bool:
-        """Whether the mean gain on left-out rests exceeds its standard error."""
+        """Whether `gain` exceeds its standard error."""
         return self.gain > self.gain_sd
 
     def __str__(self) -> str:
@@ -125,20 +126,21 @@ def update(
     """
     Update a calibration by rests.
 
-    `source`, `created`: source and date for the new file's provenance; `ahead`: time after the
-    last rest for which the covariance is aged [days]; `is_gravity_certain`: never explain the
-    rests by a gravity other than stated. Raises FitError if the rests belong to fewer than three
-    starts of the node.
+    `source`, `created`: source and date for the new file's provenance; `ahead`: time of use after
+    the last rest, for which the covariance includes ageing [days]; `is_gravity_certain`: whether
+    the stated gravity is certain, so that no jump of gravity is estimated. Raises FitError if the
+    rests belong to fewer than three starts of the node.
     """
     n_starts = int(series.start.max()) + 1
     if n_starts < 3:
         raise FitError(
-            f'the logs hold rests of {counted(n_starts, "start")} of the node, need at least 3: '
-            'each start has a bias offset, and the update is judged on left-out starts'
+            f'the logs contain rests of {counted(n_starts, "start")} of the node, at least 3 are '
+            'needed: each start has a bias offset, and the update is judged on left-out starts'
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time.min()), float(series.time.max())
-    # The random walk begins where the aged covariance ends or, without ageing, at the first rest.
+    # The random walk begins at the time up to which the covariance of the calibration includes
+    # ageing or, if this time is unknown or later than the rests, at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     to_file, bend = _levels(calibration), _slopes(calibration)
@@ -146,7 +148,7 @@ def update(
     determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
-    # For parameters that are not updated, the shift that is not applied is an additional error.
+    # The estimated shift of parameters that are not updated is an error of their old values.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
     axis_determined = [change.is_determined for change in by_axis]
@@ -168,7 +170,7 @@ def update(
 
 
 def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
-    """Add the residuals of left-out rests, and a note, to the provenance of a calibration."""
+    """Add the residuals on left-out rests, and a note on the update, to a provenance."""
     largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time.max()), 'D')
     residuals = ResidualSummary(
         f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
@@ -183,7 +185,7 @@ def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Prov
 
 
 def _levels(calibration: Calibration) -> Floats:
-    """Differentiate parameters w.r.t. bias [m/s^2] and scale [times g] of each axis: (n, 6)."""
+    """Return the parameters' derivatives by bias and by scale times g of each axis, (n, 6)."""
     layout = parameter_layout(calibration)
     result = np.zeros((layout.n_parameters, 6))
     for axis, reference in enumerate(calibration.axes):
@@ -194,7 +196,7 @@ def _levels(calibration: Calibration) -> Floats:
 
 
 def _slopes(calibration: Calibration) -> Floats:
-    """Differentiate parameters w.r.t. a slope of the bias of each axis [m/s^2 per K], (n, 3)."""
+    """Return the parameters' derivatives by a slope of each axis' bias [m/s^2 per K], (n, 3)."""
     layout = parameter_layout(calibration)
     result = np.zeros((layout.n_parameters, 3))
     for axis, reference in enumerate(calibration.axes):
@@ -234,7 +236,7 @@ def _axis_changes(
         ratio = eigh(posterior[:2, :2], prior[:2, :2] + jitter, eigvals_only=True)[0]
         is_determined = bool(ratio <= 0.6**2)
         determined[bias.static : scale.end] = is_determined
-        # Without the update, the estimated shift is an error of the old calibration.
+        # The estimated shift is an error of the old calibration.
         error = posterior[3, 3] + float(rows[3] @ solution.shift) ** 2
         residual = calibration.static.axes()[axis].residual_sd_m_s2
         scatter = float(np.hypot(ageing.turn_on, ageing.rest))
@@ -251,7 +253,7 @@ def _axis_changes(
 
 
 def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates by earlier rests on each day or, if there are less than five, each start."""
+    """Score updates by the rests before each day or, with fewer than five days, each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -280,17 +282,17 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
 
 
 def _gravity_part(series: Series, solution: Solution) -> Floats:
-    """Return the part of ``|f| - g`` due to jumps of gravity."""
+    """Return the sum of the estimated jumps of gravity before each rest [m/s^2], (n,)."""
     time = means_by(series.start, series.time)[series.start]
     result = np.zeros(len(series))
     for change, size, _ in solution.gravity:
-        # The times of starts and jumps may differ by rounding.
+        # Allow for rounding of the times of starts and jumps.
         result += size * (time > (change.time or 0.0) - 1e-6)
     return result
 
 
 def refuse_another_unit(result: Update) -> None:
-    """Raise FitError if the rests differ from gravity by more than ageing explains."""
+    """Raise FitError if |f| - g at the rests of a start is larger than ageing explains."""
     series = result.series
     residual = series.residual - _gravity_part(series, result.solution)
     rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))
@@ -302,13 +304,13 @@ def refuse_another_unit(result: Update) -> None:
         raise FitError(
             f'on {day} |f| differs from the gravity {series.gravity[at]:.5f} m/s^2 by '
             f'{ug_text(rms[worst])} RMS, expected at most {ug_text(largest[worst])} for this unit '
-            'from ageing: samples of another unit, another gravity, or damage (override with '
+            'with ageing: samples of another unit, wrong gravity, or damage (override with '
             '--allow unit)'
         )
 
 
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
-    """Add a shift to a calibration's parameters; 1 + the shift of a scale's level multiplies K."""
+    """Add a shift to a calibration's parameters; multiply K by 1 + the shift of the scale."""
     layout = parameter_layout(calibration)
     of_scale = np.array([shift[block.static] for block in layout.scale])
     K = np.array([axis.scale_factor for axis in calibration.axes])
@@ -320,7 +322,7 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
 
 
 def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) -> RegimeSet:
-    """Set the residual sd of determined axes to `turn_on`, of other axes to at least `turn_on`."""
+    """Set the residual sd to `turn_on` on determined axes, and at least to `turn_on` on others."""
     axes: dict[str, Any] = {
         name: replace(
             axis,
@@ -345,7 +347,7 @@ def _gravity_texts(result: Update) -> Iterator[str]:
 
 
 def change_texts(result: Update) -> list[str]:
-    """Return sentences on the ageing, the changes, and axes that the rests do not determine."""
+    """Return messages on the ageing, the jumps, and axes that the rests do not determine."""
     ageing = result.ageing
     lines = [
         f'random walk of the bias {ug_text(ageing.bias)}, of the scale '
@@ -357,17 +359,15 @@ def change_texts(result: Update) -> list[str]:
         lines[0] += f'; sd of the lags at a start {ageing.lags:.2g} times the calibrated sd'
     for change in result.changes:
         if change.time is None:
-            lines.append(
-                'the curves of the bias over temperature have changed, not only the level'
-            )
+            lines.append('the slopes of the bias over temperature have changed, not only the bias')
         elif change.kind == 'levels':
             day = np.datetime64(int(change.time * 86400.0), 's')
             text = f'the bias jumped before {day}: a shock, not ageing'
             if change.may_be_gravity:
                 text += (
-                    '; or another gravity, which the attitudes do not distinguish: if the unit '
-                    'was moved, state the gravity of the place (--gravity; parameter '
-                    'local_gravity of the node)'
+                    '; or gravity changed, which rests in these attitudes do not distinguish from '
+                    'a jump: if the unit was moved, state the gravity of the place (--gravity; '
+                    'parameter local_gravity of the node)'
                 )
             lines.append(text)
     lines += _gravity_texts(result)
@@ -375,10 +375,11 @@ def change_texts(result: Update) -> list[str]:
     if undetermined:
         lines.append(
             f'the rests do not determine {", ".join(undetermined)}: these axes keep their values, '
-            'with an aged uncertainty; rests in other attitudes would determine them'
+            'with an uncertainty that includes ageing; rests in other attitudes would determine '
+            'these axes'
         )
     if result.n_outliers:
         lines.append(
-            f'left out, as they contradict all other rests: {counted(result.n_outliers, "rest")}'
+            f'left out, because all other rests contradict: {counted(result.n_outliers, "rest")}'
         )
     return lines

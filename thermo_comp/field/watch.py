@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the drift watch: ``|f| - g`` of a rest log against the claimed sd, and a forecast.
+Owns the drift watch: the comparison of ``|f| - g`` in a rest log with the claimed sd, a forecast.
 
 A unit is within its claim while the RMS of its errors along gravity, over its attitudes and
-starts, is at most `LIMIT` claimed sd. The verdict follows from the rests of the last week and from
-the ageing model's error at the last rest. The forecast is the distribution of the time at which
-the RMS first exceeds the limit, for random walks of bias and scale from the present estimate with
-the variances estimated from the log.
+starts, is at most `LIMIT` times the claimed sd. The verdict follows from the rests of the last
+week and from the error at the last rest by the ageing model. The forecast is the distribution of
+the time at which the RMS first exceeds the limit, for random walks of bias and scale that begin at
+the present estimate and have the variances estimated from the log.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,10 @@ from .ageing import Ageing
 from .series import Series
 from .update import Update, update
 
-#: Largest error that agrees with the claim, in claimed standard deviations.
+#: Largest RMS error that agrees with the claim, in claimed standard deviations.
 LIMIT = 2.0
-#: Length of the window whose RMS decides the verdict [days]: long enough to average the scatter of
-#: single starts, and short against the time in which a unit drifts to the limit.
+#: Number of days whose RMS decides the verdict: enough to average the scatter of single starts,
+#: and few against the time in which a unit drifts to the limit.
 _WINDOW_DAYS = 7
 #: Smallest number of starts of the node whose attitudes the forecast uses.
 _LEAST_STARTS = 10
@@ -37,7 +37,7 @@ _CLASS_K, _PERIODS = 10.0, 30
 
 @dataclass(frozen=True)
 class Row:
-    """``|f| - g`` over the rests of a day, a period or a class of temperature [m/s^2]."""
+    """Statistics of ``|f| - g`` over rests of a day, period or class of temperature [m/s^2]."""
 
     name: str
     n_rests: int
@@ -49,7 +49,7 @@ class Row:
 
     @property
     def is_within(self) -> bool:
-        """Whether the RMS is at most the limit: the tolerance, or a multiple of the claimed sd."""
+        """Whether the RMS is at most the limit: the tolerance, or `LIMIT` times the claimed sd."""
         return self.rms <= self.limit
 
 
@@ -59,13 +59,15 @@ class Watch:
     Comparison of the rests of a log with the claimed sd.
 
     days, periods, temperatures: rows by day, by period (at most 30), by class of temperature
+    last: the last day with rests
     week: rows of the days with rests in the last week
     recent: RMS over the last week divided by the limit, robust against one disturbed day
-    outside_since: first day from which the unit stays outside its claim, None if it is within
-    inside_since: first day after a time outside the claim; None if still, or never, outside
+    outside_since: first day of the present time outside the claim; None if the unit is within it
+    inside_since: first day after the last time outside the claim; None if there was no such time,
+        or if the unit is outside its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
         exceeds its claim [days]; infinite if later than ten years
-    interval: the quantiles of `forecast` for a unit that has just been updated
+    interval: the same quantiles if the calibration is updated at the last rest
     """
 
     days: tuple[Row, ...]
@@ -92,7 +94,7 @@ class Watch:
         )
         week += f', {n_out} of {counted(len(self.week), "day")} outside'
         if self.outside_since and self.recent <= 1.0:
-            week += ', above the limit at the last rest by the ageing model'
+            week += ', but above the limit at the last rest by the ageing model'
         if self.outside_since:
             text = (
                 f'the unit is outside its claim since {self.outside_since} ({week}): update its '
@@ -122,8 +124,8 @@ class Watch:
 
 def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:
     """
-    Compare rests with the claimed sd or a tolerance of ``|f| - g`` [m/s^2]; forecast the unit's
-    time until the error exceeds the limit.
+    Compare rests with the claimed sd, or with a tolerance of ``|f| - g`` [m/s^2], and forecast the
+    time until the error of the unit exceeds the limit.
     """
     names = np.array([str(np.datetime64(int(day), 'D')) for day in series.day])
     ordered = np.unique(names)
@@ -143,9 +145,9 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         ageing = updated.ageing
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
-    # The RMS of a week follows a change late. A unit leaves its claim after a day above the limit
-    # if the ageing model's error at the last rest is above the limit, too. A unit is within its
-    # claim again after two days within the limit if the ageing model's error is, too.
+    # The RMS of a week responds late to a change. A unit is therefore outside its claim after one
+    # day above the limit if the error by the ageing model at the last rest is above it, too; and
+    # within its claim after two days within the limit if this error is within the limit, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()
     is_out[-1] |= is_error_out and is_row_out[-1]
@@ -157,8 +159,8 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
         outside_since = next((row.name for row in window if not row.is_within), window[-1].name)
         forecast = ()
     elif (recent > 1.0).any():
-        # If the last week of a unit within its claim is above the limit, the last two days are
-        # within the limit, so a day follows the last day outside.
+        # The day after the last day above the limit exists, because the last day is within the
+        # limit if the unit is within its claim.
         until = int(np.flatnonzero(recent > 1.0)[-1])
         inside_since = days[int(np.flatnonzero(is_row_out[: until + 1])[-1]) + 1].name
     periods = _rows(series, firsts, ordered[::together].tolist(), tolerance)
@@ -171,10 +173,10 @@ def watch(series: Series, calibration: Calibration, tolerance: float | None = No
 
 def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     """
-    Return the first index of the window that ends on each day, and the window's robust RMS.
+    Return the index of the first day, and the robust RMS, of the week that ends on each day.
 
-    A window has the days with rests in the week up to a day, and at least two days with rests. The
-    largest daily RMS of a window, perhaps of a disturbed day, is replaced by the second largest.
+    If a week has only one day with rests, the preceding day with rests is added. The largest daily
+    RMS of a week, perhaps of a disturbed day, is replaced by the second largest.
     """
     n = np.arange(len(day))
     first = np.minimum(
@@ -190,7 +192,8 @@ def _forecasts(
     updated: Update, tolerance: float | None
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """
-    Forecast when the unit leaves its claim, with the present calibration and just after an update.
+    Return the quantiles of the time until the error of the unit exceeds the limit, with the
+    present calibration and with an update at the last rest.
 
     The attitudes are those of the rests of the last week, and of the last ten starts.
     """
@@ -198,22 +201,22 @@ def _forecasts(
     is_recent = used.time > used.time[-1] - _WINDOW_DAYS
     recent = used.at(is_recent | (used.start > used.start[-1] - _LEAST_STARTS))
     share = recent.n_windows / recent.n_windows.sum()
-    # The norm of `root @ (errors of parameters, of levels)` is the RMS of |f| - g over the rests.
+    # With the errors e of parameters and levels, the norm of `root @ e` is the RMS of |f| - g.
     joined = np.hstack((recent.by_parameter, recent.by_level)) * np.sqrt(share)[:, np.newaxis]
     root = np.linalg.qr(joined, mode='r')
     of_parameters, of_levels = np.split(root, [recent.by_parameter.shape[1]], axis=1)
     walk = of_levels * np.repeat([ageing.bias, ageing.scale], 3)
     bias, scale = (float((part**2).sum()) for part in np.split(walk, 2, axis=1))
-    # The offsets of the starts add to the error, so their variance reduces the bound of the random
-    # walk. An earlier disturbance increases the model's variance of the offsets, so the variance
-    # of the recent rests is used if it is smaller.
+    # The offsets of the starts add to the error, so their variance is subtracted from the square
+    # of the limit. The ageing model may overestimate this variance after an earlier disturbance,
+    # so the variance of the recent rests is used if it is smaller.
     scatter = ageing.turn_on**2 * float((of_levels[:, :3] ** 2).sum()) + ageing.rest**2
     scatter = min(
         scatter, float(share @ (recent.residual - recent.by_parameter @ solution.shift) ** 2)
     )
     limit = tolerance or LIMIT * float(np.sqrt(share @ recent.claim**2))
     bound = float(np.sqrt(max(limit**2 - scatter, 0.0)))
-    # Sd of the logarithm of the variance by which the error grows per day, by the delta method.
+    # Sd, by the delta method, of the logarithm of the variance by which the error grows per day.
     slope = 2.0 * np.array([bias, scale]) / (bias + scale)
     of_walks = updated.model.log_covariance(ageing)[:2, :2]
     rate_sd = float(np.sqrt(slope @ of_walks @ slope))
@@ -245,16 +248,17 @@ def passage(
     """
     Return quantiles of the time [days] at which the norm of a random walk first exceeds a bound.
 
-    The random walk begins at N(mean, covariance), (k,) and (k, k), and grows by `walk` (k, m)
-    times m independent normal variables per root day; `rate_sd` is the sd of the logarithm of the
-    walk's variance. The time is 0 if the norm begins above the bound, else at least 0.01 days.
+    The initial value has the mean `mean`, (k,), and the covariance `covariance`, (k, k). Its
+    change after d days is sqrt(d) `walk`, (k, m), times m independent normal variables; `rate_sd`
+    is the sd of the logarithm of the variance of the walk. The time is 0 if the initial norm is
+    above the bound, else at least 0.01 days.
     """
     rng = np.random.default_rng(1)
-    # Directions with less than a thousandth of the largest error are left out.
+    # Principal directions with less than a thousandth of the largest error are left out.
     size, vectors = np.linalg.eigh(covariance + np.outer(mean, mean) + walk @ walk.T)
     onto = vectors[:, size > 1e-6 * size[-1]].T
     mean, covariance = onto @ mean, onto @ covariance @ onto.T
-    # Reduce the walk's independent variables to one per direction, with the same covariance.
+    # Reduce the independent variables to one per direction, without a change of the covariance.
     walk = np.transpose(np.linalg.qr((onto @ walk).T, mode='r'))
     values, vectors = np.linalg.eigh(covariance)
     initial = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -267,15 +271,16 @@ def passage(
     for step in np.diff(times):
         if stays[-1] <= 1.0 - _QUANTILES[-1]:
             break
-        # Remove the walks beyond the bound once more than a fifth of the walks are beyond it.
+        # Once more than a fifth of the simulated walks are beyond the bound, remove these walks.
         is_in = inside > 0.0
         if is_in.mean() < 0.8:
             error, speed, left, inside = error[is_in], speed[is_in], left[is_in], inside[is_in]
         moved = rng.standard_normal((len(error), walk.shape[1])) @ walk.T
         error = error + (speed * np.sqrt(step))[:, np.newaxis] * moved
         size = np.sqrt(np.einsum('ij,ij->i', error, error))
-        # Between two points a Brownian bridge crosses the bound with the probability exp(-2 a b /
-        # variance): a and b are the distances from the bound, the variance is along the error.
+        # Between two times a Brownian bridge crosses the bound with the probability exp(-2 a b /
+        # variance): a and b are the distances from the bound at these times, and the variance is
+        # that of the step along the error.
         onto_walk = error @ walk
         along = np.einsum('ij,ij->i', onto_walk, onto_walk) * speed**2 * step
         product = left * np.maximum(bound - size, 0.0) * size**2

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the choice between models whose columns differ: in their lags (one lag per axis, or a bank of
-time constants for all axes) and in the condition that ends the dynamic regime.
+Owns the choice between models that differ in the lags of their columns (one lag per axis, or a
+bank of time constants for all axes) or in the condition that ends the dynamic regime.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior or, without a prior, a model with all columns that the bags can
-    determine.
+    Return the model of the prior or, without a prior, a model with all columns for which the bags
+    have thermometers.
 
     `parts`: the lag of each axis, or None for the bank of time constants
     """
@@ -47,8 +47,8 @@ def model_of(
         rests = gradients_at_rest(bags, sensors)
         columns = bank(sensors, rests, board_span(bags, reference), parts)
     if not any(len(bag.case.value) for bag in bags):
-        # Without a case thermometer the gradient is estimated from the board's rate, and the
-        # columns of the gradient are linear combinations of those of the board.
+        # Without a case thermometer the gradient is estimated from the board's rate, so the
+        # columns of the gradient would be linear combinations of those of the board.
         columns = tuple(column for column in columns if not column.is_of_sensor)
     if options.groups is not None:
         groups = {*options.groups, *options.forced}
@@ -60,21 +60,20 @@ def model_of(
 
 
 def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
-    """Fit the windows with the alternative models; return the best fit, with its windows."""
+    """Fit the windows with alternative lags and regimes; return the best fit and its windows."""
     bags, options = problem.bags, problem.options
     fit = _with_lags(windows, problem)
     has_case = all(len(bag.case.value) for bag in bags)
     has_choice = has_case and options.prior is None and options.detector is None
     if not has_choice or not _may_have_sets(fit.selected):
         return fit
-    # The alternative detector ends the dynamic regime once the case temperature is constant; the
-    # default detector also waits for the board. Models with one set do not depend on the regime.
+    # The alternative detector ends the dynamic regime once the case temperature is constant, the
+    # default detector once the board temperature is constant, too.
     model = fit.windows.model
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves limit the number of columns, so they do not count in the comparison of two
-    # detectors with the same columns.
+    # Left-out halves limit the number of columns, but both detectors have the same columns.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -88,7 +87,7 @@ def windows_of(
     """
     Return the windows of bags, with the known |f| of each position.
 
-    `tracks`: thermal states of the bags, if known; `undisturbed`: factors of the windows' weights
+    `tracks`: thermal states of the bags, if computed before; `undisturbed`: see `Windows`
     """
     windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
@@ -96,8 +95,9 @@ def windows_of(
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with one lag per axis; or with a bank of time constants, if no lags are found,
-    or if all lags found leave a left-out drift above `Parts.most_drift` and the bank is better.
+    Fit the windows with one lag per axis, see `find_parts`; or with a bank of time constants, if
+    no lags are found, or if all lags found leave a left-out drift above `Parts.most_drift` and the
+    fit with the bank is better.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -112,14 +112,14 @@ def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _better(fit: Fit | None, other: Fit) -> Fit:
-    """Return `other` if it is better than `fit` on left-out data, or there is no `fit`."""
+    """Return `other` if it is better than `fit` on left-out data, or if `fit` is None."""
     return other if fit is None or is_better(fit.selected.score, other.selected.score) else fit
 
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether two sets are in the chosen model, or in a model whose left-out error is within one
-    standard error and whose white noise is below 80 % of that of the chosen model on every axis.
+    Whether the chosen model has two sets, or a model with two sets has a score within one standard
+    error of the chosen model's and, on each axis, less than 80 % of its white noise.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

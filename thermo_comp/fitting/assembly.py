@@ -60,14 +60,10 @@ def build_calibration(
     known: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """
-    Make a calibration from a posterior.
-
-    `known`: the calibration that was the prior; the valid ranges include its ranges.
-    """
+    """Make a calibration from a fit; its valid ranges include those of the prior, `known`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Response columns that have a weight, or only a variance in the covariance.
+    # Response columns with a weight, or with a variance and zero weight.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
@@ -99,7 +95,7 @@ def build_calibration(
         nonlinearity=nonlinearity,
     )
     if known is not None and not (known.needs_temperature or windows.has_temperature):
-        # Rounding errors must not make a unit without thermometer depend on temperature.
+        # Without a thermometer the calibration must not depend on temperature by rounding errors.
         places = parameter_layout(blank)
         for block in (*places.bias, *places.scale):
             level = values[block.static]
@@ -110,7 +106,7 @@ def build_calibration(
 
 
 def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[RegimeSet]:
-    """Return the static and the dynamic set with their ranges, all coefficients 0."""
+    """Return the static and the dynamic set with valid ranges, and with all coefficients 0."""
     windows, prior = fit.windows, fit.posterior.prior
     temperatures = temperature_range(windows)
     rates = valid_range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
@@ -151,14 +147,15 @@ def _valid_columns(
             order = column.term.order
             valid = valid_range(windows.raw[:, k], 0.01, order)
             if k not in weighed:
-                # A column with zero weight contributes only to the covariance, and is valid at any
-                # value.
+                # A column with zero weight contributes only to the covariance, so all values that
+                # the temperature range allows are valid.
                 most = (upper - lower) ** order
                 valid = union((valid, (-most, most)))
         if k in of_parts and column.term.order % 2:
-            # A part lags in cooling as in heating, so an odd power of its lag has both signs.
+            # A part lags in cooling and in heating, so the range of an odd power of its lag is
+            # extended to the same values of opposite sign.
             valid = union((valid, (-valid[1], -valid[0])))
-        # A column that only curves over parts' temperatures use gets the group of these curves.
+        # A column whose weight belongs only to curves over parts' temperatures gets their group.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
@@ -166,7 +163,7 @@ def _valid_columns(
 
 
 def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
-    """Return the response columns that a mask of the regression's columns contains."""
+    """Return the response columns in a mask of columns, also those in sums for part curves."""
     sums, n_curves = windows.model.part_curves.sums, len(windows.model.sets.groups)
     contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
     return [int(k) for k in np.flatnonzero(contained[n_curves:])]
@@ -178,12 +175,12 @@ def _provenance(
     residuals: Sequence[ResidualRow],
     findings: Sequence[Finding],
 ) -> Provenance:
-    # A left-out RMS of ``|f| - g`` is stated only if the norm of each position was left out.
+    # The left-out RMS of ``|f| - g`` is stated only if every position was scored when left out.
     is_norm = bool(np.isfinite(fit.selected.score.norms.square).all())
     now = datetime.now(timezone.utc)
     end_s = 1e-9 * max(bag.end_ns for bag in bags)
-    # Stamps since the start of a computer, or of a wrong clock, are not dates: dates are from the
-    # start of the year 2000 on, 946684800 s after 1970.
+    # The stamps may count from the start of a computer, or be of a wrong clock: only times from
+    # the year 2000 (946684800 s after 1970) to now are taken for dates.
     is_date = 946684800.0 <= end_s <= now.timestamp()
     tested = datetime.fromtimestamp(end_s if is_date else 0.0, timezone.utc)
     return Provenance(
@@ -213,13 +210,13 @@ def _date_text(date: datetime) -> str:
 
 
 def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:
-    """Return the response terms of some columns with all weights 0."""
+    """Return the response terms of the columns, with all weights 0."""
     zero = (0.0, 0.0, 0.0)
     return tuple(ResponseTerm(**vars(column), bias=zero, scale=zero) for column in columns)
 
 
 def parameters_of(calibration: Calibration) -> Floats:
-    """Return the parameters in the order of the file's posterior, with levels of the scale 0."""
+    """Return the parameters in the order of the file's posterior; levels of the scale are 0."""
     values: list[float] = []
     pairs = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     for axis, (reference, sets) in enumerate(zip(calibration.axes, pairs, strict=True)):
@@ -303,7 +300,7 @@ def file_jacobian(
     """
     sets, sums = model.sets, model.part_curves.sums
     n, m = sets.static.n_free, sets.dynamic.n_free
-    # The last row, at index -1, is zero: the index -1 marks a parameter that is not estimated.
+    # The last row is zero: the index -1 of a parameter that is not estimated selects this row.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)
     rows: list[Floats] = []
     for axis, K in enumerate(regression.nominal_scale):
@@ -315,7 +312,8 @@ def file_jacobian(
             (of_scale, 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
         ):
             each = unknown[places] * (unit / regression.rms)[:, None]
-            # Curves over the temperatures of parts are sums of columns of the sets and response.
+            # Add the weights of curves over the temperatures of parts to those of the columns of
+            # which these curves are sums.
             each, of_parts = np.split(each, [sums.shape[1]])
             each = each + sums.T @ of_parts
             static, (delta,), dynamic, response = np.split(each, [n, n + 1, n + 1 + m])
@@ -331,7 +329,7 @@ def file_jacobian(
         for places in layout.nonlinear:
             rows += [*unknown[places[at]], *unknown[places[[len(all_kinds) + k for k in at]]]]
     a, _, c = state.misalignment
-    # M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c of the elements (a, b, c) of its inverse.
+    # With a, b, c from the inverse of M: M[1][0] = -a, M[2][0] = a c - b, M[2][1] = -c.
     of_a, of_b, of_c = unknown[layout.misalignment]
     return np.array([*rows, -of_a, c * of_a - of_b + a * of_c, -of_c])
 

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the published uncertainty: the covariance of the fit, widened by the parameters that the data
-do not determine, and by the effects that the model lacks.
+Owns the published uncertainty: the covariance of the fit, increased for columns that the data do
+not determine, and for effects that the model lacks.
 
 The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
 mixture of fits on a grid of this standard deviation. The weight of a fit in the mixture is its
 evidence, limited by the evidence of the positions' norms, times a half-Student prior of the offset
-sd. The covariance includes the sd of gravity, an error by the same ratio of all scale factors.
-`jackknife` adds the variance due to effects that the model lacks.
+sd. The covariance includes the sd of local gravity, whose error changes all scale factors by the
+same ratio. `jackknife` adds the variance due to effects that the model lacks.
 
 References
 ----------
@@ -35,11 +35,11 @@ from .regression import Posterior, Regression
 from .unknowns import InformativePrior, Prior, State
 from .windows import CURVE, LAGS, PART
 
-#: Largest usual sd of the offsets of mountings within a turn-on, of a single turn-on, and of
-#: several turn-ons or of mountings that each have their own turn-on, relative to
-#: `Prior.offset_scale`. By data sheets, turn-ons of tactical triads repeat within 0.3 to 1 mg,
-#: those of MEMS within some mg: 10 to 20 times `Prior.offset_scale`. The largest usual sd of
-#: turn-ons is a compromise between data sheets and units whose turn-ons repeat perfectly.
+#: Largest usual sd of a bias offset, relative to `Prior.offset_scale`: of mountings within a
+#: turn-on, of a single turn-on, and ('both') of several turn-ons, or of mountings that each begin
+#: with a turn-on. By data sheets, the bias repeats to 0.3 .. 1 mg over turn-ons of tactical triads
+#: and to some mg over those of MEMS, 10 to 20 times `Prior.offset_scale`. The values for turn-ons
+#: are a compromise between data sheets and units whose bias repeats perfectly.
 LARGEST_USUAL = {'mounting': 1.0, 'turn-on': 2.0, 'both': 5.0}
 
 
@@ -48,8 +48,8 @@ class Claim:
     """
     The published uncertainty of a unit.
 
-    layout: indices of the unknowns of the fit and of the columns in the covariance alone
-    covariance: of the unit's own unknowns, shape (n_unit, n_unit)
+    layout: indices of the unknowns of the fit, and of columns of zero weight, in the covariance
+    covariance: of the unknowns that belong to the unit (not to a position), (n_unit, n_unit)
     offset_sd: sd of the bias offset of a new mounting or turn-on [m/s^2]
     """
 
@@ -72,15 +72,15 @@ def claim_of(
     """
     Return the published covariance of the fit of the chosen model.
 
-    `candidates`: prior sd of the columns that could take part, shape (2, m); columns that the
-    data do not determine are added to the covariance; `gravity_sd`: sd of local gravity [m/s^2];
-    `known_offset_sd`: sd of mounting and turn-on offsets by a calibration [m/s^2]; 0 for none;
-    `informative`: priors from one calibration, with different ageings since that calibration;
+    `candidates`: prior sd of the columns that the selection could choose, shape (2, m); those that
+    the data do not determine are added to the covariance; `gravity_sd`: sd of local gravity
+    [m/s^2]; `known_offset_sd`: sd of mounting and turn-on offsets by a prior calibration, or 0
+    [m/s^2]; `informative`: priors from one calibration, for several amounts of ageing;
     `of_means`: see `Fit`; `lacks_effects`: whether noise does not explain the left-out drift, see
     `Selected` and `jackknife`
     """
     # All rests of a mounting share an offset, but the regression has an offset for each rest: with
-    # `n_rests` times the variance, the mean offset of a mounting has the variance of one offset.
+    # `n_rests` times the variance, the mean over a mounting's rests has the offset's variance.
     mounting = regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
     prior = replace(chosen.prior, offset_sd=chosen.prior.offset_sd * n_rests**0.5)
@@ -96,8 +96,8 @@ def claim_of(
     if turn_on_variance:
         covariance = covariance + turn_on_variance * _of_turn_on(regression, posterior)
     if candidates is not None:
-        # The covariance with unseen columns is computed at the mode's mounting sd, and lacks the
-        # variance that mixtures, jackknife and turn-ons add to the covariance of the mode.
+        # `_widened` computes the covariance for the mounting sd of the mode, so the variance that
+        # mixtures, jackknife and turn-ons have added is added to the result.
         excess = covariance - posterior.covariance
         layout, covariance = _widened(regression, posterior, candidates, of_means)
         at = _places(posterior.layout, layout)
@@ -115,7 +115,8 @@ def _over_offsets(
     """
     Return the covariance of the unit's unknowns by the mixtures over the sd of the offsets of
     mountings and turn-ons, the sd of the offset of a new mounting after a new turn-on [m/s^2], and
-    the variance of the offset of a single turn-on, which is no unknown of the regression.
+    the variance of the turn-on offset if all bags have one turn-on, else 0: the regression has no
+    unknown for this offset.
 
     `offset_sd`: sd of a mounting's offset; `known_sd`: offset sd of a prior calibration [m/s^2]
     """
@@ -123,8 +124,8 @@ def _over_offsets(
     n_mountings = int(windows.mounting[-1]) + 1
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
-        # A stated offset sd holds for turn-ons, too: the mean offset of m mountings has 1 / m of
-        # the variance of a single turn-on, and 1 - 1 / m is added.
+        # A stated offset sd also holds for the turn-on. The regression's offsets of m mountings
+        # have a mean with 1 / m of this variance, so 1 - 1 / m of it is added for one turn-on.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -137,7 +138,7 @@ def _over_offsets(
         return covariance, float(np.hypot(offset_sd, variance**0.5)), 0.0
     if not (is_single and regression.gravity):
         return covariance, offset_sd, 0.0
-    # The norms of a single turn-on do not show how well turn-ons repeat.
+    # Bags of one turn-on do not show how well turn-ons repeat: use the prior of this sd.
     values, log_density = _offsets_tried(scale, known_sd, 'turn-on')
     variance = float(np.average(values**2, weights=np.exp(log_density)))
     return covariance, float(np.hypot(offset_sd, variance**0.5)), variance
@@ -145,27 +146,27 @@ def _over_offsets(
 
 def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Floats]:
     """
-    Return the values tried of the sd of the offsets of mountings or turn-ons [m/s^2], and the log
-    prior density of log sd at these values.
+    Return the values to try for the sd of the offsets of mountings or turn-ons [m/s^2], and the
+    log prior density of the logarithm of this sd at these values.
 
-    `scale`: scale of the fit's prior of offsets, 3 times the noise in 1 Hz; `known_sd`: offset sd
-    by a prior calibration, 0 for none; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
+    `scale`: `Prior.offset_scale`, 3 times the noise in 1 Hz; `known_sd`: offset sd by a prior
+    calibration, 0 without one; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
     """
     if known_sd:
-        # Twelve positions determine the sd of mounting offsets within a factor of 1.5.
+        # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # By data sheets, turn-ons of navigation grade repeat within some 10 ug at best; mountings
-    # within one turn-on repeat better.
+    # `least`: smallest usual sd, relative to `scale`. By data sheets, the bias of navigation grade
+    # repeats to some 10 ug over turn-ons at best; over mountings within one turn-on, to less.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
-    # The grid of the sd has steps of a third of a decade: the log evidence is smooth over a step.
+    # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
     small = np.minimum(np.log(ratio / least), 0.0)
     return scale * ratio, log_student(ratio / LARGEST_USUAL[kind]) + small
 
 
 def _places(layout: Layout, widened: Layout) -> Ints:
-    """Return the unit's unknowns as indices in a layout with more columns, (n_unit,)."""
+    """Return the indices of the unit's unknowns of `layout` in `widened`, shape (n_unit,)."""
     places = np.empty(layout.n_unit, dtype=np.int64)
     for name in ('kappa', 'bias', 'weights', 'nonlinear', 'shared'):
         at = getattr(layout, name)
@@ -177,7 +178,7 @@ def _widened(
     regression: Regression, posterior: Posterior, candidates: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
     """
-    Return the covariance with the columns that the data do not determine, and its layout.
+    Return layout and covariance, with the columns that the data do not determine.
 
     `candidates`: prior sd of the columns, shape (2, m); `of_means`: fit to the positions' means
     """
@@ -185,10 +186,11 @@ def _widened(
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
         return with_unseen.layout, with_unseen.covariance.copy()
-    # The curve of the positions' means is an alternative to a curve that the drifts of a warm-up
-    # determine, because a warm-up heats the board in another way than a chamber does.
+    # The chosen curve follows from drifts of warm-ups within the positions. A warm-up heats the
+    # board in another way than a chamber does, so the curve of the positions' means is an
+    # alternative: half of the squared difference of the two curves is added to the variance.
     other = _with_curve(regression, state, of_means)
-    # Columns that only the curve of the means has get rows in the covariance, with an sd of 1e-9.
+    # Columns that only the fit to the means has need rows in the covariance: give them a tiny sd.
     is_used = other.weights.any(axis=1) & (prior.column_sd == 0.0)
     prior = replace(prior, column_sd=np.where(is_used, 1e-9, prior.column_sd))
     with_unseen = regression.solve(state, prior, n_steps=0)
@@ -212,16 +214,16 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     """
     Add columns that the data do not determine to the prior, so that their variance is not 0.
 
-    An inactive column is consistent with 0, but the data bound it only to ``1 / sqrt(S)``, S being
-    its information given the active columns. A column whose bound exceeds two sd of a window's
-    noise enters the covariance with the bound as sd, and zero weight; for this test the bound of
-    an almost constant column is scaled to the change of temperature.
+    The weight of an inactive column is consistent with 0, but the data bound the weight only to
+    ``1 / sqrt(S)``, S being its information given the active columns. A column whose bound exceeds
+    two sd of a window's noise enters the covariance with the bound as sd, and zero weight; for
+    this test the bound of an almost constant column is scaled to the change of temperature.
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
-    # Few temperatures do not determine all powers of a curve. One attitude does not separate the
-    # drifts of bias and scale factor, so each may have the columns that either has.
+    # The columns considered are lags, curves (few temperatures do not determine all powers), and
+    # columns active in bias or scale (one attitude does not separate their drifts).
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -231,27 +233,27 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
     sd[inactive.part, inactive.column] = 1.0 / np.sqrt(np.maximum(information, 1e-300))
     is_of_lags = np.isin(groups, LAGS)
     if not regression.windows.has_drifts:
-        # At constant temperatures only thermometer errors change the lags: no weight is bounded.
+        # At constant temperatures only thermometer errors change the lags: no bound on weights.
         sd = np.where((sd > 0.0) & (regression.windows.lag >= 0), np.inf, sd)
     sd = np.where(is_of_lags, sd, np.minimum(sd, typical))
     if CURVE in active:
-        # A lag delays the curve, so the prior sd of a lag's weight is at most the largest slope of
-        # the curve (RMS of the three axes), including the columns that the data do not exclude.
+        # A lag delays the curve, so the prior sd of a lag's weight is at most the slope of the
+        # curve (RMS of the axes), including the bounds of columns that the data do not exclude.
         is_curve = (groups == CURVE) & (kelvins > 0.0)
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
-        # An unseen column changes the slope of a curve by up to half of the largest slope.
+        # A curve column that the data do not determine changes the slope by up to half of it.
         unseen = 0.5 * of_curve
         typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
         sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
-    # All lags together have at most the effect of one lag: the lags share the variance of one lag.
+    # The variance of n lags is limited to that of one lag, so each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
     sd = np.where(is_lag, np.minimum(sd, typical / share), sd)
     units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-    # A column counts as constant if it changed by less than 1 % of the change of temperature.
+    # A column counts as constant if its temperature change (`kelvins`) is below 1 % of that of t.
     is_constant = kelvins < 0.01 * float(kelvins[0])
     ratio = np.where(is_constant, float(kelvins[0]) / np.maximum(kelvins, 1e-9), 1.0)
     matters = (sd > 0.0) & (sd * ratio > 2.0 * float(np.mean(prior.sigma)) * units)
@@ -262,8 +264,8 @@ def _over_mountings(
     regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
     """
-    Return covariance and offset sd [m/s^2] of the mixture of fits over the sd of mounting offsets,
-    given values of this sd (`tried`) and their log prior density, (k,).
+    Return the covariance of the unit's unknowns, and the RMS of the offset sd [m/s^2], by a
+    mixture of fits with the sds `tried` of mounting offsets, (k,), and their log prior density.
     """
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
@@ -275,15 +277,15 @@ def _over_mountings(
         ]
 
     fits = solved(tried)
-    # With a large mounting sd the attitudes absorb errors of the model: the log evidence relative
-    # to the mode may exceed that of the norms alone by at most `CLEAR_GAIN`.
+    # With a large mounting sd the attitudes absorb errors of the model, which increases the log
+    # evidence: relative to the mode, it is limited to that of the norms plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
     of_data, of_norms = of_data - of_data[nearest], of_norms - of_norms[nearest]
     weight = np.minimum(of_data, of_norms + CLEAR_GAIN)
     if n_rests > 1.0:
-        # All rests of a mounting share its offset: only the mountings' means determine its sd.
+        # The rests of a mounting share its offset: only the means of mountings determine the sd.
         fits, weight = solved(n_rests**0.5 * tried), of_norms
     covariance, weight = _mixture(posterior, fits, weight + log_density)
     return covariance, float(np.sqrt(weight @ tried**2))
@@ -330,8 +332,8 @@ def _excess_over_priors(
 ) -> Floats:
     """
     Return the excess of the covariance of a mixture of fits over that of the most probable fit.
-    The fits assume different ageings since the prior calibration, because a few rests do not show
-    which constants have aged.
+    The fits assume different amounts of ageing since the prior calibration, because few rests do
+    not show which constants have aged.
     """
     n = posterior.layout.n_unit
     if not informative:
@@ -345,7 +347,7 @@ def _excess_over_priors(
 
 
 def _excess(covariance: Floats, other: Floats) -> Floats:
-    """Return the positive part of ``covariance - other``, its negative eigenvalues set to 0."""
+    """Return ``covariance - other`` with negative eigenvalues, in units of `other`, set to 0."""
     sd = np.sqrt(np.diag(other))
     values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
@@ -354,8 +356,8 @@ def _excess(covariance: Floats, other: Floats) -> Floats:
 
 def _of_turn_on(regression: Regression, posterior: Posterior) -> Floats:
     """
-    Return the covariance of the unit's unknowns by a bias offset of unit variance that all
-    positions of a single turn-on share, shape (n_unit, n_unit).
+    Return the covariance of the unit's unknowns due to a bias offset of unit variance on each axis
+    that all positions share, shape (n_unit, n_unit).
     """
     point = regression.at(posterior.state, posterior.prior)
     by_offset = np.array([point.by_offset(axis) for axis in range(3)])
@@ -366,11 +368,10 @@ def _norm_evidence(
     regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
-    Return the log evidence of the mean norms of the mountings for k values of the sd of mounting
-    offsets, shape (k,).
+    Return the log evidence of the mountings' mean norms for k sds of mounting offsets, shape (k,).
 
-    `by_drifts`: root of the unit's covariance at the largest offset sd, at which the norms have
-    almost no weight; the rows of the thermal weights are used
+    `by_drifts`: root of the unit's covariance at the largest offset sd, at which drifts alone
+    determine the thermal weights; only the rows of these weights are used
     """
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     point, first = regression.at(state, prior), regression.windows.edges[:-1]
@@ -386,7 +387,7 @@ def _norm_evidence(
     weight = rows[:, -1]
     along, errors = rows[:, :-2] / weight[:, None], rows[:, -2] / weight
     if prior.informative is None:
-        # The prior of the constants is almost flat, so its mean may be set to the state.
+        # The prior of the constants is so wide that its mean may be replaced by the state.
         weights = layout.axis[:, 2:].ravel()
         constants = np.setdiff1d(np.arange(layout.n_unit), weights)
         of_prior = np.hstack((

@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the covariance of a triad's constants by the directions of a test's positions, and the next
-direction to record.
+Owns the covariance of a triad's constants after a test, and the choice of its next position.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
-bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. With equations
-linearised about an ideal triad, and with the prior of the fit, the covariance of the constants
-follows from the directions alone.
+bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. The equations
+are linearised about an ideal triad. Together with the prior of the fit, the directions of the
+positions and the noise determine the covariance of the constants.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD
 
 #: Prior sd of a triad's nine constants: bias [g], relative scale, misalignment [rad].
 PRIOR_SD = np.repeat([BIAS_SD / STANDARD_GRAVITY, SCALE_SD, MISALIGNMENT_SD], 3)
-#: Largest angle between two rests of the same position [deg].
+#: Largest angle between the directions of two rests that count as one position [deg].
 SAME_DIRECTION_DEG = 5.0
 
 
@@ -62,11 +61,12 @@ def worst_sd(covariance: Floats) -> float:
 
 def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     """
-    Find the direction in which a position of noise `sd` [g] most lowers the force's mean variance.
+    Find the direction of a new position, of noise `sd` [g], that most reduces the variance of the
+    force in the mean of all attitudes.
 
-    Faces of a cube, which are the easiest to hold, are preferred if their gain is at least half of
-    the largest, then edges, then corners. Directions closer than 20 degrees to a direction in
-    `positions`, shape (n, 3), are not proposed.
+    A face of a cube, which is the easiest to hold, is preferred if its reduction is at least half
+    of the largest reduction, then an edge, then a corner. Directions closer than 20 degrees to a
+    direction in `positions`, shape (n, 3), are not proposed.
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
@@ -83,7 +83,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Return the direction of largest angle to the nearest of `up`, (n, 3); the angle [deg]."""
+    """Return the direction farthest from its nearest vector in `up`, (n, 3); the angle [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
@@ -109,40 +109,41 @@ def rough_centre(means: Floats) -> Floats:
     """
     Return the reading at zero force: 0 if the norms agree, else the centre of a fitted sphere.
 
-    Angles between vectors of offset binary codes are meaningful only about the code at zero force.
-    `means`: mean readings, shape (n, 3); fewer than four, or all in a plane, give 0. Readings of
-    one pose, which differ by drifts and small rotations, do not count as a sphere.
+    In offset binary codes the angle between two readings is meaningful only after the code at zero
+    force is subtracted. `means`: mean readings, shape (n, 3). The result is 0 for fewer than four
+    readings, for readings in a plane, and for readings in almost one attitude.
     """
     zero = np.zeros(3)
     if len(means) < 4:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The origin is the centre if the norms' sd is below 30 % of the RMS distance to the mean.
+    # The origin is the centre if the norms' sd is below 30 % of the RMS distance from the mean.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
-    # Points with less than 2 % of their variance across a plane do not determine a sphere.
+    # Readings whose smallest principal variance is below 2 % of the largest do not determine a
+    # sphere, because they are almost in a plane.
     if values[0] < 0.02 * values[2]:
         return zero
     # A sphere about c satisfies |m|^2 = 2 c m + const; subtracting the mean keeps numbers small.
     columns = np.column_stack((2.0 * arms, np.ones(len(arms))))
     centre = np.linalg.lstsq(columns, np.sum(arms**2, axis=1), rcond=None)[0][:3]
     radii = np.linalg.norm(arms - centre, axis=1)
-    # The sphere is accepted if the distances from its centre vary by less than 10 %, and if the
-    # readings are spread over the sphere: their RMS distance from the mean is at least half of the
-    # radius (1 radius for six faces, and 0.1 radius for readings within 6 degrees).
+    # The sphere is accepted if the distances from its centre vary (sd) by less than 10 %, and if
+    # the RMS distance of the readings from their mean is at least half of the radius (it is 1
+    # radius for six faces, and 0.1 radius for readings within 6 degrees).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # There is a sphere through any four readings, so the coordinates of its centre must agree: the
-    # codes at zero force of an analog sensor's axes agree within 20 % of their mean (ADXL335 data
-    # sheet, 1.2 to 1.8 V), while the axes of a unit in one pose read differently.
+    # A sphere exists through any four readings. Only the centre of a true sphere has similar
+    # coordinates: the outputs at zero force of the axes of an analog sensor are within 20 % of
+    # their mean (ADXL335 data sheet, 1.2 to 1.8 V).
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd of a constant per noise sd of |f|, for directions (n, 3)."""
+    """Return the largest sd of a constant over the noise sd of |f|, for directions (n, 3)."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -152,11 +153,11 @@ def geometry(up: Floats, with_misalignment: bool) -> float:
 
 def best_rests(candidates: list[Floats]) -> int:
     """
-    Return the index of the best of several sets of rests, each of mean readings, shape (n, 3).
+    Return the index of the best set of rests; each set has mean readings of shape (n, 3).
 
-    The residuals of |f| and the directions of a set's rests give the sd of the constants. The best
-    set is the first whose sd of the constants is within 2 % of the smallest sd, as earlier sets
-    have stricter thresholds. If no set of rests has six attitudes, the best set is the first set.
+    The sd of the constants follows from the directions of the rests of a set and from the
+    residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd, because
+    earlier sets have stricter thresholds. If no set has six attitudes, the first set is the best.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
     counts = [len(distinct_directions(up)) for up in ups]
@@ -168,7 +169,7 @@ def best_rests(candidates: list[Floats]) -> int:
 
 
 def _cost(means: Floats, with_misalignment: bool) -> float:
-    """Fit constants to rests; return a constant's largest sd [g], by the scatter of the norms."""
+    """Fit constants to rests; return the largest sd of a constant, by the scatter of |f| [g]."""
     n_free = len(means) - (9 if with_misalignment else 6)
     if n_free < 0:
         return np.inf
@@ -177,8 +178,8 @@ def _cost(means: Floats, with_misalignment: bool) -> float:
     except FitError:
         return np.inf
     norms = np.linalg.norm(force, axis=1)
-    # Prior of the scatter: an error of 1e-3 g, weighted as four rests, so that a set of few rests
-    # that agree by chance does not win.
+    # Prior of the scatter: an error of 1e-3 g with the weight of four rests, so that a set of few
+    # rests whose |f| agrees by chance is not chosen.
     left = float(np.sum((norms - 1.0) ** 2)) + 4 * 1e-3**2
     scatter = float(np.sqrt(left / (n_free + 4)))
     return geometry(force / norms[:, None], with_misalignment) * scatter
@@ -202,13 +203,13 @@ class LeastKnown:
 
 
 def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
-    """Find the attitude of largest sd of |f|, None without covariance; `up`: attitudes, (n, 3)."""
+    """Find the attitude of largest sd of |f|, None without covariance; `up`: positions, (n, 3)."""
     if calibration.posterior is None:
         return None
     layout, axes = parameter_layout(calibration), calibration.axes
     levels = [block.static for block in (*layout.bias, *layout.scale)]
     places = [*levels, *range(layout.misalignment, layout.misalignment + 3)]
-    # Signs: a calibrated bias or scale that is too large makes the corrected force too small.
+    # Negative signs: if a calibrated bias or scale is too large, the corrected force is too small.
     unit = np.array([-1.0 / axis.scale_factor for axis in (axes.x, axes.y, axes.z)])
     unit = np.concatenate((unit, np.repeat((-1.0, 1.0), 3) * calibration.gravity_m_s2))
     covariance = calibration.posterior.covariance()[np.ix_(places, places)] * np.outer(unit, unit)
@@ -228,7 +229,7 @@ def least_known(calibration: Calibration, up: Floats) -> LeastKnown | None:
 
 
 def direction_text(up: Floats) -> str:
-    """Describe an attitude: the axes that point up, and the reading of each axis in g."""
+    """Describe an attitude: the axes, as +x or -x, that point up, and the reading of each axis."""
     signs = [f'{"-" if value < 0.0 else "+"}{name}' for name, value in zip('xyz', up, strict=True)]
     size = np.abs(up)
     axes = [sign for sign, share in zip(signs, size, strict=True) if share > 0.1]
@@ -256,6 +257,5 @@ def _spiral(n: int) -> Floats:
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
-# Unit vectors: 26 to faces, edges and corners of a cube, then 500 evenly over the sphere, 8
-# degrees apart.
+# Unit vectors: 26 to faces, edges and corners of a cube, then 500 at intervals of 8 degrees.
 _SPHERE = np.concatenate([_cube(), _spiral(500)])

@@ -3,8 +3,8 @@
 """
 Owns the checks of the windows of a fit, and of the fitted calibration, with advice to the user.
 
-Only contradictory data are refused; missing data increase the posterior uncertainty. A refusal
-stops the fit unless the user allows it by name; advice goes into the result.
+Only data that contradict themselves or the model are refused; missing data increase the posterior
+uncertainty. A refusal stops the fit unless the user allows it by name; the result lists advice.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from .evidence import ResidualRow
     from .selection import Fit
 
-#: Smallest numbers of positions that determine bias and scale factor (six constants), the
-#: misalignment (three more constants), and by their norms the sd of mounting offsets.
+#: Smallest numbers of positions that determine bias and scale factor (six constants), also the
+#: misalignment (nine constants), and also, by |f|, the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
-#: Smallest span of the board temperature that shows whether the bias depends on temperature [K].
+#: Span of the board temperature below which it does not show a temperature dependence [K].
 LEAST_SPAN_K = 3.0
 
 
@@ -73,7 +73,8 @@ def judge_windows(
     """
     Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest.
 
-    Temperature span and ramps are not judged with a prior of the unit, which states their effects.
+    With a prior calibration of the unit, which contains the effects of temperature and of ramps,
+    the span and the ramps are not judged, but temperatures beyond the range of the prior.
     """
     yield _judge_positions(up)
     used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
@@ -93,7 +94,7 @@ def judge_windows(
     if not has_case:
         text = (
             'no case temperature: the regime is detected from the board temperature alone, later '
-            'and less reliably'
+            'and less reliably than with a case thermometer'
         )
         yield advice('case', text)
         return
@@ -118,15 +119,14 @@ def _judge_span(windows: ThermalWindows) -> Finding:
         return Finding('span', 'good', text)
     why = 'run the chamber over the whole range of temperatures in use'
     if span < LEAST_SPAN_K and _has_drift(windows):
-        why = 'readings hardly change while the bias does: is the thermometer on the board?'
+        why = 'the temperature hardly changes while |f| drifts: is the thermometer on the board?'
     return advice('span', f'{text} ({ADVISED_SPAN_K:g} degC advised): {why}')
 
 
 def _judge_beyond(temperature: Floats, prior: Calibration) -> Finding:
-    """Compare the temperatures of the bags with the range of a prior calibration."""
     edges = [edge for part in prior.regime_sets() for edge in part.temperature_range_c]
     lower, upper, coldest, hottest = min(edges), max(edges), temperature.min(), temperature.max()
-    text = f'the effect of temperature is that of the prior, {lower:.0f} to {upper:.0f} degC'
+    text = f'the prior gives the effect of temperature from {lower:.0f} to {upper:.0f} degC'
     if max(lower - coldest, hottest - upper) <= 1.0:
         return Finding('span', 'good', text)
     return advice(
@@ -137,7 +137,7 @@ def _judge_beyond(temperature: Floats, prior: Calibration) -> Finding:
 
 
 def _has_drift(windows: ThermalWindows) -> bool:
-    """Whether the norm of the readings drifts within positions, far above the noise."""
+    """Whether the drift of |f| within the positions is above 10 times the noise of a window."""
     data = windows.data
     norm = np.linalg.norm(data.mean, axis=1, keepdims=True)
     drift = float(np.sqrt(np.mean(within_positions(norm, data.position) ** 2)))
@@ -147,8 +147,8 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
-    Return the rate of the board temperature [K/min], shape (n,); 0 where the rate is noise, as the
-    mean temperature of the windows changes by less than half of the rate.
+    Return the rate of the board temperature [K/min], shape (n,). The rate is set to 0, as noise,
+    where the slope of the windows' mean temperatures is below half of it.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
@@ -164,27 +164,28 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
     if heating + cooling < 0.02:
         yield advice(
             'ramps',
-            f'no ramp: the board temperature never changes by {RAMP_K_MIN:g} K/min for long, so '
-            'the effect of a ramp is unknown; record ramps between the soaks',
+            'no ramp: the board temperature changes by more than '
+            f'{RAMP_K_MIN:g} K/min in less than 2 % of the windows, so the effect of a ramp is '
+            'unknown; record ramps between the soaks',
         )
         steps = np.diff(np.sort(windows.temperature))
-        # Soaks at one chamber temperature differ by less than 1 K, or a tenth of the span.
+        # Temperatures of two soaks differ by more than 1 K and more than a tenth of the span.
         is_gap = steps > max(1.0, 0.1 * steps.sum())
         n = 1 + int(is_gap.sum())
-        # A slow drift of the temperature through a range is not a soak.
+        # If the temperature drifts slowly through its range, there are no soaks to count.
         has_soaks = steps[~is_gap].sum() < n * max(1.0, 0.1 * steps.sum())
         # Five temperatures determine a cubic, and show whether the cubic fits.
         if has_soaks and n < 5:
             yield advice(
                 'soaks',
-                f'soaks at {counted(n, "temperature")}: the curve between and beyond them is '
-                f'unknown; five temperatures determine a cubic',
+                f'soaks at {counted(n, "temperature")}: the curve of the bias at temperatures '
+                'between or beyond the soaks is unknown; five temperatures determine a cubic',
             )
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
         recorded, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
         yield advice(
             'directions',
-            f'only {recorded} was recorded; errors in a ramp change sign with its direction, so '
+            f'only {recorded} was recorded; heating and cooling cause errors of opposite sign, so '
             f'record {missing}, too',
         )
     calm = windows.weight <= 0.5
@@ -194,7 +195,8 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
         yield advice(
             'soak',
             f'only {100.0 * np.mean(calm):.0f} % of the windows are static, over {static:.1f} of '
-            f'{span:.1f} K: the soaks end before the unit has settled; let some last for hours',
+            f'{span:.1f} K: the soaks end before the temperatures of the unit are constant; let '
+            'some soaks last for hours',
         )
 
 
@@ -224,7 +226,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a position if the largest sd of |f| is 3 times the median sd in the positions."""
+    """Advise a position if the largest sd of |f| is 3 times the median over the positions."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',
@@ -238,24 +240,23 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     """
     Report the assumed sd of mounting and turn-on offsets if the data do not determine this sd.
 
-    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. The norms of nine positions
-    are explained by nine constants, whatever the offsets; only large offsets appear in the drifts.
+    `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain the
+    norms of nine positions, whatever the offsets; the drifts determine large offsets only.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
     assumed = f'the uncertainty assumes {ug_text(offset_sd)}: state --mounting-sd'
-    # The first turn-on determines the bias of the unit; three further turn-ons show how well
-    # turn-ons repeat.
+    # Smallest number of turn-ons that determine the sd of turn-on offsets.
     needed = 4
     if n_turn_ons < min(n, needed):
         yield advice(
             'mountings',
             f'{n} rests in {counted(fit.regression.n_bags, "recording")} have '
-            f'{counted(n_turn_ons, "turn-on")}, too '
-            f'few to show how well the bias repeats after the unit is switched on again; {assumed}'
-            f', or switch the unit off between {needed} recordings or more',
+            f'{counted(n_turn_ons, "turn-on")}, too few to show how well the bias repeats after '
+            f'the unit is switched on again; {assumed}, or make {needed} recordings or more and '
+            'switch the unit off between them',
         )
     elif n < POSITIONS_FOR_MOUNTINGS and prior.offset_sd < prior.offset_scale:
         yield advice(
@@ -267,11 +268,11 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
 
 def determines_misalignment(up: Floats) -> bool:
     """
-    Whether the number and the spread of positions are sufficient to estimate M.
+    Whether the number and the spread of positions are sufficient to estimate the misalignment M.
 
-    The largest sd of a constant, in units of the noise of one position, must be at most 6: it is 1
-    for 18 well spread positions, 3 for nine, and 4.5 to 8 for the six faces held three times each
-    by hand.
+    The largest sd of a constant, divided by the noise of one position, must be at most 6. This
+    ratio is 1 for 18 well spread positions, 3 for nine well spread positions, and 4.5 to 8 for the
+    six faces held three times each by hand.
     """
     distinct = distinct_directions(up)
     if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
@@ -283,9 +284,9 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     """
     Refuse data that appear to be compensated already.
 
-    `raw`: RMS of |f| - g with the constants of the triad alone [m/s^2].
-    No raw triad has biases [g], errors of the scale and misalignments [rad] all below 1e-4, and an
-    RMS of |f| - g below 2e-5 g over 20 K.
+    `raw`: RMS of |f| - g with constants at the reference temperature alone [m/s^2].
+    No uncompensated triad has biases [g], relative errors of the scale and misalignments [rad] all
+    below 1e-4, and an RMS of |f| - g below 2e-5 g over 20 K.
     """
     state, K = fit.posterior.state, fit.posterior.state.kappa * fit.regression.nominal_scale
     span = float(np.ptp(fit.windows.temperature))
@@ -297,18 +298,17 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
         yield Finding(
             'compensated',
             'refusal',
-            f'there is nothing to correct: over {span:.0f} K |f| moves by {raw / MICRO_G:.1f} ug '
-            f'RMS, scales differ by {1e6 * scale:.1f} ppm, biases reach {worst / MICRO_G:.1f} ug '
-            f'and misalignments {1e6 * angle:.1f} urad: the samples have been compensated '
-            'already, and the calibration must be made from raw samples',
+            f'there is nothing to correct: over {span:.0f} K |f| - g is {raw / MICRO_G:.1f} ug '
+            f'RMS, scale factors are within {1e6 * scale:.1f} ppm, biases within '
+            f'{worst / MICRO_G:.1f} ug, misalignments within {1e6 * angle:.1f} urad: the samples '
+            'are already compensated, and the calibration must be made from raw samples',
         )
 
 
 def check_scale(fit: Fit) -> None:
     """
-    Refuse scale factors that few attitudes do not determine and that are no scale factors of a
-    triad: their ratio is beyond six sd of the prior. The bags then have drifts, steps or motions
-    that the model takes for an effect of the scale factor.
+    Refuse scale factors, in a fit of few attitudes, that deviate by more than six sd from the
+    prior: the fit attributes drifts, steps or motions in the bags to a scale factor.
     """
     state, prior = fit.posterior.state, fit.posterior.prior
     if prior.informative or len(distinct_directions(state.up)) >= POSITIONS_NEEDED:
@@ -318,8 +318,9 @@ def check_scale(fit: Fit) -> None:
     if abs(ratio[axis] - 1.0) > 6.0 * prior.scale_sd:
         raise UndeterminedError(
             f'by the fit the scale factor of {"xyz"[axis]} is {ratio[axis]:.2f} times the mean of '
-            'the axes, which no triad has, and too few attitudes show it: are all rests of one '
-            f'unit, and was it at rest? {POSITIONS_NEEDED} attitudes determine the scale factors'
+            'the axes, which no triad has, and too few attitudes determine it: are all rests of '
+            f'one unit, and was the unit still? {POSITIONS_NEEDED} attitudes determine the scale '
+            'factors'
         )
 
 
@@ -337,11 +338,12 @@ def judge_result(
     """
     Check the residuals of a fit.
 
-    slow: sd of the bias that no temperature explains [m/s^2]
+    K: scale factors; rows: residuals of the axes and, last, overall
+    slow: sd of the bias offset of a mounting or turn-on [m/s^2]
     span: span of the board temperature [K]
     drift: RMS of ``|f| - g`` about the means of the positions [m/s^2]
     noise: white noise of a window [m/s^2]
-    is_changed: whether the evidence favours a far wider prior than the given calibration
+    is_changed: whether a prior far wider than the given calibration has more evidence
     """
     overall = rows[-1]
     raw, fitted, left_out = (
@@ -355,14 +357,14 @@ def judge_result(
         why = 'temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
         if drift <= max(2.0 * noise, 0.3 * overall.fitted.rms):
             why = (
-                'the positions differ, while temperature explains the drift within them: the bias '
-                'does not repeat after the unit is mounted or switched on again'
+                '|f| differs between positions, while temperature explains the drift within them: '
+                'the bias does not repeat after the unit is mounted or switched on again'
             )
         yield advice('misfit', f'{text}: {why}')
     elif raw < 1.2 * fitted and span >= LEAST_SPAN_K:
         why = (
-            ': the correction gains little, as there is no temperature drift above the noise; are '
-            'the samples already compensated?'
+            ': there is hardly a temperature drift above the noise to correct; are the samples '
+            'already compensated?'
         )
         yield advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
@@ -371,22 +373,22 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # Neither a bias offset of a new turn-on of up to 2 sd (`slow`) contradicts the prior, nor a
-    # residual that the initial lag states explain: `noise` then is that of two sets alone.
+    # Neither a bias offset of up to 2 sd (2 `slow`) after a new turn-on contradicts the prior, nor
+    # a residual that the initial lag states explain: then `noise` is about that of two sets alone.
     contradiction = ''
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and noise > 1.5 * alone
     if options.prior is not None and is_above:
         contradiction = (
             f'|f| - g is {ug_text(overall.fitted.rms)} RMS with the prior, {ug_text(alone)} with '
-            'two sets fitted without it'
+            'a static and a dynamic set fitted without the prior'
         )
     elif is_changed:
-        contradiction = 'the parameters differ from it by far more than the sd that it states'
+        contradiction = 'the parameters differ from those of the prior by far more than its sd'
     if contradiction:
         yield advice(
             'prior',
-            f'the bags contradict the prior: {contradiction}; check that the calibration in '
-            '--prior is one of this unit, or of its type',
+            f'the bags contradict the prior: {contradiction}; check that the calibration given by '
+            '--prior is of this unit, or of its type',
         )
     if options.input == 'm/s^2' and np.abs(K - 1.0).max() > 0.1:
         yield advice(

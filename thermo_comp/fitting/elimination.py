@@ -24,18 +24,18 @@ from .tangent import Normal
 
 def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
     """
-    Return the lower Cholesky factors of matrices that are positive definite except for rounding,
-    shape (..., n, n).
+    Return the lower Cholesky factors of matrices that are positive definite except for rounding
+    errors, shape (..., n, n).
 
-    The matrix is scaled to a unit diagonal, or by the root of a given `diagonal`, shape (..., n);
-    then the smallest jitter with which a factor exists is added to the scaled diagonal.
+    Each matrix is scaled to a unit diagonal, or by the root of a given `diagonal`, shape (..., n).
+    The smallest jitter for which a factor exists is then added to the scaled diagonal.
     """
     square = np.einsum('...ii->...i', matrix) if diagonal is None else diagonal
     root = np.sqrt(square)
     scaled = matrix / root[..., None, :]
     scaled /= root[..., :, None]
     index = np.arange(matrix.shape[-1])
-    # Relative jitters, added to the diagonal in turn until a Cholesky factor exists.
+    # Jitters relative to the diagonal, added one after the other until a factor exists.
     jitters = 1e-13, 1e-11, 1e-9, 1e-7
     for jitter in jitters:
         scaled[..., index, index] += jitter
@@ -43,7 +43,7 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             if matrix.ndim > 2:
-                # Each matrix gets only the jitter with which its Cholesky factor exists.
+                # Factor each matrix separately, so that each gets only the jitter that it needs.
                 return np.stack([factored(*pair) for pair in zip(matrix, square, strict=True)])
             if jitter == jitters[-1]:
                 raise
@@ -55,11 +55,11 @@ def factored(matrix: Floats, diagonal: Floats | None = None) -> Floats:
 
 def factored_with_prior(information: Floats, precision: Floats) -> Floats:
     """
-    Return the lower Cholesky factor of an information matrix plus a prior's precision, shape (n,).
+    Return the lower Cholesky factor of an information matrix plus the precision of a prior, (n,).
 
-    An information matrix is the difference of larger matrices, so that its smallest eigenvalues
-    are rounding errors. If these leave no Cholesky factor, eigenvalues of the matrix scaled to a
-    unit diagonal that are up to ten times the most negative eigenvalue count as no information.
+    The information matrix is a difference of larger matrices, so its smallest eigenvalues are
+    rounding errors. If no Cholesky factor exists for this reason, the matrix is scaled to a unit
+    diagonal, and its eigenvalues up to ten times the size of the most negative one are set to 0.
     """
     places = np.diag_indices(len(information))
     hessian = information.copy()
@@ -79,7 +79,7 @@ def factored_with_prior(information: Floats, precision: Floats) -> Floats:
 
 
 def solved(factor: Floats, right: Floats) -> Floats:
-    """Solve equations by the lower Cholesky factor of their matrix, faster than `cho_solve`."""
+    """Solve equations, given the lower Cholesky factor of their matrix."""
     return np.asarray(dpotrs(factor.T, right)[0])
 
 
@@ -91,11 +91,11 @@ def inverse_root(factor: Floats) -> Floats:
 @dataclass(frozen=True)
 class Blocks:
     """
-    Eliminated blocks of the normal equations, of equal size: of all positions or of all bags.
+    Eliminated diagonal blocks of the normal equations: one for each position, or for each bag.
 
     root: inverse of each block's Cholesky factor, shape (n, k, k)
-    whitened: `root` times the cross block with the remaining unknowns and, in the last column,
-        times the gradient, shape (n, k, m + 1)
+    whitened: `root` times the off-diagonal block with the m remaining unknowns and, in the last
+        column, `root` times the gradient, shape (n, k, m + 1)
     """
 
     root: Floats
@@ -103,8 +103,8 @@ class Blocks:
 
     @classmethod
     def of(cls, block: Floats, cross: Floats, diagonal: Floats | None = None) -> Blocks:
-        """Eliminate blocks by cross blocks and gradients; `diagonal`: see `factored`."""
-        # `numpy.linalg.inv` of all factors is slower: it does not use that they are triangular.
+        """Eliminate diagonal blocks, given `cross` (off-diagonal blocks and gradients)."""
+        # The inverse by `numpy.linalg.inv`, which is not made for triangular factors, is slower.
         root = np.stack([inverse_root(factor).T for factor in factored(block, diagonal)])
         return cls(root, root @ cross)
 
@@ -127,19 +127,17 @@ class Blocks:
 @dataclass(frozen=True)
 class Reduced:
     """
-    The normal equations of the unit's n unknowns, with all other unknowns eliminated.
+    The normal equations of the unit's n unknowns after the elimination of all other unknowns.
 
-    layout: indices of the unknowns
     of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
         from the prior mean, shape (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
-    positions: the blocks of the positions, with cross blocks for the unknowns of the bag, then for
-        the unknowns of the unit
-    shares: contributions of the positions to the blocks of the bags with their cross blocks and
-        gradients, shape (n_positions, r, r + n + 1); and to the diagonals before the elimination
-        of the positions, shape (n_positions, r)
+    positions: the blocks of the positions; remaining unknowns: of the bag, then of the unit
+    shares: contribution of each position to the block of its bag, with off-diagonal blocks and
+        gradients, shape (n_positions, r, r + n + 1); and to the diagonal of this block before the
+        elimination of the positions, shape (n_positions, r)
     bags: the blocks of the bags
-    common: the prior on the sum of the initial lag states as a further block, or None
+    common: the prior on the sum of the initial lag states over the bags, as a block, or None
     """
 
     layout: Layout
@@ -162,7 +160,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add a prior of mean 0 to the sum of the initial lag states, at present `total`."""
+        """Add a prior of mean 0 on the sum over the bags of lag states, whose value is `total`."""
         r = len(total)
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total
@@ -194,7 +192,7 @@ class Reduced:
         return positions, starts
 
     def without(self, places: Ints, normal: Normal) -> Floats:
-        """Return `full_matrix` without some positions, given the normal equations of these."""
+        """Return `full_matrix` without the positions `places`, whose equations are `normal`."""
         bag, r = self.layout.bag, len(self.bags.root[0])
         at = np.unique(bag[places])
         others = (bag == at[:, None]) & ~np.isin(np.arange(len(bag)), places)
@@ -206,12 +204,13 @@ class Reduced:
 
     def eliminate_from(self, rows: Floats) -> tuple[Floats, Floats]:
         """
-        Eliminate positions and bags from the equations of further unknowns, m of each axis.
+        Eliminate positions and bags from the normal equations of m new unknowns of each axis.
 
-        `rows`: normal equations of the further unknowns with the unknowns of the fit and the
-        residual, shape (n_positions, 3, m, k + 1). Returns the reduction of the Hessian of the
-        further unknowns by the elimination, shape (3 m, 3 m), and the cross block of the further
-        unknowns with the unit, and their gradient, after the elimination, shape (n + 1, 3 m).
+        `rows`: products of the derivatives by the new unknowns with those by the unknowns of the
+        fit and with the residual, shape (n_positions, 3, m, k + 1). Returns the reduction of the
+        Hessian of the new unknowns by the elimination, shape (3 m, 3 m), and, after the
+        elimination, the off-diagonal block of the new unknowns with the unknowns of the unit and
+        the gradient of the new unknowns, shape (n + 1, 3 m).
         """
         layout, whitened = self.layout, self.positions.whitened
         n_positions, n_own, _ = whitened.shape
@@ -230,7 +229,7 @@ class Reduced:
         cross -= _summed(whitened[..., r:], of_positions) + _summed(self.bags.whitened, of_bags)
         reduction = _square(of_positions, of_bags)
         if self.common is not None:
-            # The prior on the sum of the initial lag states adds information to the equations.
+            # Take account of the prior on the sum of the initial lag states over the bags.
             starts = (np.swapaxes(self.bags.root, 1, 2) @ of_bags).sum(axis=0)
             of_sum = self.common.root @ starts[: layout.start.shape[1]]
             cross += _summed(self.common.whitened, of_sum)
@@ -258,7 +257,7 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floa
     index = np.arange(n_own)
     block[:, index, index] += precision[layout.own]
     cross[..., -1] -= (precision * deviation)[layout.own]
-    # Attitudes about which the data have no information keep their value.
+    # A diagonal element of 0, for an attitude without information in the data, is set to 1.
     block[:, index, index] += np.einsum('pii->pi', block) <= 0.0
     positions = Blocks.of(block, cross)
     diagonal = np.einsum('pii->pi', starts[..., :r])
@@ -272,12 +271,12 @@ def eliminate(normal: Normal, layout: Layout, precision: Floats, deviation: Floa
 
 
 def _membership(layout: Layout) -> Floats:
-    """Return 1 for the positions of each bag, 0 for the others, shape (n_bags, n_positions)."""
+    """Return 1 for the positions of each bag, else 0, shape (n_bags, n_positions)."""
     return np.asarray(layout.bag == np.arange(len(layout.start))[:, None], dtype=np.float64)
 
 
 def _of_unit(normal: Floats, layout: Layout) -> Floats:
-    """Add up the normal equations of the unit's unknowns, given by axis, shape (3, k, k)."""
+    """Add the normal equations of the three axes for the unit's unknowns, shape (3, k, k)."""
     result = np.zeros((layout.n_unit + 1, layout.n_unit + 1))
     for equations, at in zip(normal, layout.unit, strict=True):
         result[at[:, None], at] += equations
@@ -285,7 +284,7 @@ def _of_unit(normal: Floats, layout: Layout) -> Floats:
 
 
 def _of_bags(members: Floats, shares: tuple[Floats, Floats], prior: Floats) -> Blocks:
-    """Eliminate the unknowns of bags; `members`: 1 for each position of a bag, else 0, (m, n)."""
+    """Eliminate the unknowns of m bags; `members`: 1 for positions of a bag, else 0, (m, n)."""
     if not shares[0].size:
         return Blocks(
             np.zeros((len(members), 0, 0)), np.zeros((len(members), *shares[0].shape[1:]))
@@ -306,11 +305,11 @@ def _variance(derivatives: Floats, root: Floats) -> Floats:
 
 
 def _square(*blocks: Floats) -> Floats:
-    """Return the reduction of the remaining equations by the elimination of blocks, (k, k)."""
+    """Return what the elimination of blocks subtracts from the remaining equations, (k, k)."""
     rows = np.concatenate([block.reshape(-1, block.shape[2]) for block in blocks])
     return np.asarray(rows.T @ rows)
 
 
 def _summed(left: Floats, right: Floats) -> Floats:
-    """Return the sum over blocks of the products of their rows, shape (k, m)."""
+    """Return the sum over blocks of ``left.T @ right``, shape (k, m)."""
     return np.asarray(left.reshape(-1, left.shape[2]).T @ right.reshape(-1, right.shape[2]))

@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the exclusion of bags that were recorded in another thermal environment, such as still air,
-and the error that the calibration states for these bags.
+Owns the exclusion of bags that were recorded in another thermal environment than most bags, such
+as still air, and the error that the calibration states for these bags.
 
-In still air the board temperature follows the case temperature by another law than in a chamber
-with a fan. The bias of an axis without its own thermometer depends on the environment, so no set
-of coefficients describes two environments: a bag of still air would increase the error in a
-chamber with a fan. The error of the correction in an excluded bag is published as a lack of fit.
+In still air the board temperature responds to the case temperature in another way than in a
+chamber with a fan. No thermometer is at the axes, so their bias as a function of the thermometers
+differs, too, and no set of coefficients describes two environments: a bag of still air would
+increase the error in a chamber with a fan. The error of the correction in an excluded bag is
+published as a lack of fit.
 """
 
 from __future__ import annotations
@@ -37,17 +38,17 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """Whether an RMS error exceeds five times the usual RMS, both given as mean squares."""
+    """Whether an RMS error exceeds five times a usual RMS error; both are mean squares."""
     return np.asarray(square > 5.0**2 * usual)
 
 
 def contradicting_bag(fit: Fit) -> list[int]:
     """
-    Find the bag that may be of another environment: a list of one bag, or an empty list.
+    Return, in a list, the number of a bag that may be of another environment; [] if none may.
 
-    A bag is suspect if its left-out drift is far above both the median of all bags and the white
-    noise of a window. A bag is also suspect if its drift alone is not determined by the
-    other bags, and the median drift is far above the noise.
+    A bag is suspect if its left-out drift is far above both the median over the bags and the white
+    noise of a window. If the other bags do not determine the drift of exactly one bag, and the
+    median left-out drift is far above the noise, this bag is suspect.
     """
     square = _square_of_bags(fit)
     known = np.isfinite(square)
@@ -62,14 +63,14 @@ def contradicting_bag(fit: Fit) -> list[int]:
 
 
 def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
-    """Whether leaving out a bag halves the mean square of the left-out drift of the other bags."""
+    """Whether a fit without `bag` halves the mean square left-out drift of the other bags."""
     before, after = np.delete(_square_of_bags(whole), bag), _square_of_bags(rest)
     known = np.isfinite(before) & np.isfinite(after)
     return bool(known.any() and before[known].mean() > 2.0 * after[known].mean())
 
 
 def _square_of_bags(fit: Fit) -> Floats:
-    """Mean square of each bag's left-out drift [(m/s^2)^2], (n_bags,); NaN if unknown."""
+    """Return the mean square left-out drift of each bag [(m/s^2)^2], NaN if unknown, (n_bags,)."""
     data, folds = fit.windows.data, fit.selected.score.positions
     bag = data.bag_of_position[np.flatnonzero(np.diff(data.mounting, prepend=-1))]
     return Folds.of(folds.square, folds.windows, bag).square
@@ -77,11 +78,11 @@ def _square_of_bags(fit: Fit) -> Floats:
 
 class Contradiction(NamedTuple):
     """
-    Bags that contradict a calibration of the same unit.
+    Bags that contradict an earlier calibration of their unit.
 
-    bags: bags whose drift no initial lag states explain, with the unit's parameters fixed
-    is_changed: whether |f| misses gravity by far more than the drift and the claimed sd of |f|, so
-        that the constants have changed as well
+    bags: numbers of bags whose drift the calibration does not explain with any lag states at start
+    is_changed: whether ``|f| - g`` is far above the drift and the claimed sd of |f|, so that bias
+        or scale has changed, too
     """
 
     bags: list[int]
@@ -91,7 +92,7 @@ class Contradiction(NamedTuple):
 def contradiction(
     windows: ThermalWindows, known: Calibration, options: FitOptions
 ) -> Contradiction:
-    """Find the bags whose drift contradicts a calibration of the same unit."""
+    """Find the bags whose drift contradicts the calibration `known` of their unit."""
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(known, data, options.gravity)
     first = next(informative_priors(known, regression, state, windows.model, options))
@@ -103,11 +104,10 @@ def contradiction(
         scale_sd=SCALE_SD,
         misalignment_sd=MISALIGNMENT_SD,
         column_sd=data.parts.astype(np.float64),
-        # Only the drift is compared, because a turn-on or ageing may have changed the bias by up
-        # to 1 mg.
+        # Only drifts are compared: bias offsets of 1 mg, by turn-ons or ageing, are allowed.
         offset_sd=1e-2,
         sigma=np.maximum(sigma, 1e-9),
-        # The factor 1e4 on the prior's root fixes the parameters at the mean of the prior.
+        # The factor 1e4 keeps the parameters practically at their values in the calibration.
         informative=replace(first, root=1e4 * first.root),
     )
     fitted = regression.solve(state, prior, n_steps=4)
@@ -135,7 +135,7 @@ def contradiction(
 def _at_calibration(
     calibration: Calibration, data: Windows, gravity: float
 ) -> tuple[Regression, State]:
-    """Return the regression of windows, and the state of a calibration."""
+    """Return the regression of windows, and its state with the values of a calibration."""
     constants = constants_of(calibration)
     regression = Regression(data, gravity, constants.scale)
     state = initial_state(regression, constants, constants.directions(data))
@@ -146,10 +146,10 @@ def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool = False
 ) -> tuple[Calibration, Finding]:
     """
-    Add the drift that the correction leaves in bags to the lack of fit of both regimes.
+    Add the drift that remains in `bags` after the correction to the lack of fit of both regimes.
 
-    `others` names the bags or the prior that these bags contradict; `is_updated`: whether the bags
-    took part in the fit
+    `others`: text that names what these bags contradict, other bags or the prior; `is_updated`:
+    whether `bags` were used in the fit
     """
     windows = thermal_windows(bags, prior_model(calibration))
     regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)
@@ -164,7 +164,7 @@ def with_excluded_error(
     text = (
         f'{names}: the correction by {others} leaves a drift of {rms:.0f} ug. The recording took '
         'no part in the fit; the published uncertainty includes this error. Another environment, '
-        'with the fan off or mounted elsewhere, needs a separate calibration'
+        'such as still air or another mounting, needs a separate calibration'
     )
     if is_updated:
         text = (

@@ -7,12 +7,13 @@ Equation of window w of position p and axis i, in m/s^2 of the nominal scale fac
 
     N / K0 = kappa a (1 + S s) + b + B beta + o_p + o_b + kappa (A l_p)_i g + noise,
     a = (A u_p)_i g,  A = M^-1,  kappa: scale factor / K0,  b: bias,  u_p: attitude,
-    l_p across u_p: tilt of the support,  o_p, o_b: bias offsets of the position, of the turn-on
+    l_p, perpendicular to u_p: tilt of the support,
+    o_p, o_b: bias offsets of the position and of the turn-on (bag)
 
 B and S are columns of the table in `unit.columns`, each divided by its RMS, with the weights beta
-and s. With g = 0 the terms b, B beta and o_p remain: the equation of an angular rate. If |f|
-differs between positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t)
-n_j(a)`` are added (`forces`). All terms are linear combinations of the base series (`series`).
+and s. For an angular rate g is 0, and the terms b, B beta and o_p remain. If |f| differs between
+positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) n_j(a)`` are added
+(`forces`). All terms are linear combinations of the base series (`series`).
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _Result = TypeVar('_Result')
 def last_result_kept(
     method: Callable[Concatenate[_Self, _Given], _Result],
 ) -> Callable[Concatenate[_Self, _Given], _Result]:
-    """Keep the last result of a method, and return it again for the same objects as arguments."""
+    """Keep the last result of a method, and return it if the arguments are the same objects."""
     name = f'_last_{method.__name__}'
 
     @wraps(method)
@@ -54,14 +55,14 @@ def last_result_kept(
 
 class Effects(NamedTuple):
     """
-    The readings that a state of the unknowns predicts at the reference temperature, by parts.
+    The parts of the readings that a state of the unknowns predicts at the reference temperature.
 
     force: specific force along each axis in each position, shape (n_positions, 3)
     by_rotation: derivative of the reading w.r.t. a rotation of the attitude, (n_positions, 3, 2)
     without_bias: reading without the bias, shape (n_positions, 3)
-    nonlinear: sums of the nonlinear terms at the reference temperature and per kelvin, shape (2,
-        n_positions, 3)
-    slopes: derivatives of `nonlinear` w.r.t. the force, of the same shape
+    nonlinear: sums of the nonlinear terms at the reference temperature and of their changes per
+        kelvin, shape (2, n_positions, 3)
+    slopes: derivatives of `nonlinear` w.r.t. the force, shape (2, n_positions, 3)
     """
 
     force: Floats
@@ -109,7 +110,7 @@ class Equations(Series):
         )
 
     def norms(self, state: State) -> Floats:
-        """Return |f| of each position with the estimated radius, shape (n_positions,)."""
+        """Return |f| of each position, without the error `State.stretch`, (n_positions,)."""
         if self.forces is None:
             return np.full(self.windows.n_positions, self.gravity)
         return self.forces.norms(state.radius, np.zeros_like(state.stretch))
@@ -141,7 +142,7 @@ class Equations(Series):
 
     @last_result_kept
     def effects(self, state: State) -> Effects:
-        """Return the specific force along each axis and its nonlinear terms."""
+        """Return the parts of the readings predicted by a state, see `Effects`."""
         force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
         along_axes = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
         sizes = np.reshape(self._norm(state), (-1, 1, 1))
@@ -191,8 +192,8 @@ class Equations(Series):
 
     def _combined(self, state: State, base: Base, n_starts: int) -> Floats:
         """
-        Return the combinations of the base series that a tangent uses: 1 + S s; the derivatives
-        w.r.t. kappa, the force along the axis and the initial lag states; the residual.
+        Return the combinations of the base series that `Tangent` uses: 1 + S s; the derivatives
+        w.r.t. kappa, the force along the axis and the initial lag states; and the residual.
         """
         force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
@@ -215,8 +216,8 @@ class Equations(Series):
         """
         Return index and factor of the series of each active nonlinear coefficient, see `Tangent`.
 
-        The relative change of the scale factor multiplies the terms at the reference temperature,
-        but not the terms' change per kelvin: the product of both changes is negligible.
+        The factor 1 + S s of the scale multiplies the terms at the reference temperature. It is
+        left out in the terms' change per kelvin, where its effect is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):
@@ -227,9 +228,9 @@ class Equations(Series):
         return place, state.kappa[:, None] * value[..., active % k]
 
     def _by_misalignment(self, state: State) -> Floats:
-        """Differentiate each axis' force w.r.t. the misalignment, times kappa, (n, 3, 3)."""
+        """Return the derivatives of kappa times the force along the axes by M^-1, (n, 3, 3)."""
         result = np.zeros((len(state.up), 3, 3))
-        # Rows and columns of the three free elements of the inverse of M.
+        # Rows and columns of the three elements below the diagonal of the inverse of M.
         rows, columns = [1, 2, 2], [0, 0, 1]
         components = (self._norm(state) * state.up)[:, columns]
         result[:, rows, [0, 1, 2]] = state.kappa[rows] * components
@@ -257,7 +258,7 @@ class Equations(Series):
         return np.asarray(np.einsum('nb,nib->ni', series, self.misfit(state, base)[position]))
 
     def force(self, state: State, rows: slice = slice(None)) -> Floats:
-        """Correct windows as the compensator does, without mounting offsets, shape (n, 3)."""
+        """Correct windows as the compensator does, with no mounting offsets, shape (n, 3)."""
         active = np.flatnonzero(state.weights.any(axis=(0, 1)))
         columns, (on_bias, on_scale) = self.columns[rows, active], state.weights[:, :, active]
         along = self.measured[rows] - state.bias - columns @ on_bias.T
@@ -292,8 +293,8 @@ class Equations(Series):
         result[layout.tilt] = prior.tilt_sd**-2
         result[layout.start] = 1.0 / prior.start_variance_ratio
         result[layout.turn_on] = prior.turn_on_sd**-2
-        # The prior of attitudes is flat, so its precision is 0. An angular rate does not depend on
-        # the attitude, and a precision of 1 keeps the attitude's equations regular.
+        # The prior of attitudes is flat: a precision of 0. An angular rate does not depend on the
+        # attitude, so a precision of 1 prevents singular equations.
         result[layout.up] = 0.0 if self.gravity else 1.0
         result[layout.posed] = prior.pose_sd**-2
         # The prior of a pose is almost flat: its sd is 1 rad.
@@ -301,7 +302,7 @@ class Equations(Series):
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
-        """Return the unknowns less their prior mean, 0 except for the unit's, shape (n,)."""
+        """Return the unknowns less their prior means, which are 0 for all but the unit's, (n,)."""
         result = as_vector(state, layout)
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean
@@ -313,7 +314,7 @@ class Equations(Series):
 
 
 def _added(layout: Layout) -> list[str]:
-    """Return the unknowns to which a step is added: all but the attitudes."""
+    """Return the names of the unknowns to which a step is added; attitudes are rotated instead."""
     names = (
         *('kappa', 'bias', 'weights', 'misalignment', 'offset', 'tilt'),
         *('start', 'turn_on', 'nonlinear', 'radius', 'stretch'),
@@ -330,7 +331,7 @@ def as_vector(state: State, layout: Layout) -> Floats:
 
 
 def without_inactive(state: State, layout: Layout) -> State:
-    """Set inactive weights and coefficients to 0; return `state` itself if they are 0 already."""
+    """Set inactive weights and coefficients to 0; return `state` itself if all of them are 0."""
     kept = {name: getattr(layout, name) >= 0 for name in ('weights', 'nonlinear')}
     if not any(getattr(state, name)[~active].any() for name, active in kept.items()):
         return state
@@ -359,7 +360,7 @@ def _poses(up: Floats, pose_of: Ints | None, n_poses: int) -> Floats:
 
 
 def _by_poses(by_rotation: Floats, layout: Layout) -> Floats:
-    """Return the derivatives w.r.t. rotations of the poses, shape (n_positions, 3, 2 n_poses)."""
+    """Return the readings' derivatives by rotations of poses, (n_positions, 3, 2 n_poses)."""
     is_in = layout.pose_of[:, None] == np.arange(len(layout.pose))
     each = by_rotation[:, :, None, :] * is_in[:, None, :, None]
     return np.asarray(each.reshape(*by_rotation.shape[:2], -1))

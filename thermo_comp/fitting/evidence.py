@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the statistics that a fit reports: the residuals of each position, the residuals with
-constants, curves and response added in turn, and the contribution of each group of columns.
+Owns the statistics that a fit reports: residuals of each position; residuals after correction with
+constants, with curves and with the response; and the contribution of each group of columns.
 
-Each position has two residuals: in sample, that is, of the fit of all positions; and left out,
-of a fit without this position, which estimates the error in a new attitude.
+Each position has two residuals: in sample, by the fit of all positions; and left out, by a fit
+without this position, which estimates the error in a new attitude.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class ResidualRow:
 
 def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     """
-    Return statistics of the residuals after each step of the correction and, of each window,
+    Return statistics of the residuals after each step of the correction; and, for each window,
     ``|f| - g`` in sample and the left-out error [m/s^2], shape (n,).
     """
     windows, regression, selected, state = *fit[:3], fit.posterior.state
@@ -98,7 +98,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
 def tables_of(
     residuals: Iterable[Floats], is_dynamic: Bools
 ) -> list[dict[str, ResidualStatistics]]:
-    """Return statistics by regime of the finite values of residuals, each of shape (n,)."""
+    """Return, for each array of residuals, (n,), statistics of finite values by regime."""
     return [
         statistics_by_regime(values[np.isfinite(values)], is_dynamic[np.isfinite(values)])
         for values in residuals
@@ -108,7 +108,7 @@ def tables_of(
 def left_out_error(score: Score, gravity: float | Floats) -> Floats:
     """
     Return the error of each left-out window [m/s^2], shape (n,): ``|f| - g`` if the other
-    positions determine the norm, else the RMS over the axes of the drift.
+    positions determine |f|, else the RMS of the drifts of the three axes.
     """
     norm = norm_residual(score.force, gravity)
     drift = np.sqrt(np.mean(score.drift**2, axis=1))
@@ -116,10 +116,10 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
 
 
 def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...]) -> State:
-    """Fit again with some groups of columns only, under an almost flat prior of their weights."""
+    """Repeat the fit with the given groups only, under an almost flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
-    # The residuals of a model with few groups are mostly model error, so the fit has white noise
-    # alone and no mounting offsets.
+    # The residuals of a model with few groups are mostly model error, which slow noise or mounting
+    # offsets would absorb: the fit has white noise only and no offsets.
     prior = replace(
         chosen.prior,
         column_sd=only * regression.windows.parts * [[0.05], [0.005]],
@@ -132,7 +132,7 @@ def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...
 
 
 def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[PositionReport, ...]:
-    """List the positions with their RMS residuals in sample and left out, see `residual_rows`."""
+    """Return a report for each position; `residual`, `left_out`: of windows (`residual_rows`)."""
     windows, state = fit.windows, fit.posterior.state
     result = []
     for number, (bag, interval) in enumerate(windows.rests):
@@ -153,10 +153,10 @@ def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[Posi
 
 def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupEvidence, ...]:
     """
-    Return RMS contribution, effective parameters and log Bayes factor of each group in use.
+    Return RMS contribution, effective parameters and log Bayes factor of each active group.
 
-    The Bayes factor compares the fit with a fit without the group or, if the prior is informative,
-    with a fit in which the group keeps the weights of the prior's mean.
+    The Bayes factor compares the fit with a fit without the group or, if the prior is a
+    calibration, with a fit in which the group keeps the weights of this calibration.
     """
     names = np.array(regression.windows.groups)
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
@@ -198,5 +198,5 @@ def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupE
 
 
 def _mean_sd(root: Floats) -> float:
-    """Return the geometric mean of the sd along the axes of the covariance ``root @ root.T``."""
+    """Return the geometric mean of the principal sds of the covariance ``root @ root.T``."""
     return float(np.exp(np.linalg.slogdet(root @ root.T)[1] / (2.0 * len(root))))

@@ -3,8 +3,8 @@
 """
 Owns the sequence of a fit, from sources to a calibration with its residuals and findings.
 
-Angles and norms of raw codes with an offset, as in offset binary, are meaningless, so the code at
-zero force is subtracted before the fit and added to the bias afterwards.
+Directions and norms cannot be computed from codes with an offset, as in offset binary, so the code
+at zero force is subtracted before the fit and added to the bias after the fit.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def fit(
 
 
 def reduce_bag(source: FitSource, options: FitOptions) -> ReducedBag:
-    """Reduce a source to sufficient statistics; raises FitError if it has no still interval."""
+    """Reduce a source to its statistics; raises FitError without samples or still intervals."""
     return _checked(_reduced(source, options))
 
 
@@ -96,7 +96,6 @@ def _reduced(source: FitSource, options: FitOptions) -> ReducedBag:
 
 
 def _checked(bag: ReducedBag) -> ReducedBag:
-    """Return the bag; raises FitError if it has no samples, or no still interval."""
     if not bag.n_samples:
         name = bag.source.name
         raise FitError(f'{name}: no accelerometer samples in the part that is read')
@@ -109,9 +108,9 @@ def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
     """Fit a calibration to reduced bags; raises FitError if the bags contradict themselves."""
-    # A part of a split recording may have no rest, so the joined recordings are checked.
+    # One bag of a split recording may have no rest, so the bags are joined before the check.
     recordings = [_checked(bag) for bag in joined(bags)]
-    # The fit multiplies many small matrices, and threads would only slow these products down.
+    # Threads would slow down the products of small matrices in the fit.
     with threadpool_limits(1, 'blas'):
         try:
             return _fit_without_code_offset(recordings, options, progress)
@@ -155,7 +154,7 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
         return np.zeros(3)
     if options.prior is not None:
         known = constants_of(options.prior)
-        # A bias above 0.5 g is the offset of a code.
+        # A bias above 0.5 g is taken for the code at zero force.
         is_far = np.abs(known.bias / known.scale).max() > 0.5 * options.gravity
         return np.asarray(np.rint(known.bias) * is_far)
     middle = max(bag.middle for bag in bags)
@@ -177,11 +176,11 @@ def without_code_offset(bag: ReducedBag, offset: Floats) -> ReducedBag:
 
 
 def with_code_offset(calibration: Calibration, offset: Floats) -> Calibration:
-    """Convert a calibration of codes less their offset into a calibration of the codes."""
+    """Convert a calibration of codes without their offset into a calibration of raw codes."""
     unit = calibration.unit
     full_scale = unit.full_scale
     if full_scale == COUNTS_FULL_SCALE and offset.max() > 0.0:
-        # The full scale of unsigned codes of the default length, 16 bits.
+        # Full scale of unsigned codes of 16 bits, the default length.
         full_scale = 2.0 * COUNTS_FULL_SCALE + 1.0
     axes = (
         AxisReference(axis.scale_factor, axis.bias + by)
@@ -200,7 +199,7 @@ def with_notes(calibration: Calibration, findings: Iterable[Finding]) -> Calibra
 def _fit_one_environment(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
-    """Fit the bags, without bags of another environment, see `environments`."""
+    """Fit the bags, without bags recorded in another thermal environment, see `environments`."""
     first = _fit(bags, options, progress)
     known = options.prior
     excluded, is_changed = [], False
@@ -219,8 +218,8 @@ def _fit_one_environment(
             return _refined(first, bags, options, progress)
         refit = _refined(refit, kept, options, progress)
     elif known is not None and not is_updated:
-        # If all bags contradict the prior's effects of temperature, and the constants have not
-        # changed, the bags are of another environment and cannot update the prior.
+        # If all bags contradict the prior's effects of temperature, and bias and scale have not
+        # changed, the bags were recorded in another environment and cannot update the prior.
         provenance = first.calibration.provenance
         refit = replace(first, calibration=replace(known, provenance=provenance))
     others = 'the other bags' if known is None else 'the prior'
@@ -239,9 +238,7 @@ def _fit_one_environment(
 def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
-    """
-    Repeat a fit whose settled bias is uncertain, or whose supports may tilt, see `refit_checks`.
-    """
+    """Repeat a fit whose settled bias is uncertain or whose supports may tilt (`refit_checks`)."""
     if options.prior is not None or options.model == 'golovach':
         return result
     if refit_checks.extrapolates(result.fit):
@@ -266,7 +263,7 @@ def _refined(
 def _tried(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress, **given: bool
 ) -> FitResult | None:
-    """Fit the bags with other assumptions; return None if this fit is refused."""
+    """Fit the bags with the assumptions `given` of `_fit`; return None if this fit is refused."""
     try:
         return _fit(bags, options, progress, **given)
     except (FitError, np.linalg.LinAlgError):
@@ -331,7 +328,7 @@ def _fit(
         if known is not None or not is_beyond(fit.windows):
             calibration, rates = add_gyroscope(calibration, fit.windows, bags, options)
         elif fit.windows.angular_rate.shape[1]:
-            text = 'the unit rotated in some rests, so no gyroscope was fitted'
+            text = 'the unit rotated in some rests, so the bias of the gyroscope was not fitted'
             findings.append(Finding('rate', 'advice', text))
     except ValueError as error:
         raise _unusable(error, fit.posterior.state.up) from error
@@ -353,13 +350,13 @@ def _fit(
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """Return the bags without copies of the board's thermometer, and findings about raw data."""
+    """Return the bags without copies of the board's thermometer; and findings on raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name
         raise FitError(
             f'{name}: no board temperature, which the other bags have: leave out this bag, or '
-            'name its topic with --topic board=TOPIC'
+            'name the topic of its board temperature with --topic board=TOPIC'
         )
     serial = check_serial([bag.source for bag in bags], options)
     findings = enforce(raw_checks.judge_prior(serial, options.prior), options)
@@ -369,14 +366,13 @@ def _judged(
 
 
 def _unusable(error: ValueError, up: Floats) -> FitError:
-    """Return the FitError for a calibration with values outside their ranges."""
     if 'misalignment' in str(error):
-        # If the positions determine a misalignment out of range, the sensor is no accelerometer.
+        # If the positions determine the misalignment, these samples are not those of a triad.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
             'in the fit the angle between two of the axes is less than 60 degrees, which no '
-            'accelerometer has: is the topic that of the accelerometer, did the axes stay the '
-            'same in all positions, and are there at least 9 positions?'
+            'accelerometer has: is the topic that of the accelerometer, do all positions have the '
+            'same order and signs of the axes, and are there at least 9 positions?'
         )
     return FitError(f'the bags give a calibration with an impossible value: {error}')
 
@@ -387,8 +383,8 @@ def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
     if options.serial is None and len(serials) > 1:
         names = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))
         raise FitError(
-            f'the bags are of different units: {names}; fit the bags of each unit alone or, if it '
-            'is one unit, state --serial'
+            f'the bags are of different units: {names}; fit the bags of each unit separately or, '
+            'if all bags are of one unit, state its serial with --serial'
         )
     try:
         return valid_serial(options.serial or next(iter(serials), 'unknown'))
@@ -404,7 +400,7 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale == COUNTS_FULL_SCALE:
         full_scale = widened(full_scale, np.array([[largest]]))
     if full_scale is None:
-        # The smallest usual full scale of sensors in m/s^2 that contains the data.
+        # The smallest of the usual full scales that exceeds the largest sample by 10 %.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))

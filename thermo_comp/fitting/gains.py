@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the change of a fit's log evidence by the removal or the addition of columns.
+Owns the change of the log evidence of a fit if columns are removed or added.
 
 References
 ----------
@@ -20,16 +20,17 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Squares of the candidate values of a common factor of the columns' prior sd; the candidate with
-# the largest gain is used.
+# Squares of the factors by which the prior sd of new columns is multiplied; the factor with the
+# largest gain is used.
 _SQUARED_FACTORS = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 
 def log_bayes_factors(mode: Floats, covariance: Floats, places: Ints, prior_sd: Floats) -> Floats:
     """
-    Return the loss of log evidence if k weights are set to 0 (Savage-Dickey ratio, [1]_), (n,).
+    Return the loss of log evidence if k weights are set to 0 (Savage-Dickey ratio, [1]_), for n
+    choices of these weights, shape (n,).
 
-    `places`, `prior_sd`: indices and prior sd of the weights in each of n cases, shape (n, k)
+    `places`, `prior_sd`: indices and prior sd of the weights in each choice, shape (n, k)
     """
     means = mode[places]
     blocks = covariance[places[:, :, None], places[:, None, :]]
@@ -58,7 +59,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S and Q of the wanted weights, in units of prior sd, and the weights' columns."""
+        """Return S and Q of the weights of `wanted` columns, in units of prior sd; and columns."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])
@@ -66,10 +67,10 @@ class Inactive:
 
     def gain(self, column_sd: Floats, wanted: Bools) -> float:
         """
-        Return the gain in log evidence by adding the `wanted` columns, shape (m,).
+        Return the gain in log evidence if the columns in the mask `wanted`, (m,), are added.
 
-        The gain is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, S and q in units of the columns'
-        prior sd, shape (2, m), at the best common factor of this sd.
+        The gain is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, with S and q in units of the prior
+        sd `column_sd`, shape (2, m), times the best of `_SQUARED_FACTORS`.
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)
         S, along = np.linalg.eigh(S)
@@ -78,10 +79,10 @@ class Inactive:
 
     def chosen(self, column_sd: Floats, wanted: Bools, least: float, most: int) -> Bools:
         """
-        Choose up to `most` of the `wanted` columns, shape (m,), by forward selection.
+        Choose up to `most` columns from the mask `wanted`, (m,), by forward selection.
 
-        The next column is that with the largest gain in log evidence given the columns chosen
-        before; the selection ends when this gain is below `least`.
+        The next column is that with the largest gain in log evidence given the columns already
+        chosen; the selection ends when this gain is below `least`.
         """
         S, Q, column = self._in_prior_sd(column_sd, wanted)
         result = np.zeros_like(wanted)

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fit of a gyroscope's bias to the angular rate at rest, over the accelerometer's columns.
+Owns the fit of a gyroscope's bias to the angular rate at rest, with the accelerometer's columns.
 
 A gyroscope at rest measures the component of the Earth's rate in its attitude, plus a bias that
-changes at each turn-on. A constant offset of the rate in each position is an unknown of the
-regression. Changes of the rate within a position determine the effect of temperature; the mean
-rate over the positions determines the constant bias. The regression is that of the accelerometer
-with gravity 0, in rad/s in place of m/s^2.
+changes at each turn-on, so the regression has a constant offset of the rate as an unknown of each
+position. Changes of the rate within a position determine the effect of temperature; the mean rate
+over the positions determines the constant bias. The equations are those of the accelerometer with
+gravity 0, in rad/s instead of m/s^2.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from .windows import ThermalWindows
 
 @dataclass(frozen=True)
 class RateRow:
-    """Residuals of the rate about the mean of each position, as in `ResidualRow`."""
+    """Statistics of the rate less its mean in each position, fields as in `ResidualRow`."""
 
     section: str
     raw: ResidualStatistics
@@ -51,9 +51,8 @@ def add_gyroscope(
     options: FitOptions,
 ) -> tuple[Calibration, tuple[RateRow, ...]]:
     """
-    Add a gyroscope to a calibration: that of the prior, or else a gyroscope fitted to the bags.
-
-    Without a prior, and without angular rates or temperatures, no gyroscope is added.
+    Add a gyroscope to a calibration: that of the prior calibration or, without a prior, a
+    gyroscope fitted to the bags, if the bags have angular rates and temperatures.
     """
     if options.prior is not None:
         known = options.prior.gyroscope
@@ -84,11 +83,11 @@ def add_gyroscope(
         offset_scale=earth_sd,
     )
     fit = Fit(windows, regression, select(regression, state, prior, _candidates(data, options)))
-    # The positions determine the sd of the offsets: `claim_of` does not marginalise this sd.
+    # The positions determine the sd of the offsets well: `claim_of` need not marginalise this sd.
     fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
     chosen = replace(fit.posterior, prior=fixed_sd)
     claim = claim_of(regression, chosen, lacks_effects=fit.selected.lacks_effects)
-    # The Earth's rate, which the offsets contain, is a true rate and no error of the gyroscope.
+    # The offsets contain the Earth's rate, which is no error of the gyroscope: subtract it.
     turn_on = math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0))
     claim = replace(claim, offset_sd=turn_on)
     triad = build_calibration(fit, claim, bags, calibration.unit)
@@ -104,8 +103,7 @@ def _candidates(data: Windows, options: FitOptions) -> Candidates:
     is_candidate = np.isin(data.groups, list(allowed)) & (data.kelvins > 0.0)
     kelvins = np.outer((1.0, 0.0), is_candidate * data.kelvins)
     none = np.zeros(kelvins.shape, dtype=bool)
-    # Typical and largest sd of a slope of the bias [rad/s per K]; the largest is that of consumer
-    # MEMS.
+    # Typical and largest (consumer MEMS) prior sd of a slope of the bias [rad/s per K].
     return Candidates(1e-5 * kelvins, 5e-3 * kelvins, none[0], none)
 
 

@@ -3,11 +3,11 @@
 """
 Owns the estimation of prior sd and noises, and the removal of columns of small log Bayes factor.
 
-Each column has one prior standard deviation for the bias of all axes and one for the scale, found
-by MacKay's fixed point [1]_ with a log-normal hyperprior per kelvin. The mode of log evidence plus
-hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w the
-weights of the column, sd0 and tau^2 centre and variance of the hyperprior. The sd of a column
-about which the data have no information stays at the centre sd0 of the hyperprior.
+Each column has one prior standard deviation of its weights in the bias of all axes and one in the
+scale, found by MacKay's fixed point [1]_ with a log-normal hyperprior. The mode of log evidence
+plus log hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w
+being the weights of the column on the three axes, sd0 and tau^2 centre and variance of the
+hyperprior of log sd. The sd of a column about which the data have no information stays at sd0.
 
 References
 ----------
@@ -35,24 +35,24 @@ from .regression import Posterior, Regression
 from .unknowns import POSE_SD, Noise, Prior, State, Windows
 from .windows import LAGS, PRODUCTS
 
-#: Degrees of freedom of the half-Student prior of the sd of mounting offsets; 4 as in [2]_.
+#: Degrees of freedom of the half-Student prior of the sd of mounting offsets, as in [2]_.
 STUDENT_NU = 4.0
 #: Smallest log Bayes factor of a column that is kept: below 1 the evidence is "not worth more than
 #: a bare mention" (Kass and Raftery, Bayes factors, JASA 90 (1995), section 3.2).
 LEAST_GAIN = 1.0
 #: Gain in log evidence from which a model is clearly more likely than another: odds of 55 : 1.
 CLEAR_GAIN = 4.0
-#: Variance of the log of a prior sd in the log-normal hyperprior, whose sd is a factor of ten.
+#: Variance of the natural log of a prior sd in the hyperprior: 1 sd is a factor of ten.
 LOG_VARIANCE = float(np.log(10.0)) ** 2
 
 
 @dataclass(frozen=True)
 class Candidates:
     """
-    The columns that may take part in a model.
+    The columns that a model may have.
 
     typical, largest: centre of the hyperprior and upper bound of `Prior.column_sd`, in the bias
-        [m/s^2] and in the scale (relative), (2, m); 0 for a column that may not take part
+        [m/s^2] and in the scale (relative), (2, m); 0 for a column that the model may not have
     forced: columns that are always kept, shape (m,)
     fixed: columns that are always kept, with a constant prior sd, shape (2, m)
     """
@@ -66,7 +66,7 @@ class Candidates:
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
 ) -> Posterior:
-    """Iterate all prior sd and noises until the log of none changes by more than 0.05."""
+    """Iterate all prior sd and noises until the logarithm of each changes by less than 0.05."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
@@ -79,7 +79,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: Posterior, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move all prior sd and noises towards their modes; return also the largest log change."""
+    """Move all prior sd and noises towards their modes; return also the largest log ratio."""
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     sd, determined = prior.column_sd, posterior.determined
     moves = (sd > 0.0) & ~candidates.fixed
@@ -94,8 +94,8 @@ def _updated(
     changes.append(change)
     turn_on_sd = prior.turn_on_sd
     if prior.informative is None:
-        # A prior calibration states the sd of turn-on offsets, which the few turn-ons of an update
-        # do not separate from the ageing of the bias.
+        # With a prior calibration the sd of turn-on offsets keeps its value, because the few
+        # turn-ons of an update do not separate turn-on offsets from the ageing of the bias.
         turn_on_sd, change = _offset_sd(posterior, turn_on_sd, posterior.layout.turn_on)
         changes.append(change)
     tilt_sd, change = _tilt_sd(posterior, float(regression.windows.kelvins[0]))
@@ -104,19 +104,19 @@ def _updated(
     changes.append(change)
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly, so the built-in sd counts as a fourth
-        # element, and the sd changes only if the data determine more than one element of M.
+        # Three elements of M determine their sd poorly. The built-in sd therefore counts as a
+        # fourth element, and the sd changes only if the data determine more than one element.
         gamma = float(determined[layout.misalignment].sum())
         share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
         square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
         new_sd = float(np.sqrt(square / (share * gamma + 1.0)))
-        # Limit the misalignment sd to 0.03 rad: larger misalignments, such as those of separate
-        # sensors on a printed bracket, would explain the norms of six faces, to second order.
+        # The misalignment sd is limited to 0.03 rad, a value for separate sensors on a printed
+        # bracket: larger misalignments would explain the norms of six faces, to second order.
         misalignment_sd = min(new_sd, 0.03)
     start_ratio = prior.start_variance_ratio
     if layout.start.size:
-        # One lag state with the variance of the node's prior (a ratio of 1) is added, so that the
-        # states of a single bag cannot make `start_variance_ratio` very small.
+        # A lag state with the variance of the node's prior (a ratio of 1) is added to the data, so
+        # that the lag states of a single bag cannot make `start_variance_ratio` very small.
         gamma = float(determined[layout.start].sum())
         if gamma <= -1.0:
             raise np.linalg.LinAlgError('rounding errors exceed the information about lag states')
@@ -139,20 +139,19 @@ def _updated(
 
 def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
     """
-    Move the sd of the supports' tilts towards the mode; return also a third of log sd's change.
-
-    `kelvins`: RMS of the board temperature about the reference [K]
+    Move the sd of the supports' tilts towards the mode; return also a third of the change of its
+    logarithm. `kelvins`: RMS of the board temperature about the reference [K]
     """
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
         return sd, 0.0
-    # Scale of the half-normal prior of tilts: 15 urad/K, aluminium of 23 ppm/K heated unevenly,
-    # times the temperature, at least 1 K.
+    # The scale of the half-normal prior of the tilts' sd is 15 urad/K, for unevenly heated
+    # aluminium of 23 ppm/K, times the RMS temperature, or times 1 K if this is larger.
     square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
     effective = posterior.determined[posterior.layout.tilt].sum()
     step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
-    # An sd of tilts that is off by 15 % hardly changes the fit, so convergence counts only a third
-    # of the change of its logarithm.
+    # An error of 15 % of the sd of tilts hardly changes the fit, so a third of the change of its
+    # logarithm is compared with the limit of convergence, 0.05.
     return float(sd * np.exp(step)), float(np.abs(step)) / 3.0
 
 
@@ -188,7 +187,7 @@ def _toward(
 def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, float]:
     """
     Move the sd of the offsets of mountings or turn-ons, the unknowns at `places`, towards the mode
-    under a half-Student prior; return also the change of log sd, 0 if the data do not determine
+    under a half-Student prior; return also the change of log sd, or 0 if the data do not determine
     the offsets.
     """
     scale = posterior.prior.offset_scale
@@ -200,7 +199,7 @@ def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, fl
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, sd, slope, bend + 0.1)
-    # Bounds of the offset sd [m/s^2]: 1e-4 of the prior's scale; 5 mg, as in the cheapest MEMS.
+    # Bounds of the offset sd: 1e-4 of the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
     new = float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
     return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
 
@@ -233,16 +232,16 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
     of_axis = determined[layout.axis].sum(axis=1) + determined[layout.offset].sum(axis=0)
     if layout.turn_on.size:
         of_axis += determined[layout.turn_on].sum(axis=0)
-    # Each axis counts a third of the effective parameters of the unknowns that all axes share.
+    # Effective parameters of unknowns that all axes share are divided equally among the axes.
     common = (layout.shared, layout.up, layout.stretch, layout.tilt, layout.start)
     spent = of_axis + sum(determined[places].sum() for places in common) / 3.0
     sigma = np.sqrt(posterior.square / np.maximum(n - spent, 0.05 * n))
-    # Constant samples of an axis have no noise: the noise is at least a hundredth of that of the
-    # noisiest axis.
+    # The samples of an axis may be constant, without noise. The noise of an axis is at least a
+    # hundredth of the noise of the noisiest axis.
     least = np.full(3, max(posterior.prior.least_sigma, 0.01 * float(sigma.max())))
     if not regression.windows.has_drifts:
-        # If no column changes within a position, slow noise explains the whole drift. The white
-        # noise is then at least that by differences of windows, in which a drift cancels.
+        # If no column changes within a position, slow noise may explain the whole residual. The
+        # white noise is then at least that of differences of windows, in which a drift cancels.
         least = np.maximum(least, white_noise_of(regression.windows, regression.nominal_scale))
     return np.asarray(np.maximum(sigma, least))
 
@@ -250,7 +249,7 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
 def with_slow_noise(
     regression: Regression, posterior: Posterior, candidates: Candidates
 ) -> Posterior:
-    """Estimate slow noise from the residuals, then by log evidence; fit again with this noise."""
+    """Estimate slow noise from the residuals, then by log evidence; repeat the fit with it."""
     prior = posterior.prior
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
     estimated = regression.whitener.estimate(residual, regression.weight)
@@ -265,8 +264,8 @@ def with_slow_noise(
         return replace(fitted, prior=trial)
 
     # The parameters absorb a part of the noise, so residuals underestimate the noise; the log
-    # evidence does not. All accelerometers have flicker noise, so a single correlation time is
-    # chosen only if its log evidence is larger by `CLEAR_GAIN`.
+    # evidence does not. All accelerometers have flicker noise, so noise with one correlation time
+    # is chosen only if its log evidence exceeds that of flicker noise by `CLEAR_GAIN`.
     kinds = (estimated._replace(n_times=n) for n in (1, regression.whitener.n_flicker))
     single, best = (_likeliest(with_noise, regression.whitener.shows, noise) for noise in kinds)
     if single.log_evidence > best.log_evidence + CLEAR_GAIN:
@@ -278,8 +277,8 @@ def _likeliest(
     with_noise: Callable[[Noise], Posterior], shows: Callable[[float], bool], noise: Noise
 ) -> Posterior:
     """
-    Search variance ratio and correlation time of the largest log evidence, from a given noise, in
-    steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
+    Search the variance ratio and the correlation time of the largest log evidence, beginning at
+    `noise`, in steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
     """
     best, step = with_noise(noise), 3.0
     while step > 3.0**0.2:
@@ -319,8 +318,8 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
     """
     layout, prior, covariance = posterior.layout, posterior.prior, posterior.covariance.copy()
     mode = as_vector(posterior.state, layout)[: layout.n_unit]
-    # A column of the scale with a fixed sd can explain the drift of a column of the bias, so the
-    # evidence would drop the column of the bias.
+    # A column with a fixed sd in the scale can explain the drift that the same column causes in
+    # the bias, so the column is kept in the bias, too.
     is_kept = candidates.fixed | candidates.forced | candidates.fixed[1]
     droppable = np.argwhere((prior.column_sd > 0.0) & ~is_kept).tolist()
     column_sd, weight_sd = prior.column_sd.copy(), regression.weight_sd(prior)
@@ -342,8 +341,8 @@ def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates
 
 def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
     """
-    Return the columns, (2, m), that are the only lag in a part (bias or scale) with products or
-    squares of lags.
+    Return the columns that are the only lag in the bias, or in the scale, of a model that also has
+    products or squares of lags there, shape (2, m).
 
     A product t m of temperature and lag approximates the lag m at the rates of one program, but
     not at other rates, so a model with products keeps a lag (marginality, [3]_).
@@ -357,9 +356,8 @@ def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
 
 def downweigh(regression: Regression, posterior: Posterior) -> None:
     """
-    Reduce the weight of disturbed windows: those more than 3 sd from the local median.
-
-    The weight is reduced so that the distance of the window from the median becomes 3 sd.
+    Reduce the weight of windows whose residual is more than 3 sd from the local median, so that
+    the weighted distance becomes 3 sd.
     """
     windows = regression.windows
     if windows.undisturbed is None:
@@ -368,9 +366,9 @@ def downweigh(regression: Regression, posterior: Posterior) -> None:
 
 
 def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
-    """Return factors, up to 1, of the windows' weights, by residuals of shape (n, 3)."""
+    """Return factors of at most 1 for the windows' weights, from residuals of shape (n, 3)."""
     size = residual * np.sqrt(weight)[:, None]
-    side = 3  # number of windows on each side, whose median is the local level
+    side = 3  # number of windows before, and after, a window, whose median is its local level
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
         if len(part) > 2 * side:
             around = np.pad(part, ((side, side), (0, 0)), mode='reflect')

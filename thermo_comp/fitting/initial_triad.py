@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the initial triad: constant bias, scale and misalignment from the means of the positions.
+Owns the initial triad: constant bias, scale and misalignment from the mean readings of positions.
 
-The mean readings of the positions lie on an ellipsoid, which is fitted without temperature by
-least squares on ``|f| - g``. The initial values of bias and scale follow from the extremes of the
-mean readings on each axis.
+Without temperature, the mean readings of the positions lie on an ellipsoid, which is fitted by
+robust least squares on ``|f| - g``. The fit begins with the bias and scale that follow from the
+extremes of the mean readings on each axis.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from .unknowns import BIAS_SD, SCALE_SD, Windows
 
 @dataclass(frozen=True)
 class ConstantCalibration:
-    """Constants at one temperature: bias [input units], scale [input units per m/s^2], M."""
+    """Bias [input units], scale [input units per m/s^2] and M, without effects of temperature."""
 
     bias: Floats
     scale: Floats
     misalignment: Floats
 
     def force(self, measured: Floats) -> Floats:
-        """Return the specific force of measured vectors, shape (n, 3)."""
+        """Return the specific force for measured readings, shape (n, 3)."""
         return np.asarray(((measured - self.bias) / self.scale) @ self.misalignment.T)
 
     def directions(self, windows: Windows) -> Floats:
@@ -44,21 +44,21 @@ def constant_calibration(
     means: Floats, gravity: float | Floats, misalignment_sd: float
 ) -> ConstantCalibration:
     """
-    Fit the triad to position means, shape (n, 3); raises FitError for means on no ellipsoid.
+    Fit the triad to position means, (n, 3); raises FitError if they do not lie on an ellipsoid.
 
     `gravity`: |f| of all positions, or of each position, shape (n,) [m/s^2];
     `misalignment_sd`: prior sd of the elements of M [rad]; 0 for axes at right angles
     """
-    # Largest RMS distance from the ellipsoid [m/s^2]: 5 % of |f|, more than the drift of a cheap
-    # sensor over 60 K, and less than the error of a moving unit.
+    # Largest RMS distance from the ellipsoid [m/s^2]: 5 % of |f|, which is above the drift of a
+    # cheap sensor over 60 K, and below the error for a unit in motion.
     largest_rms = 0.05 * float(np.median(gravity))
     if isinstance(gravity, np.ndarray):
         scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
         calibration, rms = _refine(means, gravity, np.zeros(3), scale, misalignment_sd)
         if not np.all(calibration.scale > 0.0) or not rms < largest_rms:
             raise FitError(
-                'the readings at rest contradict the stated |f|: are the values right, in '
-                '--specific-force, --radius or the metadata of the bags?'
+                'the readings at rest contradict the stated |f|: are the values in '
+                '--specific-force, --radius or the metadata of the bags right?'
             )
         return calibration
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
@@ -77,8 +77,7 @@ def constant_calibration(
         scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
         tried.append(_refine(means, gravity, bias, scale, misalignment_sd))
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
-    # The best ellipsoid of scattered points can be very large, with a remote centre, which is no
-    # calibration.
+    # Scattered points may give a very large ellipsoid with a far centre, which is refused.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
     if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
         raise FitError(
@@ -93,10 +92,10 @@ def _refine(
     means: Floats, gravity: float | Floats, bias: Floats, scale: Floats, misalignment_sd: float
 ) -> tuple[ConstantCalibration, float]:
     """
-    Fit the triad from initial values; return also the RMS error of the norms [m/s^2].
+    Fit the triad, beginning with given values; return also the RMS error of |f| [m/s^2].
 
-    The norms of few positions hardly determine some constants, so the built-in prior of the
-    constants is added, with the weight of norms that are known to 0.1 %.
+    |f| of few positions hardly determines some constants, so the built-in prior of the constants
+    is added, weighted as if |f| had an error of 0.1 %.
     """
     one_g = float(np.median(gravity))
 
@@ -134,18 +133,18 @@ def position_means(windows: Windows) -> Floats:
 
 
 def block_means(values: Floats, weight: Floats, first: Ints) -> Floats:
-    """Return the weighted means of blocks of rows, (n, k), that begin at the rows `first`."""
+    """Return the weighted mean of each block of rows, (n, k); blocks begin at rows `first`."""
     total = np.add.reduceat(weight, first)
     return np.asarray(np.add.reduceat(values * weight[:, None], first, axis=0) / total[:, None])
 
 
 def white_noise_of(windows: Windows, scale: Floats) -> Floats:
     """
-    Return the windows' white noise of each axis [m/s^2], shape (3,), from second differences,
+    Return the white noise of a window on each axis [m/s^2], shape (3,), from second differences,
     which do not depend on a linear drift; 0 if no position has three windows.
 
-    In fast ramps the second differences contain the drift, and fourth or sixth differences are
-    much smaller; the noise then follows from the smaller differences.
+    In fast ramps second differences contain a part of the drift. If fourth or sixth differences
+    then give a noise below 70 % of that by second differences, the smallest value is used.
     """
     position, noises = windows.position, []
     for order in (2, 4, 6):
@@ -162,11 +161,11 @@ def white_noise_of(windows: Windows, scale: Floats) -> Floats:
 
 def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool = False) -> Floats:
     """
-    Return the error of the windows of each axis due to the board's thermometer [m/s^2], (3,):
-    the sd of the temperature times the slope of the samples over temperature within the positions.
+    Return the error of a window on each axis due to the error of the board temperature [m/s^2],
+    (3,): the sd of the temperature times the slope of the samples over temperature in positions.
 
-    `beyond_noise`: use the variance less that of a reading's noise, left by coarse steps or long
-    intervals
+    `beyond_noise`: subtract the variance of a reading's noise from that of the temperature; the
+    remaining error is due to coarse steps of the readings, or to long intervals between readings
     """
     if windows.board is None:
         return np.zeros(3)
@@ -175,7 +174,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
     change = within_positions(windows.board[:, :1], windows.position)
     power = np.maximum(np.add.reduceat(change**2, first), 1e-12)
     along = np.add.reduceat(change * drift, first)
-    # White noise alone gives `along**2 / power` of each position a mean of one squared noise.
+    # Under white noise alone, the mean of `along**2 / power` of a position is the noise variance.
     square = along**2 / power - white_noise_of(windows, scale) ** 2
     slope = np.sqrt(np.maximum(square.sum(axis=0), 0.0) / power.sum())
     variance = float(windows.board[:, 1].mean()) - beyond_noise * windows.board_noise**2
@@ -183,7 +182,7 @@ def thermometer_error_of(windows: Windows, scale: Floats, *, beyond_noise: bool 
 
 
 def within_positions(values: Floats, position: Ints) -> Floats:
-    """Subtract from values of windows, shape (n, k), the mean over the position of the window."""
+    """Subtract the mean over each position from values of windows, shape (n, k)."""
     _, where, count = np.unique(position, return_inverse=True, return_counts=True)
     total = np.zeros((len(count), values.shape[1]))
     np.add.at(total, where, values)

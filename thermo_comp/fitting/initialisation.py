@@ -32,19 +32,19 @@ from .selection import LARGE_OFFSETS, Fit, fit_all, select
 from .unknowns import BIAS_SD, SCALE_SD, Prior, State, misalignment_scale
 from .windows import CURVE, PART, ThermalWindows
 
-#: Largest prior sd of a slope over temperature: bias [m/s^2 per K] (500 ug/K) and relative scale
-#: factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
+#: Largest prior sd of a slope over temperature: of the bias [m/s^2 per K] (500 ug/K), and of the
+#: relative scale factor [1/K] (200 ppm/K), the limits in data sheets of consumer MEMS triads.
 STEEPEST = np.array([5e-3, 2e-4])
 
 
 @dataclass(frozen=True)
 class Problem:
     """
-    The input of a regression other than the windows.
+    The input of a fit besides the windows.
 
-    start: initial calibration of the triad, without effects of temperature
+    start: initial bias, scale and misalignment, without effects of temperature
     up: directions of the positions, shape (n_positions, 3)
-    is_by_settled: whether the expected error of the settled bias limits the choice of a model
+    is_by_settled: whether a model must not increase the expected error of the settled bias
     has_pieces: whether the positions are pieces of rests, see `refit_checks`
     """
 
@@ -61,8 +61,8 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows, with or without a prior calibration.
 
-    If positions differ in temperature by more than their temperatures change, the curve is that
-    of the positions' means, unless drifts within the positions improve it on left-out data.
+    If the temperature changes more between positions than within them, the curve is fitted to the
+    means of the positions, unless a fit that also uses the drifts is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -73,11 +73,11 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
         windows = replace(windows, data=rests.constant_in(data, is_steady, is_settled))
     if problem.has_pieces or not rests.is_constant(windows, windows.data.position):
         return _regress(windows, problem)
-    # In a soak a lag of unknown size and the remaining drift of the temperature change the
-    # readings by similar amounts, so only the norms of the positions determine the curve.
+    # In a soak a lag of unknown size and the remaining drift of the temperature change |f| by
+    # similar amounts, so only the differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
-    # A regression reports progress from 0.7 to 0.95; each of two regressions gets half the range.
+    # One regression reports progress from 0.7 to 0.95: map this range to a half for each of two.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
@@ -90,18 +90,18 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
 
 
 def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = False) -> Fit:
-    """Fit the windows; `is_at_rest`: whether the columns are constant in each position."""
+    """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
-    # A prior calibration separates the drifts of bias and scale factor, also in one attitude.
+    # With a prior calibration, drifts in a single attitude separate bias and scale factor.
     is_bench = known is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
         data = replace(data, pose=rests.poses_of(windows, problem.up))
     if options.model == 'golovach' or is_bench or n_directions == 1 or data.n_poses:
-        # In one attitude a tilt of the support looks like a drift of the unit; in a pose to which
-        # the unit is returned, a tilt looks like an error of the next attitude. In Golovach's
-        # model tilts would absorb errors of the two sets.
+        # No tilts are fitted: in one attitude a tilt of the support is not separable from a drift
+        # of the unit, in a pose not from a change of the attitude, and in Golovach's model tilts
+        # would absorb errors of the two sets.
         data = replace(data, tilt=data.tilt[:, :0])
     data = replace(data, has_prior=known is not None)
     if not problem.is_by_settled:
@@ -110,7 +110,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Misalignments would explain turn-on offsets that are no unknowns: reduce the sd of M.
+        # Misalignments would explain turn-on offsets, which here are no unknowns: reduce their sd.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
@@ -120,7 +120,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         *others, widest = informative_priors(
             known, regression, state, windows.model, options, usual_ageing
         )
-        # A few windows may be fitted exactly: the noise is at least half of the known noise.
+        # Few windows may be fitted exactly: the noise is at least half of that of the calibration.
         window_s = windows.typical_count * known.unit.cycle_time_s
         least = 0.5 * float(np.min(known.noise_density_m_s2_sqrt_hz)) / window_s**0.5
         prior = replace(
@@ -151,7 +151,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     chosen = selected.posterior
     full_prior = replace(chosen.prior, bias_sd=prior.bias_sd, scale_sd=prior.scale_sd)
     selected = replace(selected, posterior=replace(chosen, prior=full_prior))
-    # The covariance has the full prior sd of slopes of the scale factor that no position shows.
+    # The covariance has the full prior sd of slopes of the scale, not that halved by `_steepest`.
     full, used = (
         _typical_slopes(steepness, limits, options)
         for limits in (STEEPEST, _steepest(n_directions))
@@ -177,7 +177,7 @@ def _initial_prior(
     least = 1e-5
     sigma = max(float(np.sqrt(np.mean(drift**2))), least)
     noise = _noise_in_1_hz(windows, start.scale)
-    # Without noise, the means of a position have an error by rounding, as by a mounting offset.
+    # If samples have no noise, rounding shifts the mean of a position as a mounting offset does.
     roundings = [interval.rounding_sd / start.scale for _, interval in windows.rests]
     rounding_sd = float(np.sqrt(np.mean(np.square(roundings))))
     misalignment_sd = misalignment_scale(noise)
@@ -188,8 +188,8 @@ def _initial_prior(
         column_sd=np.zeros((2, len(data.groups))),
         offset_sd=max(least, rounding_sd),
         sigma=np.full(3, sigma),
-        # The three axes of a sensor have similar scale factors: the mean of the prior is their
-        # geometric mean.
+        # The three axes of a sensor have similar scale factors: the prior mean of each axis is the
+        # geometric mean of the three.
         scale_mean=np.exp(np.mean(np.log(start.scale))) / start.scale,
         offset_scale=max(_mounting_scale(noise), 3.0 * rounding_sd),
         misalignment_scale=misalignment_sd,
@@ -204,15 +204,15 @@ def _initial_prior(
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior with a smaller misalignment sd for a noisy sensor in positions near the six
-    faces. Faces hardly determine the misalignment, and misalignments of some degrees would explain
-    other errors of the norms to second order. The published covariance keeps the misalignment sd
-    of the given prior.
+    Return the prior with a smaller misalignment sd if a noisy sensor has only positions near its
+    six faces. Faces hardly determine misalignments, and misalignments of some degrees would, to
+    second order, explain other errors of |f|. The published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
-    # Sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
+    # Smaller sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
     of_faces, sd = 2.5e-3, prior.misalignment_scale
-    # The RMS product of two components of `up` is below 0.1 near the faces, and 0.3 for edges.
+    # The RMS product of two components of `up` is below 0.1 if the vertical is near the axes, and
+    # 0.3 if the vertical is between two axes.
     if float(np.sqrt(np.mean(by_element**2))) >= 0.1 or sd <= of_faces:
         return prior
     return replace(prior, misalignment_sd=of_faces, unseen_misalignment_sd=sd)
@@ -220,9 +220,9 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
 
 def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOptions) -> Prior:
     """
-    Return the prior of the constants during the selection of the columns: its sd is five times the
-    largest error of a norm, but 5 % to 100 % of the sd of `prior`. In an incomplete model,
-    constants that few attitudes do not determine would change by large amounts.
+    Return the prior for the selection of the columns: the sds of bias and scale are five times the
+    largest error of |f|, but 5 % to 100 % of those of `prior`. With wider priors, bias and scale
+    would take large values in a model that lacks effects, as few attitudes do not determine both.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())
@@ -235,10 +235,10 @@ def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOp
 
 def _is_slow(windows: ThermalWindows) -> Bools:
     """
-    Return which columns, shape (m,), are lags that settle by less than 90 % in the longest bag.
+    Return which columns, shape (m,), have lags that settle by less than 90 % in the longest bag.
 
-    The effect of a slow column is nearly collinear with the curve, and its final value would be
-    extrapolated. `select` does not use slow columns; slow lags enter the covariance, see `claim`.
+    A slow column is nearly collinear with the curve, and its effect after settling would be
+    extrapolated. `select` does not use slow columns; the covariance includes them, see `claim`.
     """
     model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])
@@ -257,9 +257,9 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 def _mounting_scale(noise: float) -> float:
     """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
-    # Bounds of the prior's scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer
-    # MEMS; the tail of the Student prior allows for more. For almost no noise the lower bound of
-    # the prior's scale is below 30 ug, because an offset 1e6 times as large as the noise cannot be
+    # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer MEMS; the
+    # tail of the Student prior allows for larger offsets. With almost no noise the lower bound is
+    # 100 times the noise in 1 Hz, because an offset 1e6 times as large as the noise cannot be
     # estimated in double precision.
     least, most = max(min(3e-4, 100.0 * noise), 1e-7), 5e-3
     return float(np.clip(3.0 * noise, least, most))
@@ -274,7 +274,7 @@ def _candidates(
     is_bench: bool,
 ) -> Candidates:
     """
-    Return the columns that may take part, with the typical and largest sd of their weights.
+    Return the columns that the model may have, with the typical and largest sd of their weights.
 
     `is_bench`: whether only one of several attitudes was heated, see `rests`
     """
@@ -292,14 +292,14 @@ def _candidates(
         fixed[1] = parts[1] & np.isin(groups, (CURVE, PART))
     forced = np.isin(groups, options.forced)
     if options.model == 'golovach':
-        # All columns of both sets of Golovach's paper are kept. Ten times the largest prior sd of
-        # a slope is a flat prior.
+        # All columns of both sets of Golovach's paper are kept, with ten times the largest prior
+        # sd of a slope, which is almost a flat prior.
         slopes, forced, fixed = 10.0 * STEEPEST, np.ones_like(forced), np.ones_like(fixed)
     typical, largest = (
         np.outer(slope_sd, data.kelvins) * parts for slope_sd in (slopes, steepest)
     )
     if not windows.was_measured:
-        # Without a thermometer the slope over temperature is unknown: its full prior sd is kept.
+        # Without a thermometer the slopes over temperature keep their largest prior sd.
         typical[:, 0] = largest[:, 0] = STEEPEST
         forced[0] = fixed[:, 0] = True
     return Candidates(typical, largest, forced, fixed)
@@ -307,9 +307,9 @@ def _candidates(
 
 def _steepest(n_directions: int) -> Floats:
     """Return the largest prior sd of slopes of bias and scale, given the number of attitudes."""
-    # In two to eight attitudes the prior sd of the scale factor's slope is halved, because a tilt
-    # of the support explains a drift that the scale factor of a nearly level axis explains only by
-    # a slope of several hundred ppm/K.
+    # For two to eight attitudes the prior sd of the scale factor's slope is halved: a drift of a
+    # nearly level axis is more often a tilt of the support than a slope of its scale factor, which
+    # would have to be several hundred ppm/K.
     is_few = 1 < n_directions < POSITIONS_FOR_MISALIGNMENT
     return STEEPEST * (1.0, 0.5 if is_few else 1.0)
 
@@ -324,7 +324,7 @@ def _typical_slopes(steepness: float, steepest: Floats, options: FitOptions) -> 
 def _steepness(
     windows: ThermalWindows, start: ConstantCalibration, options: FitOptions, *, is_at_rest: bool
 ) -> float:
-    """Return the RMS change of the readings, as if the bias alone changed [m/s^2 per K]."""
+    """Return the RMS change of a reading per kelvin, taken for a change of bias [m/s^2 per K]."""
     data = windows.data
     within = within_positions(data.mean / start.scale, data.position)
     drift = float(np.sqrt(np.mean(within**2, axis=0)).max())
@@ -332,18 +332,18 @@ def _steepness(
         change = within_positions(windows.temperature[:, None], data.position)
         return drift / (float(np.sqrt(np.mean(change**2))) or 1.0)
     kelvins = float(np.std(windows.temperature)) or 1.0
-    # If each rest has one temperature, the drift appears as a difference between the rests' norms.
+    # If the temperature differs between rests only, the drift appears in differences of their |f|.
     force = (position_means(data) - start.bias) / start.scale
     sizes = sizes_of(windows, options)
     norms = np.linalg.norm(force, axis=1)
     errors = norms - sizes
     if np.ptp(sizes) > 0.0:
-        # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f|.
+        # Nonlinearity over |f| is not a thermal drift: subtract a cubic of |f| from the errors.
         powers = np.vander(sizes / sizes.max(), 4)
         errors -= powers @ np.linalg.lstsq(powers, errors, rcond=None)[0]
     if is_at_rest:
-        # The constants explain a part of the differences between norms: take the RMS change of the
-        # norms, per unit of all slopes, that the constants do not explain.
+        # Bias and scale explain a part of the differences of |f|. Divide the RMS error of |f| by
+        # the RMS change of |f|, per unit of each slope, that bias and scale do not explain.
         constants = norm_columns(force / norms[:, None])[:, :6]
         celsius = windows.temperature[data.edges[:-1]]
         of_slopes = (celsius - celsius.mean())[:, None] * constants
@@ -360,7 +360,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Estimate the triad without temperature: an ellipsoid or, with few attitudes, the scale."""
+    """Fit bias, scale and misalignment without temperature; with few attitudes the scale alone."""
     means = position_means(windows.data)
     gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)

@@ -3,9 +3,9 @@
 """
 Owns the covariance due to effects that the model lacks: a jackknife over the program's sections.
 
-The covariance of a fit contains only the errors due to noise. If the model lacks an effect, each
-section of the program requires other weights, and the error in another program is as large as the
-differences of weights, which the jackknife [1]_ estimates from fits without one section.
+The covariance of a fit contains only the errors due to noise. If the model lacks an effect, the
+best weights differ between sections of the program, and the error in another program is as large
+as these differences. The jackknife [1]_ estimates the differences from fits without one section.
 
 References
 ----------
@@ -24,7 +24,7 @@ from .regression import Posterior, Regression
 def jackknife_covariance(regression: Regression, posterior: Posterior) -> Floats:
     """
     Return the covariance of the unit's unknowns by the jackknife over the sections of the program,
-    shape (n_unit, n_unit); 0 if noise explains the changes of the unknowns without each section.
+    shape (n_unit, n_unit), or 0 if noise explains how the unknowns change without each section.
     """
     n = posterior.layout.n_unit
     last = int(regression.windows.section.max())
@@ -47,15 +47,14 @@ def jackknife_covariance(regression: Regression, posterior: Posterior) -> Floats
 
 def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     """
-    Return the squared changes of the unknowns without some windows, along the principal directions
-    that these windows measure, in units of the variance of these changes due to noise, (k,).
+    Return the squared changes of k combinations of the unknowns if some windows are left out,
+    divided by the variances of these changes due to noise, shape (k,).
 
     `change`: change of the unknowns, shape (n,), and `remaining`: root of the information of the
     remaining windows, ``remaining.T @ remaining``, shape (n, n), both in units of the fit's root
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
-    # A combination of the unknowns counts as measured by the windows left out, if these windows
-    # have more than 1e-6 of the information about the combination.
+    # Use combinations about which the left-out windows have more than 1e-6 of the information.
     is_measured = shares < 1.0 - 1e-6
     shares = np.maximum(shares[is_measured], 1e-12)
     return np.asarray((change @ directions[:, is_measured]) ** 2 * shares / (1.0 - shares))

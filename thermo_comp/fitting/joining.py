@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the joining of bags that are successive parts of one recording, which a recorder split.
+Owns the joining of bags that are successive parts of one recording, as split by a recorder.
 
-The unit stays switched on between the parts of a recording, so the parts share a turn-on, the lags
-continue, and a rest in which a part ends continues in the next part.
+The unit stays switched on between the parts of a recording, so the parts have one turn-on, the
+lags do not restart, and a rest at the end of a part continues in the next part.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from .sources import FitSource
 
 #: Longest gap or overlap of two parts of one recording [s]; switching off and on takes longer.
 CONTINUED_S = 3.0
-#: Number of windows before and after the end of a part that show the usual step between windows.
+#: Number of windows before the end of a part, and after it, whose steps are compared with the step
+#: between the two parts.
 _N_COMPARED = 20
 
 
@@ -31,7 +32,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
     for bag in sorted(bags, key=lambda bag: bag.start_ns):
         before = [recording for recording in recordings if _continues(recording[-1], bag)]
         if before:
-            # Simulated recordings may have equal stamps: join the part with the nearest readings.
+            # Simulated recordings may have equal stamps: choose that with the nearest readings.
             min(before, key=lambda recording: _step(recording[-1], bag)).append(bag)
         else:
             recordings.append([bag])
@@ -44,10 +45,10 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     """Whether a bag is the part of a recording that follows `part`."""
     gap_s = 1e-9 * (bag.start_ns - part.end_ns)
     is_alike = _is_alike(part.cycle_s, bag.cycle_s)
-    # Times of sections of known |f| count from the start of a bag: such a bag is not joined.
+    # A bag with known |f| is not joined, because times of |f| count from the start of the bag.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
-    # Short recordings whose stamps all begin at 0 overlap, but are not parts of one recording.
+    # The overlap is at most a tenth of a part: recordings whose stamps all begin at 0 exceed this.
     overlap_s = min(CONTINUED_S, 1e-10 * (part.end_ns - part.start_ns))
     is_next = -overlap_s < gap_s < max(CONTINUED_S, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)
@@ -116,7 +117,7 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
 
 
 def _readings(parts: Sequence[Readings]) -> Readings:
-    """Join a thermometer's readings in successive parts; keep readings with rising stamps."""
+    """Join the readings of a thermometer in successive parts; keep those with rising stamps."""
     stamp_ns = np.concatenate([part.stamp_ns for part in parts])
     value = np.concatenate([part.value for part in parts])
     newest = np.maximum.accumulate(stamp_ns)
@@ -131,7 +132,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
         is_alike = _is_alike(parts[0].window_s, part.window_s)
         for number, rest in enumerate(part.intervals):
-            # Windows shorter than those of the first part, as in a short part, are not whole.
+            # Windows of another length than in the first part, as in a short part, are not whole.
             n_whole = rest.n_whole if is_alike else 0
             shifted = replace(rest, time=rest.time + shift_s, n_whole=n_whole)
             is_first = bool(result) and number == 0
@@ -144,9 +145,9 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
-    Whether a rest continues in the next part: the gap is at most three windows long, and the step
-    of each axis between the parts is at most five times the RMS step from window to window or, as
-    most steps may be 0 by rounding, at most twice the largest step from window to window.
+    Whether a rest continues in the next part: the gap is at most three windows long, and on each
+    axis the step between the parts is at most five times the RMS step from window to window, or at
+    most twice the largest step from window to window (most steps may be 0 by rounding).
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
     means = before.mean[: before.n_whole][-_N_COMPARED:], after.mean[:_N_COMPARED]
@@ -158,7 +159,7 @@ def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -
 
 
 def _continued(before: StillInterval, after: StillInterval) -> StillInterval:
-    """Join two parts of a rest; drop an incomplete window between windows of full length."""
+    """Join two parts of a rest; drop an incomplete window if complete windows follow it."""
     is_whole = after.n_whole > 0 and len(before.time) <= before.n_whole + 1
     use = slice(before.n_whole if is_whole else None)
     rates = before.angular_rate, after.angular_rate

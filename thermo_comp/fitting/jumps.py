@@ -3,17 +3,17 @@
 """
 Owns the detection of jumps: steps in the reading of an accelerometer at rest.
 
-The reading of a sensor can step within one sample, if a die relaxes or a part slips. The
+The reading of a sensor can step within one sample, if a die relaxes or a piece slips. The
 temperature does not step, so no function of temperature describes a jump, and a fit to data across
-a jump distorts the whole curve. Two criteria distinguish a jump from a rotation of the unit. The
-samples beside a jump scatter no more than at rest. A jump changes the norm of the reading, which
+a jump gives a wrong curve. A jump differs from a rotation of the unit in two ways. The samples
+before and after a jump scatter no more than at rest. A jump changes the norm of the reading, which
 is almost constant in a rotation, or a gyroscope measures no rotation during the jump.
 
 If a sensor has a low-pass filter, neighbouring samples have a correlation r, and the slow noise of
 the samples hides a step. The noise of the differences ``a_i - r a_(i-1)`` is white (generalised
 least squares for first-order noise), so a step within one sample is significant in these
-differences. A shock that decays is also significant, so the mean levels of the quiet samples
-before and after a jump must differ, too.
+differences. A shock that decays is also significant there, so for a jump the mean levels of the
+quiet samples before and after the step must differ, too.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest part on either side of a gap that gives the mean level: [s], and number of samples.
+# Shortest time [s] and smallest number of samples, before or after a gap, for a mean level.
 _MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
-# Smallest number of samples on either side of a step that is tested.
+# Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8
-# Smallest significant ratio of a step to the sd of the step; the search over the time of a step
-# reaches a ratio of about 5 by chance.
+# Smallest significant ratio of a step to its sd. In noise without a step, the largest ratio over
+# all possible times of a step is about 5.
 _STEP_SDS = 8.0
 
 
@@ -44,10 +44,10 @@ class Jump:
 
     time: time of the step since the bag's first sample [s]
     duration_s: interval between the samples before and after the step [s]
-    step: change of the reading, per axis [input units]
-    along: change of the norm, that is, along the specific force [input units]
-    temperature_change, temperature_change_sd: step of the board's readings at the time of the jump
-        about a linear drift, and the step's sd [K], both NaN with too few readings
+    step: change of the reading of each axis [input units]
+    along: change of the norm of the reading, that is, along the specific force [input units]
+    temperature_change, temperature_change_sd: step of the board temperature at the time of the
+        jump, fitted with a linear drift, and sd of this step [K]; NaN with too few readings
     """
 
     time: float
@@ -60,13 +60,13 @@ class Jump:
 
 def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     """
-    Find the jumps between a bag's rests; the bag is read again if there are close rests.
+    Find the jumps between successive rests of a bag; the bag is read again if rests are compared.
 
-    Two rests are compared if the gap between them is at most 30 s, or 250 samples, and their
-    directions differ by less than 10 degrees.
+    Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
+    longer, and their directions differ by less than 10 degrees.
     """
     cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
-    # Slow samples have long gaps: rests end at borders of cells, usually of 30 samples or more.
+    # At a low sample rate gaps are long: rests end at borders of cells of usually 30 samples.
     longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -77,11 +77,11 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
         if after.start_ns - before.end_ns <= longest_ns and up @ other > np.cos(np.radians(10.0))
     ]
     quiet_sd = np.median([interval.sample_sd for interval in bag.intervals], axis=0)
-    # Samples that are equal at rest have at least the error of rounding.
+    # Samples without visible noise have at least the error of rounding.
     rounding_sd = np.median([interval.rounding_sd for interval in bag.intervals], axis=0)
     quiet_sd = np.maximum(quiet_sd, np.maximum(rounding_sd, 1e-9))
     beside = _beside_gaps(bag, gaps, [margin_s] * len(gaps))
-    # If the noise is correlated, the level beside a gap is a mean over more than `margin_s`.
+    # If the noise is correlated, the mean level before and after a gap needs more samples.
     margins = [max(_margin(part, quiet_sd), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)
@@ -93,7 +93,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
 def _beside_gaps(
     bag: ReducedBag, gaps: Sequence[tuple[float, float]], margins: Sequence[float]
 ) -> list[Floats]:
-    """Collect the samples beside each gap: time, reading, angular rate or NaN, shape (n, 7)."""
+    """Collect the samples in and around each gap: time, reading, angular rate or NaN, (n, 7)."""
     parts = [[np.zeros((0, 7))] for _ in gaps]
     for block in bag.source.blocks() if gaps else ():
         time, rate = (block.accel_stamp_ns - bag.start_ns) * 1e-9, angular_velocity(block)
@@ -106,7 +106,7 @@ def _beside_gaps(
 
 
 def _margin(samples: Floats, quiet_sd: Floats) -> float:
-    """Return the time of readings beside a gap [s]: 60 time constants of the noise, 10..100."""
+    """Return the time before and after a gap to use: 60 time constants of the noise, 10..100 s."""
     time, accel = samples[:, 0], samples[:, 1:4]
     if len(time) < 2 * _FEWEST_SAMPLES:
         return _MARGIN_S
@@ -122,26 +122,26 @@ def _examine(
     rounding_sd: Floats,
     bag: ReducedBag,
 ) -> Jump | None:
-    """Return the jump in the samples beside a gap between two rests, or None for no jump."""
+    """Return the jump in the samples around a gap between two rests, or None for no jump."""
     time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
         return None
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
-    # A step, unlike a shock, which decays, also changes the mean level of the quiet samples.
+    # A step changes the mean level of the quiet samples; a shock, which decays, does not.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     lasting_sd = quiet_sd * relative_sd * _correlation(residual, quiet_sd)
-    # Both levels beside a step are rounded.
+    # Two levels are rounded, the level before and the level after the step.
     by_rounding = 2.0**0.5 * rounding_sd
     lasting_sd = np.hypot(lasting_sd, by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
-    # With correlated noise the scatter within a cell underestimates the noise of means.
+    # If the noise is correlated, the scatter within a cell underestimates the noise of means.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = np.hypot(sd * relative_sd * _correlation(residual, sd), by_rounding)
     if r:
-        # At least half of the step must remain in the mean level, and the change of the mean level
-        # must exceed four standard deviations of this change.
+        # The change of the mean level must be at least half of the step within one sample, and
+        # exceed four of its standard deviations.
         is_step = (np.abs(step) > _STEP_SDS * step_sd) & (
             lasting * np.sign(step) > 0.5 * np.abs(step)
         )
@@ -151,7 +151,7 @@ def _examine(
     if not is_step.any():
         return None
     sides = accel[:at], accel[at:]
-    # The noise from differences of neighbouring samples does not depend on the drift.
+    # Differences of neighbouring samples give the noise without the drift.
     spread = np.sqrt(0.25 * sum(np.mean(np.diff(side, axis=0) ** 2, axis=0) for side in sides))
     middle = 0.5 * (sides[0].mean(axis=0) + sides[1].mean(axis=0))
     norm = float(np.linalg.norm(middle))
@@ -164,7 +164,7 @@ def _examine(
     is_no_turn = _turn(time, gyro, at) < 0.33 * needed_rad or (
         abs(along) > 0.2 * size and abs(along) > _STEP_SDS * along_sd
     )
-    # If the unit is handled, the samples scatter far more than twice the quiet noise.
+    # If someone handled the unit, the samples scatter by far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
     x, y, z = step.tolist()
@@ -174,7 +174,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the ratio of the sd of a mean to that under white noise of `sd`, at least 1, (3,)."""
+    """Return the sd of the mean of residuals / its value for white noise of `sd`, >= 1, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -188,7 +188,7 @@ def _correlation(residual: Floats, sd: Floats) -> Floats:
 
 
 def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> tuple[float, float]:
-    """Estimate the step of the board's readings at the time of a jump, and its sd [K]."""
+    """Estimate the step of the board temperature at the time `at`, and the sd of the step [K]."""
     time = np.asarray(bag.board.stamp_ns - bag.start_ns, dtype=np.float64) * 1e-9
     use = (time >= begin) & (time <= end)
     time, value = time[use], bag.board.value[use]
@@ -203,9 +203,9 @@ def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[in
     """
     Find the first sample after a step, and the lag-1 correlation of the noise.
 
-    The time of the step and the correlation are estimated in turn, three times. Noise with a
-    lag-1 correlation of 0.4 or less counts as white. The correlation is limited to 0.999, because
-    noise of a larger correlation is a random walk.
+    The time of the step and the correlation are estimated alternately, up to three times. Noise
+    with a lag-1 correlation of up to 0.4 counts as white. The correlation is limited to 0.999;
+    noise of a larger correlation is practically a random walk.
     """
     at, r = _place_of_step(time, accel, quiet_sd, 0.0), 0.0
     for _ in range(3):
@@ -226,9 +226,9 @@ def _place_of_step(time: Floats, accel: Floats, quiet_sd: Floats, r: float) -> i
     residual = whitened(accel, r)
     residual = residual - trend @ (trend.T @ residual)
     candidates = np.arange(_FEWEST_SAMPLES, n - _FEWEST_SAMPLES + 1)
-    # The step H_k = (i >= k), whitened for the lag-1 correlation r, is 1 at k and 1 - r after k.
-    # The product of the whitened step H_k with a residual is a sum over the samples from k on; the
-    # square of the whitened step H_k without the trend follows from sums of the trend.
+    # A unit step at sample k, whitened for the lag-1 correlation r, is 1 at k and 1 - r after k.
+    # Its product with a residual is a sum over the samples from k on. The square of the whitened
+    # step, after removal of the trend, follows from such sums of the trend.
     tail = _sums_behind(residual, r)[candidates]
     trend_tail = _sums_behind(trend, r)[candidates]
     square = 1.0 + (1.0 - r) ** 2 * (n - candidates - 1) - (trend_tail**2).sum(axis=1)
@@ -242,13 +242,13 @@ def _sums_behind(rows: Floats, r: float) -> Floats:
 
 
 def whitened(values: Floats, r: float) -> Floats:
-    """Whiten rows, shape (n, k), of first-order noise with lag-1 correlation r."""
+    """Whiten k series, (n, k), whose noise is of first order with lag-1 correlation r."""
     first = np.sqrt(1.0 - r * r) * values[:1]
     return np.concatenate((first, values[1:] - r * values[:-1]))
 
 
 def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floats, float, Floats]:
-    """Estimate a step about a drift, the step's sd in units of the noise, and residuals (n, k)."""
+    """Fit a step and a linear drift: return the step, its sd / noise sd, residuals (n, k)."""
     trend = _trend(time, r)
     jump = whitened((time >= at).astype(np.float64)[:, None], r)[:, 0]
     jump -= trend @ (trend.T @ jump)
@@ -259,13 +259,13 @@ def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floa
 
 
 def _trend(time: Floats, r: float = 0.0) -> Floats:
-    """Return orthonormal whitened columns of a level and a drift, shape (n, 2)."""
+    """Return a constant and a linear drift, whitened and made orthonormal, shape (n, 2)."""
     columns = np.column_stack((np.ones(len(time)), time - time.mean()))
     return np.asarray(np.linalg.qr(whitened(columns, r))[0])
 
 
 def _turn(time: Floats, gyro: Floats, at: int) -> float:
-    """Return the angle of rotation within 1 s of a step [rad], by the gyroscope about medians."""
+    """Return the rotation within 1 s of a step [rad], by the rate less its median on each side."""
     about_level = [side - np.median(side, axis=0) for side in (gyro[:at], gyro[at:])]
     angles = np.concatenate(about_level)[1:] * np.diff(time)[:, None]
     return float(np.linalg.norm(angles[np.abs(time[1:] - time[at]) <= 1.0].sum(axis=0)))

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the known |f| of a bag that is not at 1 g, from the user or from the bag's metadata.
+Owns the known |f| of a bag in which |f| is not g, from the user or from the bag's metadata.
 
-|f| is given as a single value, as a table of sections, or as a rotation rate with a radius.
+|f| is given as a single value, as a table of time sections, or as a rotation rate with a radius.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class Section(NamedTuple):
 
 class Magnitude(NamedTuple):
     """
-    The known |f| of a rest [m/s^2], in two parts.
+    The known |f| of a rest, ``hypot(still, spin)`` [m/s^2].
 
-    still: |f| without rotation [m/s^2]; None for gravity
+    still: |f| without the rotation; None for gravity
     spin: centripetal acceleration w^2 r at the stated radius
-    sd: sd of |f| without the part due to the radius
+    sd: sd of |f|, except for the error of the radius
     """
 
     still: float | None
@@ -78,13 +78,13 @@ class KnownForce:
     radius_sd: float = 0.0
 
     def radius_part(self, size: Magnitude, gravity: float) -> float:
-        """Return the part of the sd of |f| due to the radius [m/s^2]."""
+        """Return the sd of |f| due to the error of the radius [m/s^2]."""
         if not self.radius:
             return 0.0
         return size.spin**2 / size.norm(gravity) * self.radius_sd / self.radius
 
     def of(self, start_ns: int, end_ns: int, first_ns: int) -> Magnitude:
-        """Return |f| of a rest, given its stamps and the stamp of the bag's first sample."""
+        """Return |f| of a rest between two stamps; `first_ns`: stamp of the bag's first sample."""
         if self.stamp_ns is None or self.rate is None:
             middle_s = (0.5 * (start_ns + end_ns) - first_ns) * 1e-9
             for section in self.sections:
@@ -127,16 +127,15 @@ class ForceOptions:
             raise ValueError('`radius` and `radius_sd` are given without `rotation`')
 
 
-#: Options without any entry: |f| follows from the metadata of the bags, or is gravity.
+#: Options if the user states nothing: |f| follows from the metadata of the bags, or is gravity.
 USUAL_FORCE = ForceOptions()
 
 
 def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce | None:
     """
-    Return the known |f| of a bag, from the user or else from its metadata; None for gravity.
+    Return the known |f| of a bag from the user's options (`asked`) or its metadata; None for g.
 
-    Raises FitError if the text of |f| cannot be parsed, or the topic of the rotation rate has no
-    messages.
+    Raises FitError for a text of |f| that cannot be parsed, and for a rotation topic without data.
     """
     metadata = info.metadata
     try:
@@ -149,8 +148,8 @@ def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownFo
             radius, sd = float(metadata.get(RADIUS, 'nan')), float(metadata.get(RADIUS_SD, '0'))
             if not (0.0 < radius < math.inf and 0.0 <= sd < math.inf):
                 raise ValueError(
-                    f'metadata with {ROTATION} need a positive {RADIUS}, and a {RADIUS_SD} of 0 '
-                    'or more, if any [m]'
+                    f'metadata with {ROTATION} need a positive {RADIUS} [m]; {RADIUS_SD} [m] may '
+                    'be absent, or must be 0 or positive'
                 )
             return _rotating(path, info, ForceOptions(None, metadata[ROTATION], radius, sd))
         if MAGNITUDE in metadata:
@@ -162,8 +161,8 @@ def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownFo
 
 def parse_sections(text: str) -> tuple[Section, ...]:
     """
-    Read a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, in seconds since the first
-    sample and m/s^2. A semicolon also ends a line of the text; a # begins a comment.
+    Read |f| from a text: a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, with times
+    since the bag's first sample [s]. A semicolon also ends a line; a # begins a comment.
     """
     lines = text.replace(',', ' ').replace(';', '\n').split('\n')
     rows = [_numbers(words) for line in lines if (words := line.split('#')[0].split())]
@@ -182,7 +181,7 @@ def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Sect
         raise ValueError(
             f'a line of |f| must end after its begin {begin_s:g} s, got the end {end_s:g} s'
         )
-    # The limit 1e7 m/s^2 is above the acceleration of a launch from a gun.
+    # The limit 1e7 m/s^2, above the acceleration in a gun, detects typing errors.
     if not (0.0 < size < 1e7 and 0.0 <= sd < size):
         raise ValueError(
             f'a specific force must be above 0 and its sd smaller, got {size:g} +- {sd:g} m/s^2'
@@ -202,7 +201,7 @@ def _numbers(words: list[str]) -> list[float]:
 
 
 def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
-    """Read |f| as a value with unit, or from a table whose lines may begin with a bag's name."""
+    """Read |f| from a value with unit, or from a table whose lines may begin with a bag's name."""
     table = Path(text)
     if not table.is_file():
         try:
@@ -230,7 +229,7 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
 
 
 def _rotating(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownForce:
-    """Read the rotation rate of a bag; return the known |f| by this rate and the radius."""
+    """Read the rotation rate of a bag; return the known |f|, from this rate and the radius."""
     wanted, field = split_field(asked.rotation or '')
     names = [name for name in info.topics if is_called(name, wanted)]
     if len(names) != 1:

@@ -3,11 +3,11 @@
 """
 Owns the lack of fit: the excess of the left-out errors over the published covariance.
 
-The lack of fit per regime and temperature is the mean square of the left-out drift less the
-published variance of this drift. The lack of fit covers effects that no column describes, such as
-a kink of the curve, a tilt of the support or a drift of the bias. Models within one standard error
-of the chosen model contribute half of the largest squared difference between their drifts and that
-of the chosen model.
+The lack of fit in a regime, near a temperature, is the mean square of the left-out drift less the
+noise and the published variance of this drift. The lack of fit covers effects that no column
+describes, such as a kink of the curve, a tilt of the support or a drift of the bias. For models
+whose score is within one standard error of that of the chosen model, half of the largest squared
+difference between their drift and that of the chosen model is added.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .unknowns import State
 
 
 def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:
-    """Return the lack of fit at some temperatures in the static and the dynamic regime, or ()."""
+    """Return the lack of fit at up to 5 temperatures, in static and in dynamic regime, or ()."""
     windows, regression, selected = fit[:3]
     prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
     noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.variance)
@@ -44,7 +44,7 @@ def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[La
 def drift_variance(
     regression: Regression, state: State, layout: Layout, covariance: Floats
 ) -> Floats:
-    """Return the variance of the drift of each window by a covariance of the unit, (n, 3)."""
+    """Return the variance of the drift of each window due to `covariance`, shape (n, 3)."""
     position = regression.windows.position
     columns = within_positions(regression.columns, position)
     by_weights = layout.by_weights(columns, regression.effects(state).force[position])

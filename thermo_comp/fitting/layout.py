@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Layout:
     """
-    Indices of the unknowns in the vector of parameters; those of the unit come first.
+    Indices of the unknowns in the vector of parameters; the unknowns of the unit come first. The
+    names are those of `State`.
 
     axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
     weights, nonlinear: indices of the weights, shape (2, 3, m), and of the nonlinear coefficients,
@@ -28,9 +29,9 @@ class Layout:
     start, turn_on: unknowns of each bag: initial lag states, and the bias offset of its turn-on,
         shapes (n_bags, r) and (n_bags, 3) or (n_bags, 0)
     own: unknowns of each position: up, stretch, offset, tilt, shape (n_positions, k)
-    pose_of: pose of each position, -1 for none
-    bag: bag of each position
-    n_unit, n: number of unknowns of the unit, and of all
+    pose_of: number of each position's pose, -1 without one
+    bag: number of each position's bag
+    n_unit, n: number of unknowns of the unit, and number of all unknowns
     """
 
     axis: Ints
@@ -63,7 +64,7 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Indices of radius, misalignment and poses, which all axes share; the unit's last."""
+        """Indices of radius, misalignment and poses, common to all axes: the unit's last ones."""
         return np.concatenate((self.radius, self.misalignment, self.pose.ravel()))
 
     @property
@@ -74,9 +75,9 @@ class Layout:
     @cached_property
     def columns(self) -> Ints:
         """
-        The unknowns of each axis in the order of `Tangent`, as indices of the columns of a
-        position's equations, which are the unknowns of the position, of the bag, of the unit and
-        the residual, shape (3, k).
+        Indices of the columns of a position's equations in the order of `Tangent`, for each axis,
+        shape (3, k). A position's equations have columns for the unknowns of the position, of its
+        bag and of the unit, and for the residual.
         """
         n_own, r = self.own.shape[1], self.start.shape[1]
         starts = np.tile(n_own + np.arange(r), (3, 1))
@@ -86,23 +87,23 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """The unknowns of the unit that each axis has, then the index of the residual, (3, k)."""
+        """Indices of the unit's unknowns in the equations of each axis, then n_unit, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 
     @property
     def n_local(self) -> int:
-        """Number of unknowns of each axis that belong to positions and bags."""
+        """Number of unknowns of a position and its bag in the equations of one axis."""
         return len(self.of_axis[0]) + len(self.start[0]) + len(self.turn_on[0]) // 3
 
     @cached_property
     def of_bag(self) -> Ints:
-        """The unknowns of each bag, shape (n_bags, r + 3) or (n_bags, r)."""
+        """Indices of the unknowns of each bag, shape (n_bags, r + 3) or (n_bags, r)."""
         return np.hstack((self.start, self.turn_on))
 
     @cached_property
     def of_axis(self) -> Ints:
-        """The unknowns of a position that each axis has, as column indices of `own`, (3, k)."""
+        """Column indices, in `own`, of a position's unknowns in each axis' equations, (3, k)."""
         first = self.up.shape[1] + self.stretch.shape[1]
         before, after = range(first), range(first + 3, self.own.shape[1])
         return np.array([[*before, first + axis, *after] for axis in range(3)])
@@ -114,8 +115,8 @@ class Layout:
 
     def by_weights(self, columns: Floats, force: Floats) -> Iterator[tuple[Floats, Ints]]:
         """
-        Yield the derivatives of readings w.r.t. the weights of each axis, and the indices of the
-        weights, given columns, (n, m), and the force along the axes, shape (n, 3) or (3,).
+        Yield, for each axis, the derivatives of readings w.r.t. the active weights, and indices of
+        these weights; `columns`: shape (n, m); `force` along the axes: shape (n, 3) or (3,).
         """
         in_bias, in_scale = self.used
         for axis in range(3):

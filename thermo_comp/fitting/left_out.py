@@ -3,17 +3,17 @@
 """
 Owns the score of a model on data that took no part in the fit, and the comparison of two scores.
 
-Each mounting (a position, or the rests into which knocks have cut a position) is left out in turn,
-and so is each section and each half of the program, in all positions at once. Left-out halves
-detect columns that interpolate between the sections of one program and fail in another. The
-left-out windows are corrected as the node would correct them: with the unit's parameters alone,
-initial lag states at their prior mean, no mounting offsets and no tilts of the support.
-The errors are the drift (each axis less its mean over the position, which does not depend on the
-attitude) and ``|f| - g`` of the position, if the other positions determine it.
+Each mounting (a position, or the rests into which knocks divide a position) is left out in turn,
+and so is each section and each half of the chamber's program, in all positions at once. Left-out
+halves detect columns that interpolate between the sections of one program but would fail in
+another program. The left-out windows are corrected as the node would correct them: with the unit's
+parameters alone, initial lag states at their prior mean, no mounting offsets and no tilts of the
+support. The errors are the drift (the force along each axis less its mean over the position, which
+does not depend on the attitude) and, if the other positions determine |f|, ``|f| - g``.
 
-A model is better if it reduces the error by more than the standard error over the folds, both for
-positions and for sections of the program. A model that describes only one recording fails for
-positions, a model that describes only one program fails for sections.
+A model is better than another model if its error is smaller by more than the standard error over
+the folds, both for positions and for sections of the program. A model that describes only one
+recording fails for positions, a model that describes only one program fails for sections.
 
 References
 ----------
@@ -40,10 +40,10 @@ from .unknowns import State
 
 # Smallest number of windows of a position for a score of the position's drift.
 _FEWEST_WINDOWS = 8
-# Largest log ratio of two mean square errors that count as equal: 5 % of an RMS.
+# Largest log ratio of two mean square errors that count as equal: 5 % of an RMS error.
 _NEGLIGIBLE_LOG_RATIO = 0.1
-# Largest ratio of an RMS error to the noise that counts as noise: in a soak, changes of the
-# temperature by hundredths of a kelvin, whose lag is not known, add to the white noise.
+# Ratio of an RMS error to the white noise up to which noise explains the error: in a soak, lags of
+# unknown size behind temperature changes of hundredths of a kelvin add to the white noise.
 _NOISE_RATIO = 1.7
 
 
@@ -61,7 +61,7 @@ class Folds:
 
     @classmethod
     def of(cls, square: Floats, windows: Floats, fold: Ints) -> Folds:
-        """Average the mean squares of positions, shape (p,), NaN if not scored, over each fold."""
+        """Average mean squares of positions, (p,), over the positions of each fold; skip NaN."""
         known = np.isfinite(square)
         count = np.bincount(fold, np.where(known, windows, 0.0))
         total = np.bincount(fold, np.where(known, square * windows, 0.0))
@@ -78,13 +78,13 @@ class Folds:
 
     def gain_of(self, other: Folds) -> tuple[float, float] | None:
         """
-        Return the log ratio of the mean square error to that of another model, and its standard
-        error, over the folds that both models have, or None without common folds.
+        Return the log ratio of the mean square error to that of another model (positive if the
+        other model is better), and the standard error of the log ratio, over the folds that are
+        scored for both models, or None if there are none.
 
-        There are two estimates: the mean over folds of their log ratios, robust to a few large
-        folds, and the log ratio of the sums with its jackknife error, robust to small folds. The
-        more significant of the two estimates of the log ratio is returned, or 0 if their signs
-        differ.
+        There are two estimates: the mean over folds of their log ratios, robust to few folds of
+        large errors, and the log ratio of the sums over folds with its jackknife error, robust to
+        folds of small errors. The more significant estimate is returned, or 0 if the signs differ.
         """
         known = np.isfinite(self.square) & np.isfinite(other.square)
         n = int(known.sum())
@@ -93,8 +93,8 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The standard error of a single fold is unknown: take the smallest difference that
-            # counts, `_NEGLIGIBLE_LOG_RATIO`.
+            # The standard error of a single fold is unknown, and set to the smallest log ratio
+            # that is not negligible.
             return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
@@ -119,15 +119,15 @@ class Score:
 
     positions, sections: drift of left-out positions, and of left-out sections of the program
     norms: ``|f| - g`` of left-out positions whose norm the other positions determine
-    force: each window corrected by a fit without its position, NaN if the norm of this position is
-        not scored, shape (n, 3)
+    force: force in each window, corrected by a fit without the window's position; NaN if the norm
+        of this position is not scored, shape (n, 3)
     drift: drift of each window by a fit without its position or, if that fit does not determine
         the drift, without its section, shape (n, 3)
     halves: drift of left-out halves of the program, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
-    by_thermometer: error of a window by a coarse board thermometer, RMS of the axes [m/s^2]
-    settled: expected error of the bias at settled temperatures [m/s^2], see `settled_bias`; 0 if
-        it is not compared
+    by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
+    settled: expected error of the bias at settled temperatures [m/s^2], see `settled_bias`; 0 in a
+        fit that does not limit this error
     """
 
     positions: Folds
@@ -169,31 +169,29 @@ class Score:
 
 
 def is_better(before: Score, after: Score, *, by_halves: bool = True) -> bool:
-    """
-    Whether the model of `after` is better on left-out data by more than the standard error;
-    `by_halves`: whether the error of left-out halves counts, which limits the number of columns.
-    """
+    """Whether the model of `after` is better on left-out data than that of `before` (`gain`)."""
     return gain(before, after, by_halves=by_halves) > 0.0
 
 
 def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
-    Return the gain of a model if the gain exceeds its standard errors, else 0.
+    Return the gain of the model of `after` over that of `before` if it is significant, else 0.
 
-    The gain is the sum of the log gains of the drift of positions and of sections. If the drifts
-    of both models are equal, the gain is the log gain of the norms of left-out positions, which
-    must exceed two standard errors.
+    The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
+    sections. If the drifts of both models are equal, the gain is the log ratio of the norms of
+    left-out positions, which must exceed two standard errors. `by_halves`: whether an increased
+    error of left-out halves of the program, a sign of too many columns, excludes a gain.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
-    # The drift of one kind of folds need not decrease if white noise explains it and the drift of
-    # the other kind decreases: bags of soaks do not show the effects of ramps.
+    # The drift of positions, or of sections, need not decrease if white noise explains it, because
+    # left-out bags of soaks contain no effects of ramps.
     must_gain = [
         gain
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
         if gain and (gain[0] > gain[1] or not second.is_noise(first, after.noise))
     ]
-    # The RMS error of left-out halves of the program may rise by a quarter, its usual scatter.
+    # The RMS error of left-out halves may rise by a quarter: it usually scatters by this ratio.
     is_worse_by_halves = by_halves and after.halves.rms > 1.25 * before.halves.rms
     if is_worse_by_norms(before, after) or is_worse_by_halves:
         return 0.0
@@ -210,16 +208,16 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
 
 def is_worse_by_norms(before: Score, after: Score) -> bool:
-    """Whether the second model has larger left-out norms, by more than the standard error."""
+    """Whether errors of left-out norms are larger in `after`, by more than a standard error."""
     norms = before.norms.gain_of(after.norms)
     return norms is not None and norms[0] < -norms[1]
 
 
 def is_undecided(before: Score, after: Score) -> bool:
     """
-    Whether left-out data do not decide between two models, of which the second is not better:
-    their drifts are equal, and they have no common norms, or the norms of the second model are
-    smaller by one to two standard errors.
+    Whether left-out data do not decide between two models, of which `after` is not better: the
+    drifts are equal, and errors of norms are not scored for both models, or are smaller in `after`
+    by one to two standard errors.
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)
@@ -234,9 +232,9 @@ def is_near(chosen: Score, other: Score) -> bool:
 
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
-    Return the log gains of `Score.kinds`, None for a drift or norms that errors of a coarse
-    thermometer explain. Errors of a coarse thermometer repeat in all bags of one program: a model
-    can explain these errors in left-out bags, and fails in another program.
+    Return the log ratios of `Score.kinds` (`Folds.gain_of`), None for a kind whose errors a coarse
+    thermometer explains. Errors of a coarse thermometer repeat in all bags of one program: a model
+    of these errors is better on left-out bags, but fails in another program.
     """
     is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)
@@ -271,7 +269,7 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
 def _by_positions(
     regression: Regression, posterior: Posterior
 ) -> tuple[Folds, Folds, Floats, Floats]:
-    """Leave out each mounting; return folds of drift and norm, corrected windows, their drift."""
+    """Leave out each mounting; return folds of drift and norm, corrected force, and drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
     point = regression.at(posterior.state, posterior.prior)
     edges = windows.edges
@@ -298,15 +296,15 @@ def _by_positions(
 
 
 def _mean(values: Floats, weights: Floats) -> Floats:
-    """Average windows as `np.average`, without checks, which would take longer than the sums."""
+    """Average windows as `np.average` does, but without its checks, which are slow."""
     share = weights.reshape(-1, *[1] * (values.ndim - 1))
     return np.asarray(np.sum(values * share, axis=0) / np.sum(share, axis=0))
 
 
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     """
-    Return the state after one Gauss-Newton step with other normal equations (`matrix`) of the
-    unit's unknowns, and the root of the unit's covariance, see `Posterior`.
+    Return the state after a Gauss-Newton step of the unit's unknowns with the normal equations
+    `matrix` instead of those of `point`, and the root of the unit's covariance, see `Posterior`.
     """
     step, factor = point.unit_step(matrix)
     step = np.pad(step, (0, point.layout.n - point.layout.n_unit))
@@ -315,8 +313,8 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
 
 def _is_determined(by_others: float, by_all: float) -> bool:
     """
-    Whether the variance of a position's norm or drift in a fit without the position is below ten
-    times the variance in the fit of all positions, including mounting offset and noise.
+    Whether the variance of a position's norm or drift by a fit without this position (`by_others`)
+    is below ten times the variance by all positions, with mounting offset or noise (`by_all`).
     """
     return by_others < 10.0 * by_all
 
@@ -326,7 +324,7 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True
-    # Every n-th window of the position is used: 50 windows are sufficient for the variance.
+    # Use every k-th window of the position: 50 windows are sufficient for the variance.
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
@@ -360,9 +358,9 @@ def _by_sections(
 ) -> tuple[Folds, Floats]:
     """
     Score the drift of left-out sections, about the mean of those windows of the position that stay
-    in the fit, by Gauss-Newton steps from the fit of all data.
+    in the fit. Each fit without sections is `n_steps` Gauss-Newton steps from the fit of all data.
 
-    `folds`: the sections left out at once, in all positions; `is_within`: score only windows at
+    `folds`: each fold's sections, left out in all positions; `is_within`: score only windows at
     temperatures that occur in the fit
     """
     windows, share = regression.windows, regression.weight / regression.windows.weight

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the check of samples at rest that are left out because their temperature is not known."""
+"""Owns the check for samples at rest that are left out because their temperature is unknown."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from .windows import ThermalWindows, Track
 if TYPE_CHECKING:
     from .reduction import ReducedBag
 
-# Smallest lost share of the time at rest that is reported.
+# Smallest share of the time at rest without temperature that is reported.
 _LEAST_LOST_SHARE = 0.1
 
 
 class _Missing(NamedTuple):
     """
-    Numbers of samples at rest: all; without a temperature before the estimate of the board has
-    settled; without a temperature between the first and the last reading of all thermometers.
+    Numbers of samples at rest.
+
+    n_still: all samples
+    n_unsettled: samples before the estimate of the board temperature is accurate
+    n_between: later samples without a temperature, between first and last readings
     """
 
     n_still: float
@@ -31,7 +34,7 @@ class _Missing(NamedTuple):
 
 
 def judge_missing(windows: ThermalWindows) -> Iterator[Finding]:
-    """Report the samples at rest that are left out because their temperature is not known."""
+    """Report which share of the time at rest is left out without a temperature, and why."""
     used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
     if not windows.has_temperature or not used_bags:
         return
@@ -55,13 +58,13 @@ def judge_missing(windows: ThermalWindows) -> Iterator[Finding]:
         yield advice(
             'steps',
             f'{100.0 * unsettled:.0f} % of the time at rest is left out: the board temperature is '
-            f'less certain than later until the reading of temperature/board{steps} changes for '
+            f'not accurate before the reading of temperature/board{steps} changes for '
             'the first time in a bag; begin with a ramp, or use a finer thermometer',
         )
 
 
 def _missing(bag: ReducedBag, track: Track) -> _Missing:
-    """Count the samples of a bag at rest without a temperature."""
+    """Count the samples at rest of one bag, see `_Missing`."""
     grid = track.start_s + track.step_s * np.arange(len(track.states))
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s, end_s = (
@@ -84,7 +87,7 @@ def _missing(bag: ReducedBag, track: Track) -> _Missing:
 
 
 def _longest_pause(bags: Sequence[ReducedBag]) -> str:
-    """Name the thermometer with the longest time from one change of its reading to the next."""
+    """Describe the longest time between two changes of a thermometer's reading."""
     pauses = []
     for bag in bags:
         for name, readings in bag.temperatures.items():

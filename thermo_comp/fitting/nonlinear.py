@@ -3,9 +3,9 @@
 """
 Owns the known |f| of positions that are not at 1 g, and the choice of the nonlinear terms.
 
-A nonlinear term that the data determine is removed if it lowers the log evidence, or if it does
-not improve the left-out norms. A nonlinear term that the data do not determine stays near its
-prior, with the prior sd.
+A nonlinear term that the data determine is removed if it lowers the log evidence, or if |f| of
+left-out positions is not better with the term. A nonlinear term that the data do not determine
+keeps its prior mean and sd approximately.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from .selection import Selected
 from .unknowns import State
 from .windows import ThermalWindows
 
-# Smallest effective parameters, per coefficient, of a nonlinear term that the data determine: 0.99
-# means that the posterior sd is a tenth of the prior sd.
+# A coefficient counts as determined by the data if its effective parameters exceed 0.99, that is,
+# if its posterior sd is less than a tenth of its prior sd.
 _DETERMINED_SHARE = 0.99
 
 _Active = frozenset[int]  # indices of the nonlinear coefficients in use
@@ -43,12 +43,12 @@ class Forces:
     """
     The known magnitude ``|f|^2 = still^2 + spin^2`` of each position, (n_positions,) [m/s^2].
 
-    kinds: the k nonlinear terms that may take part, in the order of a calibration file; the order
-        of the coefficients is all kinds at the reference temperature, then all kinds per kelvin
+    kinds: the k nonlinear terms of the model, in the order of a calibration file; the coefficients
+        at the reference temperature of all kinds precede the changes per kelvin of all kinds
     t: board temperature of each window less the reference, shape (n,) [K]
-    still: |f| without rotation; gravity if the unit rotates
+    still: stated |f| of a unit that does not rotate, or gravity
     spin: centripetal acceleration w^2 r at the stated radius; 0 without rotation
-    sd: standard deviation of |f| without the part due to the radius
+    sd: standard deviation of |f|, except for the error of the radius
     radius_sd: relative standard deviation of the radius; 0 if the radius is not estimated
     """
 
@@ -71,7 +71,7 @@ class Forces:
 
     @property
     def sizes(self) -> Floats:
-        """The |f| of each position as stated, without estimated errors."""
+        """The stated |f| of each position, without corrections by the fit."""
         return np.hypot(self.still, self.spin)
 
     @property
@@ -80,7 +80,7 @@ class Forces:
         return np.maximum(self.sd / self.sizes, 1e-12)
 
     def terms(self, force: Floats) -> tuple[Floats, Floats]:
-        """Return each nonlinear term and its slope, per unit coefficient, (*force.shape, k)."""
+        """Return each nonlinear term of coefficient 1, and its derivative, (*force.shape, k)."""
         each = {
             'square': (force**2, 2.0 * force),
             'odd_square': (np.abs(force) * force, 2.0 * np.abs(force)),
@@ -91,7 +91,7 @@ class Forces:
         return value, slope
 
     def linearise(self, x: Floats, nonlinear: Floats, rows: slice) -> Floats:
-        """Return the readings of windows, shape (n, 3), without the nonlinear terms."""
+        """Return the force of windows, shape (n, 3), without the nonlinear terms."""
         k = len(self.kinds)
         at = nonlinear[:, :k] + self.t[rows, np.newaxis, np.newaxis] * nonlinear[:, k:]
         k2, kq, k3 = (
@@ -155,16 +155,15 @@ def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
 
 
 def starting_sd(forces: Forces, options: FitOptions) -> Floats:
-    """Return the initial prior sd of the nonlinear terms: 0 for the odd square, (2 k,)."""
+    """Return the prior sd of the first fit, with an sd of 0 for the odd square, shape (2 k,)."""
     is_initial = np.array([kind != 'odd_square' for kind in forces.kinds] * 2)
     return np.asarray(prior_sd(forces.kinds, options) * is_initial)
 
 
 class _TermFits:
-    """Fits with different nonlinear coefficients, and the gain of a fit from some of them."""
+    """Fits with different sets of nonlinear coefficients, and comparisons of these fits."""
 
     def __init__(self, regression: Regression, selected: Selected, sd: Floats) -> None:
-        """Set the prior sd of the nonlinear coefficients, shape (2 k,)."""
         self._regression, self._begin, self._sd = regression, selected.posterior, sd
         self._n_kinds = len(sd) // 2
         self.posterior, self.score = cache(self._posterior), cache(self._score)
@@ -178,25 +177,25 @@ class _TermFits:
         return score_of(self._regression, self.posterior(used))
 
     def term(self, kind: int) -> _Active:
-        """Return the indices of a term's coefficients: at the reference, and per kelvin."""
+        """Return the indices of a term's coefficient at the reference, and of that per kelvin."""
         return frozenset((kind, self._n_kinds + kind))
 
     def loss(self, used: _Active, dropped: _Active) -> float:
-        """Return the loss of log evidence without some nonlinear coefficients."""
+        """Return the loss of log evidence if the coefficients `dropped` are removed."""
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the log gain of left-out norms from some coefficients, and its standard error."""
+        """Return the log ratio (`Folds.gain_of`) of left-out norms without and with `dropped`."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
-        """Whether the data determine a nonlinear coefficient."""
+        """Whether the data determine a nonlinear coefficient, in the mean of the axes."""
         posterior = self.posterior(used)
         share = posterior.determined[posterior.layout.nonlinear[:, at]]
         return bool(share.mean() > _DETERMINED_SHARE)
 
     def thinned(self, used: _Active) -> _Active:
-        """Remove nonlinear terms that the data determine and that lower the log evidence."""
+        """Remove the terms that the data determine and that lower the log evidence."""
         kinds = [at for at in sorted(used) if at < self._n_kinds and self.is_determined(used, at)]
         losses = {at: self.loss(used, self.term(at)) for at in kinds}
         worst = min(losses, key=losses.__getitem__, default=None)
@@ -209,8 +208,8 @@ def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
     """
-    Choose the nonlinear terms, and the terms whose coefficient depends on temperature; with a
-    prior calibration the fit keeps the terms of the prior.
+    Choose the nonlinear terms, and those whose coefficient depends on temperature. With a prior
+    calibration there is no choice, because the fit keeps the terms of the prior.
     """
     forces = regression.forces
     if forces is None or options.prior is not None:
@@ -260,7 +259,7 @@ def of_file(
         return None
     known = options.prior.nonlinearity if options.prior else None
     sizes = forces.sizes
-    # The calibrated range of |f| is 1 % wider at either end than the range of the positions.
+    # The calibrated range of |f| extends 1 % beyond the |f| of the positions at both ends.
     low, high = 0.99 * float(sizes.min()), 1.01 * float(sizes.max())
     if known:
         lower, upper = known.force_range_m_s2

@@ -3,8 +3,8 @@
 """
 Owns the options of a fit and their checks, normal gravity, and the choice of curve families.
 
-An error of the local gravity changes all three scale factors by the same ratio and is not visible
-in the residuals, so the user must state gravity.
+An error of the stated gravity changes all three scale factors by the same ratio, without an effect
+on the residuals. A fit cannot estimate gravity, so the user must state it.
 
 References
 ----------
@@ -45,7 +45,7 @@ GROUPS = (
     'part',
     *dict.fromkeys(column.group for column in bank(at_rest={'case': 1.0}, span_k=(-9.0, 9.0))),
 )
-#: Names of the refusals of data that a user can allow.
+#: Names of the refusals of data that a user can override.
 REFUSALS = ('prior', 'saturation', 'units', 'stuck', 'jump', 'swapped', 'compensated')
 
 
@@ -57,25 +57,25 @@ class FitOptions:
     gravity: local gravity [m/s^2]; a value that does not occur on Earth raises FitError
     model: 'response' selects from all columns; 'golovach' is the model of Golovach's paper: a
         linear static and a quadratic dynamic set, no response
-    static_curve, dynamic_curve: families of the two sets' curves, or None for the model's default
-    groups, forced: groups of columns that may take part (None: all); groups that are kept without
-        a selection
-    prior: calibration of this unit or of its type; its columns are the model
+    static_curve, dynamic_curve: families of static and dynamic curve; None: default of `model`
+    groups, forced: groups of columns that the model may have (None: all), and that it must have
+    prior: calibration of this unit or of its type, whose columns are used without a selection
     ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
         calibration; if both are 0, the change is estimated from the bags
     mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2], or None to estimate it
     gravity_sd: standard deviation of `gravity` [m/s^2]
-    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], as in a data sheet, or
-        None for 100 ug/g^2 and 10 ug/g^3 if positions are not at 1 g, else no nonlinear terms
+    k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], from a data sheet; if
+        both are None: 100 ug/g^2 and 10 ug/g^3 in a fit of positions that are not all at 1 g, and
+        no nonlinear terms in other fits
     serial: serial of the unit, or None for the serial of the sources
     input: unit of the samples
-    full_scale: magnitude of a saturated sample, or None for 32767 counts or, in m/s^2, the
-        smallest usual range that contains the data
+    full_scale: magnitude of a saturated sample [input units], or None for 32767 counts or, in
+        m/s^2, for the smallest usual range that contains the data
     offset: code at zero force, such as 32768, or None to estimate it from the bags
     reference_temperature: T_ref [degC], 20 in Golovach's paper
     detector: thermometer and detector settings, or None to estimate them from the bags
     min_rest_s: length of the shortest rest [s], or None for a length that `reduction` chooses
-    still_sd: largest scatter of the samples at rest [m/s^2]
+    still_sd: largest sd of the samples at rest [m/s^2]
     allow: names of refusals that the user overrides, see `data_checks`
     """
 
@@ -103,7 +103,7 @@ class FitOptions:
     allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        # The range of gravity on land, with a margin; a value outside the range is a typing error.
+        # Range of gravity on land [m/s^2], with a margin: other values are typing errors.
         low, high = 9.76, 9.84
         if not low <= self.gravity <= high:
             raise FitError(
@@ -128,8 +128,8 @@ class FitOptions:
             if self.prior.unit.input != self.input:
                 known = self.prior.unit.input
                 raise ValueError(
-                    f'`prior` is in {known}, the samples are in {self.input}: it cannot be used '
-                    'for them'
+                    f'`prior` is in {known}, the samples are in {self.input}: a prior must be in '
+                    'the unit of the samples'
                 )
         allowed: dict[str, tuple[str, ...]] = {
             'input': ('counts', 'm/s^2'),
@@ -149,11 +149,9 @@ class FitOptions:
                     raise ValueError(f'`{name}` must be one of {", ".join(words)}, got {word!r}')
 
     def nonlinear_sd(self, kind: Kind) -> float:
-        """
-        Return the prior sd of a nonlinear term [g/g^2; for the cube g/g^3, whose limits in data
-        sheets of quartz pendulums are a few ug/g^3].
-        """
+        """Return the prior sd of a nonlinear term [g/g^2], or of the cube [g/g^3]."""
         if kind == 'cube':
+            # Limits of K3 in data sheets of quartz pendulums are a few ug/g^3.
             return 1e-5 if self.k3_sd is None else self.k3_sd
         return K2_SD if self.k2_sd is None else self.k2_sd
 
@@ -185,9 +183,9 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name in _POLYNOMIALS:
         return Polynomial((0.0, *[1.0] * (1 + _POLYNOMIALS.index(name))))
     if name == 'exponential':
-        # Exponentials that grow by e in 15 K and 30 K: semiconductor leakage doubles in 10 K.
+        # Exponentials that grow by e in 15 K (as leakage currents, which double in 10 K) and 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # The spline has four pieces; a knot at the reference temperature replaces knots near it.
+    # The spline has four pieces; a knot at the reference temperature replaces nearby knots.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])
@@ -198,7 +196,7 @@ def normal_gravity(latitude_deg: float, height_m: float) -> float:
     """
     Return the normal gravity [m/s^2] at a height above the WGS 84 ellipsoid (Somigliana).
 
-    Real gravity differs from the result by 30 mGal (30 ug) RMS, in mountains by some 50 mGal.
+    Real gravity differs from normal gravity by 30 mGal (30 ug) RMS, in mountains by some 50 mGal.
     Raises ValueError for a latitude outside -90..90 deg or a height outside -1000..10000 m.
     """
     if not -90.0 <= latitude_deg <= 90.0:

@@ -3,10 +3,11 @@
 """
 Owns the powers of the temperature x of each axis's part, as sums of columns of t and of the lag m.
 
-The temperature of the part of an axis, such as a sensor's package, is ``x = t - m``, t that of the
-board and m the lag of the part. By the binomial theorem x^p is a sum of the columns t^p,
-t^(p-1) m, ..., m^p with known factors, so one weight per power describes a curve over x. If all
-bags repeat one warm-up, m is a function of t, and separate weights would not describe the part.
+The temperature of the part of an axis, such as a sensor's package, is ``x = t - m``, t being the
+board temperature and m the lag of the part. By the binomial theorem x^p is a sum of the columns
+t^p, t^(p-1) m, ..., m^p with known factors, so one weight per power describes a curve over x. If
+all bags repeat one warm-up, m is a function of t, and the data would not determine separate
+weights of the columns.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ class PartCurves(NamedTuple):
     """
     The powers of the temperature x of the part of each axis; each power is a curve over x.
 
-    axis, power: axis and power of x of each curve, shape (p,)
-    sums: factors of the columns (of sets and response) whose sum is the curve, shape (p, m)
+    axis, power: axis and power of x of each of p curves, shape (p,)
+    sums: factors of the m columns of sets and response whose weighted sum is a curve, (p, m)
     """
 
     axis: Ints
@@ -47,9 +48,9 @@ class PartCurves(NamedTuple):
 
 def curves_of(parts: Sequence[Part], columns: Sequence[Column], n_curves: int) -> PartCurves:
     """
-    Return the curves over the temperature of the part of each axis; none if a column is missing.
+    Return the curves over the temperature of each axis's part; none if a column is missing.
 
-    `n_curves`: number of the columns of the sets, which begin with t, t^2 and t^3
+    `n_curves`: number of columns of the static and dynamic set, of which the first are t, t^2, t^3
     """
     places = {
         (column.kind, column.power, column.part): n_curves + k for k, column in enumerate(columns)

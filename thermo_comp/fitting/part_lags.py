@@ -5,12 +5,12 @@ Owns the search for the thermal lag of each axis.
 
 The bias and the scale factor of an axis are modelled as functions of ``x = t - m``, the
 temperature of one part of the unit less the reference temperature. t is the board temperature T
-less the reference temperature, and m = T - L(T + v G) is T less the temperature of the part, L
-being the lag operator and G the gradient. The part lags the temperature T + v G between board and
-case. The lag has one stage or, for a part that is heated through another part, two stages in
-series. Without a case thermometer, the temperature that the part lags may lead that of the board.
-The time constants, the share v of the gradient and the lead minimise the RMS residual of a spline
-of the bias and a cubic of the scale factor over x.
+less the reference temperature, and m = T - L(T + v G) is T less the temperature of the part, with
+L the lag operator and G = T_case - T_board the gradient. The part lags T + v G, a temperature
+between board and case. The lag has one first-order stage or, for a part that is heated through
+another part, two stages in series. Without a case thermometer, the temperature that the part lags
+may lead the board thermometer by a time, the lead. The time constants, the share v of the gradient
+and the lead minimise the RMS residual of a spline of the bias and a cubic of the scale over x.
 """
 
 from __future__ import annotations
@@ -46,9 +46,8 @@ class _Shape(NamedTuple):
 
     n_nodes: largest number of nodes of the spline of the bias
     most_noise: largest ratio of the RMS residual to the noise at which noise explains the residual
-    has_stress: whether bias and scale also depend on the lag m of the part, by a coefficient that
-        is linear in the part's temperature x: the stress between a part and the board
-    has_gradient: whether the bias also depends on the gradient of the case
+    has_stress: whether bias and scale have terms m and m x, for stress between part and board
+    has_gradient: whether the bias also has a term in the gradient T_case - T_board
     """
 
     n_nodes: int
@@ -60,7 +59,7 @@ class _Shape(NamedTuple):
 class _Steps(NamedTuple):
     """
     First steps of a search in the logarithms of both time constants of a part, in the share of the
-    gradient, and in the ratio of lead to first time constant; 0 keeps a value constant.
+    gradient, and in the ratio of lead to first time constant; a step of 0 keeps a value constant.
     """
 
     tau: float
@@ -69,10 +68,10 @@ class _Steps(NamedTuple):
     lead: float = 0.0
 
 
-# Ratio of the RMS residual to white noise below which no other shape of the curves is tried.
+# Ratio of the RMS residual to white noise below which no further shape of `_SHAPES` is tried.
 _EXPLAINED_RATIO = 1.1
-# Shapes tried in this order: a spline of few nodes determines a lag best but has no kinks, so
-# noise must explain the residual of this spline.
+# Shapes of the curves, in the order of the trials. A spline of 4 nodes determines a lag best, but
+# cannot describe a kink of the bias, so the limit of its RMS residual is low.
 _SHAPES = (
     _Shape(4, _EXPLAINED_RATIO),
     _Shape(4, _EXPLAINED_RATIO, has_gradient=True),
@@ -101,8 +100,9 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     Find the lag of each axis, and reduce the weights of windows that deviate from the model.
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
-    data do not determine a time constant. If noise does not explain the residual, lags of one
-    stage come first: slow noise or a tilt of the support looks like a second stage.
+    data do not determine a time constant. If the residual of every shape exceeds the noise, lags
+    of one stage are also fitted, and come first in the list if they halve the RMS residual: a
+    second stage may only describe slow noise or a tilt of the support.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -112,16 +112,16 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
     for shape in _SHAPES:
         if shape.has_gradient and not windows.gradient.any():
             continue
-        # 500 windows are sufficient to search the lags, 3000 to refine them.
+        # 500 windows are sufficient for the search of the lags, 3000 for their refinement.
         searched = _PartCurves(windows, start, shape, 500).lags(noise)
         if searched is None:
             continue
         subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
         parts, ratio = _parts_of(windows, start, shape, lags, noise)
-        # A residual above `most_noise` times the noise has another cause, for example slow noise:
-        # the lags are then accepted only if they reduce the RMS residual of each axis to a quarter
-        # or less of the residual without a lag.
+        # A residual above `most_noise` times the white noise has a cause besides white noise and
+        # lags, such as slow noise: the lags are then accepted only if the RMS residual of each
+        # axis is at most a quarter of its RMS residual without a lag.
         is_explained = ratio <= shape.most_noise
         if not is_explained and min(map(subset.reduction, lags, range(3))) < 4.0:
             continue
@@ -154,7 +154,8 @@ def _parts_of(
     square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
     ratio = float(np.sqrt((square / noise**2).max()))
     x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-    # Curves without stress terms extrapolate badly: left-out drifts of 10 sd of noise are allowed.
+    # Largest left-out drift at which the lags are kept without trial of other models: 10 sd of the
+    # noise if noise explains the residual (curves extrapolate badly to left-out data), else 2 sd.
     is_curve = ratio <= shape.most_noise and not shape.has_stress
     return Parts((x, y, z), factors, (10.0 if is_curve else 2.0) * float(noise.mean())), ratio
 
@@ -163,7 +164,7 @@ class _PartCurves:
     """
     Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
 
-    Every k-th window is used, with the largest k that leaves `n_windows` windows or more.
+    Every k-th window is used, with the largest k that keeps at least `n_windows` windows.
     """
 
     def __init__(
@@ -183,9 +184,9 @@ class _PartCurves:
         self._case = windows.gradient[rows]
         self._t = windows.temperature[rows] - windows.model.reference_temperature
         self._taus = np.array([columns[k].tau_s for k in of_board])
-        #: Time constants tried [s]: those of the columns, and shorter time constants.
+        #: Time constants tried [s]: four short ones, and those of the columns of group `board`.
         self._tried = np.array([15.0, 21.0, 30.0, 42.0, *self._taus])
-        # Between the time constants tau of the columns the lag m is interpolated: m / tau is a
+        # The lag m is interpolated between the time constants tau of the columns: m / tau is a
         # smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
         ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
         knots = _interpolation_place(np.append(0.0, self._taus))
@@ -205,7 +206,7 @@ class _PartCurves:
         self._measured = self._centred(data.mean[rows] / start.scale)
 
     def lags(self, noise: Floats) -> list[Part] | None:
-        """Return the lag of each axis, or None if a lag explains little or is not determined."""
+        """Return the lag of each axis, or None if a lag fails `_is_of_use` or `_is_determined`."""
         lags = []
         for axis in range(3):
             lag = self._lag(axis, noise[axis])
@@ -217,7 +218,7 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether the residual with a lag is small or reduced, nearly as `find_parts` requires."""
+        """Whether the residual is small against the noise, or much smaller than without a lag."""
         typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -225,8 +226,8 @@ class _PartCurves:
         """
         Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual.
 
-        A second stage, or another share of the gradient, must reduce a residual above the white
-        noise (`noise`) by 5 %.
+        If the RMS residual exceeds 1.1 times the white noise `noise`, a second stage or another
+        share of the gradient is tried, and must reduce the RMS residual by more than 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)
@@ -234,12 +235,12 @@ class _PartCurves:
         if self._square(best, axis) > enough:
             starts = [one_stage]
             if self._has_case:
-                # The residual has several minima in a valley, in which the time constant grows
-                # with the time by which the temperature between board and case leads the board.
+                # The residual has several minima, because a larger share v of the gradient gives
+                # an earlier temperature T + v G, which a larger time constant delays.
                 along = [self.one_stage(axis, share) for share in (0.3, 0.6, 0.9)]
                 starts.append(min(along, key=lambda lag: self._square(lag, axis)))
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
-                # No second stage or other share of the gradient meets the limits of `find_parts`.
+                # Neither a second stage nor another share would reduce this residual enough.
                 return best
             lags = [self._searched(axis, _in_two_stages(one_stage), _Steps(0.2, 0.4))]
             if best.lead_s:
@@ -259,11 +260,11 @@ class _PartCurves:
 
     def _with_lead(self, lag: Part, axis: int) -> Part:
         """
-        Let the temperature that a part lags lead the reading of the board, if the data show this:
-        by a share of the gradient or, without a case thermometer, by a time.
+        Add a share of the gradient to a lag or, without a case thermometer, a lead time, if the
+        data show that the temperature which the part lags leads the reading of the board.
 
-        The residual is linearised in the time constant and the lead. The lead must reduce the sum
-        of squares by a factor that white residuals would reach with a probability of 1e-5.
+        The residual is linearised in the time constant and in the share or lead. Its sum of
+        squares must decrease by a factor that white residuals reach with a probability of 1e-5.
         """
         tau = lag.tau_s
         if not tau:
@@ -284,7 +285,7 @@ class _PartCurves:
         return found if self._square(found, axis) <= enough else lag
 
     def refined(self, lag: Part, axis: int) -> Part:
-        """Return the lag with the smallest RMS residual in the neighbourhood of a lag."""
+        """Return the lag with the smallest RMS residual, by a search from `lag` in small steps."""
         if not lag.tau_s:
             return lag
         near = _Steps(0.03, 0.06, 0.02, 0.02)
@@ -298,9 +299,10 @@ class _PartCurves:
 
     def _searched(self, axis: int, first: Part, steps: _Steps, accuracy: float = 0.01) -> Part:
         """
-        Return the lag of the smallest RMS residual by the simplex method, begun at `first`.
+        Return the lag of the smallest RMS residual by the simplex method, from the lag `first`.
 
-        `accuracy`: half the tolerance of the simplex in logarithms of time constants and in ratios
+        `accuracy`: half of the largest extent of the final simplex, in logarithms of the time
+        constants, in the share, and in the ratio of lead to first time constant
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -342,8 +344,8 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether time constants longer or shorter by `_TAU_RATIO` add 5 % to the RMS residual, and
-        the lag settles to 10 % within the longest bag.
+        Whether time constants longer or shorter by the factor `_TAU_RATIO` increase the RMS
+        residual by more than 5 %, and the lag decays to 10 % within the longest bag.
         """
         tau, second, share, lead = lag
         if tau > float(self._age.max()) / np.log(10.0):
@@ -362,7 +364,7 @@ class _PartCurves:
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
     def n_parameters(self, lag: Part) -> int:
-        """Return the number of unknowns of an axis: coefficients, and a level of each position."""
+        """Return the number of unknowns of an axis: coefficients, and one level per position."""
         return int(self._series(lag, 0).shape[1]) + len(self._first)
 
     def residual(self, lag: Part, axis: int) -> Floats:
@@ -370,17 +372,16 @@ class _PartCurves:
         return np.asarray(self._weighted(lag, axis) / self._root_weight[:, 0])
 
     def _square(self, lag: Part, axis: int) -> float:
-        """Return the weighted sum of squared residuals of an axis."""
         left = self._weighted(lag, axis)
         return max(float(left @ left), 1e-30)
 
     def _weighted(self, lag: Part, axis: int) -> Floats:
-        """Return the residuals of one axis times the roots of the weights, shape (n,)."""
+        """Return the residuals of an axis times the roots of the windows' weights, shape (n,)."""
         series, measured = self._series(lag, axis), self._measured[:, axis]
         return np.asarray(measured - series @ _solved(series, measured))
 
     def _series(self, lag: Part, axis: int) -> Floats:
-        """Return the weighted regressors of bias, scale factor and initial lags, shape (n, k)."""
+        """Return the weighted regressors of bias, scale and initial lag states, shape (n, k)."""
         x: Floats = self._t.copy()
         if lag.tau_s:
             tau, second, of_case, lead = lag
@@ -392,7 +393,7 @@ class _PartCurves:
                     x += of_case * share * self._gradient(at)
         low, high = float(x.min()), float(x.max())
         span = (high - low) or 1.0
-        # The spline of the bias has a node every 0.6 K or more.
+        # The nodes of the spline of the bias are at least 0.6 K apart, if there are more than 4.
         n_nodes = min(max(int(span / 0.6), 4), self._shape.n_nodes)
         nodes = np.linspace(low, low + span, n_nodes)
         knots = np.concatenate((nodes[[0] * 3], nodes, nodes[[-1] * 3]))
@@ -406,36 +407,36 @@ class _PartCurves:
         if self._shape.has_gradient:
             bias.append(self._case[:, None])
         of_scale = self._force[:, [axis]] * np.hstack(scale)
-        # The lag of the part at the start of each bag is unknown and decays.
+        # The lag of the part at the start of each bag is unknown; its effect decays with tau.
         begin = self._is_of_bag * np.exp(-self._age / max(lag.tau_s, 1.0))
         return self._centred(np.hstack((*bias, of_scale, begin)))
 
     def _centred(self, values: Floats) -> Floats:
-        """Subtract from series the weighted mean in each position; multiply by root weights."""
+        """Subtract each position's weighted mean from columns; multiply by the root weights."""
         level = np.add.reduceat(values * self._share, self._first)
         return np.asarray((values - level[self._position]) * self._root_weight)
 
 
 def _in_two_stages(lag: Part) -> Part:
     """Split a lag of one stage into two stages, as the start of a search."""
-    # The residual has a valley where the sum of the two stages' time constants is constant.
+    # Two stages with the same sum of their time constants have almost the same residual.
     tau, _, share, lead = lag
     return Part(0.8 * tau + 1.0, 0.2 * tau + 1.0, share, lead)
 
 
 def _in_order(tau_s: float, second_tau_s: float, sensor_share: float, lead_share: float) -> Part:
     """
-    Return a lag with the longer time constant first, the shorter at most 0.89 of the longer.
+    Return a lag with the longer time constant first, and the shorter at most 0.89 of the longer.
 
-    `lead_share`: the lead over `tau_s`
+    `lead_share`: ratio of the lead to `tau_s`
     """
-    # Columns accept ratios of a part's two time constants up to 0.9, after rounding to 0.1 s.
+    # `Part` accepts ratios of its two time constants up to 0.9, after rounding to 0.1 s.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
     return Part(longer, min(shorter, 0.89 * longer), sensor_share, lead_share * tau_s)
 
 
 def _interpolation_place(tau_s: Floats) -> Floats:
-    """Map time constants [s] to the interval 0 to 1, for the interpolation; 200 s become 0.5."""
+    """Map time constants [s] to 0..1, the abscissa of the interpolation; 200 s become 0.5."""
     return np.asarray(tau_s / (tau_s + 200.0))
 
 

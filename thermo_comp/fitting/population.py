@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the population of a type of unit: a calibration with the mean and the scatter, over the units,
-of the parameters relative to the scale factors.
+Owns the prior of a type of unit (`population`): a calibration with the mean of the parameters over
+several units, relative to the scale factors, and with their scatter as covariance.
 
 References
 ----------
@@ -36,9 +36,9 @@ from .nonlinear import without_terms
 from .priors import constants_of, prior_columns
 from .thermal_ranges import union
 
-#: Smallest number of units of a population: fewer units do not determine the scatter.
+#: Smallest number of units for a prior: fewer units do not determine the scatter.
 UNITS_NEEDED = 3
-#: Fields of a column whose lag has one stage, no share of the gradient and no lead.
+#: Values of the fields for a column whose lag has one stage, no share of the gradient, no lead.
 _ONE_STAGE: Any = {'second_tau_s': 0.0, 'sensor_share': 0.0, 'lead_s': 0.0}
 
 
@@ -46,11 +46,10 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError for fewer than three calibrations, or for calibrations that differ in input,
-    reference temperature, sensors or curves.
+    Raises FitError for fewer than three calibrations, or if the calibrations differ in the input
+    unit, the reference temperature, the sensors or the form of the curves.
     """
-    # Nonlinear terms are left out: most units have none, because a centrifuge is needed to
-    # determine them.
+    # Nonlinear terms are left out: few calibrations have them, as a centrifuge determines them.
     calibrations = [
         each if each.nonlinearity is None else without_terms(each) for each in calibrations
     ]
@@ -76,13 +75,14 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     mean = vectors.mean(axis=0)
     deviations = (vectors - mean) / np.sqrt(len(vectors) - 1.0)
     scatter = (1.0 + 1.0 / len(vectors)) * _scatter(deviations, parameter_layout(template), mean_K)
-    # Parameters that none of the units determined keep the uncertainty of their own prior.
+    # Add the mean covariance of the units, so that a parameter which no unit determines keeps the
+    # variance of its prior.
     scatter += np.mean([covariance for _, covariance in units], axis=0)
     return with_parameters(template, mean_K, mean, scatter)
 
 
 def _check_alike(calibrations: Sequence[Calibration]) -> None:
-    """Raise FitError for too few calibrations, or calibrations of different types of units."""
+    """Raise FitError for too few calibrations, or if they cannot be of one type of unit."""
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(
             f'the prior of a type needs the calibrations of at least {UNITS_NEEDED} units, got '
@@ -97,27 +97,27 @@ def _check_alike(calibrations: Sequence[Calibration]) -> None:
         alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
         if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
             raise FitError(
-                f'unit {serial} differs from unit {first.unit.serial} in the key unit.input, '
-                'reference_temperature_c or sensors: they are not of one type'
+                f'the calibrations of units {serial} and {first.unit.serial} differ in the key '
+                'unit.input, reference_temperature_c or sensors: they are not of one type'
             )
         if _shape(calibration) != _shape(first):
             raise FitError(
                 f'the curves over temperature of unit {serial} have another form than those of '
-                f'unit {first.unit.serial}: fit both with the same --model, --static-curve and '
-                '--dynamic-curve'
+                f'unit {first.unit.serial}: fit both units with the same --model, --static-curve '
+                'and --dynamic-curve'
             )
 
 
 def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     """
-    Return the covariance of n units from `deviations`, their distances to the mean / sqrt(n - 1),
-    shape (n, p); `K`: scale factors of the axes.
+    Return the covariance of the parameters over n units; `deviations`: the parameters less their
+    mean, divided by sqrt(n - 1), shape (n, p); `K`: scale factors of the axes.
 
-    Bias, scale and misalignment are taken as independent of each other and of the curves: with
-    chance correlations between few units, one position would determine all constants of a unit.
-    The correlations of the curves are reduced by a share estimated from their scatter [1]_. A
-    dynamic curve counts as its difference from the static curve, because most units have one curve
-    for both sets, and smaller correlations between equal curves would make the curves different.
+    The correlations of bias, scale and misalignment with each other and with the curves are set to
+    0: with chance correlations from few units, one position would determine all constants of a new
+    unit. The correlations between curves are reduced by a ratio estimated from their scatter [1]_,
+    after a dynamic curve is replaced by its difference from the static curve: in most units both
+    are equal, and a reduced correlation of equal curves would make them differ.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):
@@ -138,18 +138,18 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     others = ~np.eye(len(curves), dtype=bool)
     share = np.sum(variance, where=others) / max(np.sum(correlation**2, where=others), 1e-300)
     is_pair = (kind == 0) & ~np.eye(len(kind), dtype=bool)
-    # Correlations are reduced by at least 1 %, so that the covariance is regular.
+    # Correlations are reduced by at least 1 %, so that the covariance is not singular.
     scatter[is_pair] *= 1.0 - np.clip(share, 0.01, 1.0)
-    # `to_curves`, the inverse of `to_differences`, adds the static curve to the differences.
+    # `to_curves` is the inverse of `to_differences`: it adds the static curve to the differences.
     to_curves = 2.0 * np.eye(len(kind)) - to_differences
     return np.asarray(to_curves @ scatter @ to_curves.T)
 
 
 def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     """
-    Scale the deviations so that a kind of parameter, such as a slope of the bias, has the same
-    scatter on all axes that have nonzero deviations. The scatter is that of a future unit
-    by Student's distribution [2]_, because three units can be alike by chance.
+    Scale the deviations so that each kind of parameter, such as the slope of the bias, has the
+    same scatter on all axes with nonzero deviations. The scatter is the predictive sd for a new
+    unit by Student's t distribution [2]_, because three units can be alike by chance.
     """
     size = deviations.shape[1]
     units, kinds = np.ones(size), [[*range(layout.misalignment, size)]]
@@ -169,24 +169,24 @@ def _with_common_scatter(deviations: Floats, layout: ParameterLayout, K: Floats)
 
 
 def _without_range(column: Column) -> Column:
-    """Return a column without the fields that differ between units of a type: range, rest_k."""
+    """Return a column with constant `range` and `rest_k`, which differ between units of a type."""
     return replace(column, range=(0.0, 1.0), rest_k=0.0)
 
 
 def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
     """
-    Return columns of the bank, with factors, whose weighted sum is (about) the given column.
+    Return columns of the bank of time constants, with factors, whose sum approximates a column.
 
-    The parts of two units of a type differ in their time constants. A lag is interpolated between
-    the lags of the bank, which all units have; a lag of 0 s has the value 0. A lag of two stages,
-    a lag behind a temperature between board and sensor, and a lag with a lead are sums of
-    first-order lags. The powers of a sum of lags are approximated by powers of one lag of the
-    board, with the same delay as the sum in a long ramp.
+    Parts of two units of a type have different time constants, so a lag is interpolated between
+    the lags of the bank, which is common to all units; a lag of 0 s has the value 0. A lag of two
+    stages, a lag behind a temperature between board and sensor, and a lag with a lead are sums of
+    first-order lags. A power of such a sum is approximated by the power of one lag of the board
+    that has the same delay in a long ramp as the sum.
     """
     tau, second, lag = column.tau_s, column.second_tau_s, column.source
     is_line = isinstance(lag, Lag) and column.term.form is LINE
     if not is_line and any(column.part[1:]):
-        # A power of a sum of lags becomes the power of one lag, of a time constant of 1 s or more.
+        # Replace a power of a sum of lags by the power of one lag, whose time constant is >= 1 s.
         behind_s = max(tau + second - column.lead_s, 1.0)
         return _on_common_lags(replace(column, tau_s=behind_s, **_ONE_STAGE))
     summands: list[tuple[Column, float]] = []
@@ -216,8 +216,7 @@ def _on_common_lags(column: Column) -> list[tuple[Column, float]]:
         return [(shortest, share**column.term.order)]
     if at == len(FINE_TAUS):
         return [(replace(column, tau_s=FINE_TAUS[-1]), 1.0)]
-    # The shares of four lags of the bank are Lagrange's polynomials over the logarithm of the time
-    # constant.
+    # The factors of four lags of the bank are Lagrange polynomials in log time constant.
     first = min(max(at - 2, 0), len(FINE_TAUS) - 4)
     near = FINE_TAUS[first : first + 4]
     result = []
@@ -272,7 +271,7 @@ def _shape(calibration: Calibration) -> list[tuple[str, int]]:
 
 
 def _template(calibrations: Sequence[Calibration], columns: Sequence[Column]) -> Calibration:
-    """Return a calibration with the union of the ranges and the given columns, all weights 0."""
+    """Return a calibration with the union of the units' ranges, and the columns with weight 0."""
     first = calibrations[0]
     slow = [[axis.residual_sd_m_s2 for axis in each.static.axes()] for each in calibrations]
     usual = np.median(slow, axis=0).tolist()

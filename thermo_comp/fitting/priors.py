@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the informative prior of a fit, from an earlier calibration of the unit or from the
-population of its type.
+Owns the informative prior of a fit, from a calibration of the unit or its type (`population`).
 
-Mean and covariance of all parameters of the calibration form the Gaussian prior of the regression,
-which has the calibration's columns. The covariance of an earlier calibration of the unit is
-increased by the ageing of the unit.
+Values and covariance of all parameters of the calibration are mean and covariance of the Gaussian
+prior of the regression, which has the calibration's columns. The covariance is increased by the
+ageing of the unit since the calibration.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
-                f'the prior has a thermal response of the {term.during} regime alone, as files of '
-                'format_version 1 have: fit the bags of the prior again'
+                f'the prior has a thermal response for the {term.during} regime only, as in files '
+                'of format_version 1: fit the bags of the prior again, with this release'
             )
     names = [field.name for field in fields(Column)]
     return tuple(
@@ -77,12 +76,12 @@ def offset_sd_of(calibration: Calibration) -> float:
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Set bias and weights of a state to those of a calibration whose K is the nominal scale."""
+    """Set bias and weights of a state to those of a calibration, whose K is `nominal_scale`."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
-            'the curves of the prior differ from axis to axis, or from bias to scale: a prior '
-            'needs curves of one form, as a fit writes them'
+            'the curves of the prior have different forms on the axes, or for bias and scale: a '
+            'prior needs curves of one form, as a fit writes them'
         )
     # Replace the level of the dynamic set by its difference from the level of the static set.
     both = np.array([[values[block.rows] for block in part] for part in layout[:2]])
@@ -100,11 +99,10 @@ def informative_priors(
     usual_ageing: float = 1.0,
 ) -> Iterator[InformativePrior]:
     """
-    Return candidate priors from a calibration, which the fit compares by evidence and by the log
-    density of their ageing, a half-Student distribution whose scale is `usual_ageing` [m/s^2].
+    Return priors from a calibration for several amounts of ageing. The fit compares their log
+    evidence plus the log density of the ageing: half-Student, of scale `usual_ageing` [m/s^2].
 
-    The last candidate is the widest, with which the fit begins. Raises FitError if the calibration
-    has no covariance.
+    The fit begins with the last, widest prior. A calibration without covariance raises FitError.
     """
     if calibration.posterior is None:
         raise FitError(
@@ -125,26 +123,26 @@ def informative_priors(
         return result
 
     stated = options.ageing_bias, options.ageing_scale
-    # Candidates of an added uncorrelated variance, relative to each variance of the prior.
+    # Stated ageing, with several uncorrelated variances added, relative to those of the prior.
     tried = [(grown(*stated), share, 0.0) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Candidates of ageing: sd of biases [g] and of scale factors. Both are equal, because data
-        # sheets state similar numbers for both, and few rests do not separate bias and scale.
+        # Ageing to try: sd of the biases [g] and of the scale factors. Both are equal, because
+        # data sheets state similar numbers for both, and few rests do not separate bias and scale.
         tried += [
             (grown(ageing * options.gravity, ageing), 0.0, ageing)
             for ageing in (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
         ]
-        # Candidates in which the effects of temperature have changed as well: `share` multiplies
-        # the sd of the prior by 1.4, 30 and 1000, as the sd of a good prior may be a thousandth
-        # of the effect itself; at most by the effect itself, as a few rests would otherwise leave
-        # the effects at other temperatures unknown.
+        # Priors for a unit whose effects of temperature have changed, too: `share` multiplies the
+        # sd of the prior by 1.4, 30 and 1000, because the sd of an effect of temperature may be a
+        # thousandth of the effect. The sd is at most the effect itself: a few rests would
+        # otherwise leave the effects at other temperatures unknown.
         tried += [
             (grown(ageing * options.gravity, ageing), share, ageing)
             for share in (1.0, 1e3, 1e6)
             for ageing in (3e-5, 3e-4, 3e-3)
         ]
-    # The fit begins with the last, widest candidate: under a narrow prior the noise estimated by
-    # the first fit would absorb changes of the unit.
+    # The fit begins with the last, widest prior: in a first fit with a narrow prior, the noise
+    # would absorb changes of the unit.
     if any(stated):
         tried.append((tried[-1][0], 1.0, 0.0))
     layout = regression.layout(regression.windows.parts)
@@ -176,16 +174,16 @@ def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> F
     """
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
-    `covariance`: of the file's parameters, to which an uncorrelated part of `share` times each
-    variance is added, at most the variance or the square of the parameter's size; `to_file`:
-    derivatives of the file's parameters w.r.t. the unknowns
+    `covariance`: of the file's parameters; `share` times each variance is added to its diagonal,
+    at most the variance or the square of the parameter in `sizes`;
+    `to_file`: derivatives of the file's parameters w.r.t. the unknowns
     """
     diagonal = np.diag(covariance)
     floor = np.where(diagonal > 0.0, diagonal, np.min(diagonal[diagonal > 0.0], initial=1.0))
     sd = np.sqrt(floor)
-    # A relative jitter of 1e-6 bounds the correlations of the file's float32 covariance. The
-    # QR factor of the covariance's factor, instead of a product, keeps the precision of nearly
-    # equal parameters.
+    # A relative jitter of 1e-6 keeps the covariance, stored in single precision, positive
+    # definite. QR of the whitened derivatives, without the product of the normal equations, loses
+    # no precision for strongly correlated parameters.
     added = np.minimum(share, np.maximum((sizes / sd) ** 2, 1.0))
     widened = covariance / np.outer(sd, sd) + np.diag(1e-6 + added)
     scaled = to_file / sd[:, None]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the checks of the raw data of a fit: serial numbers, samples and readings."""
+"""Owns the checks of the raw data of a fit: serial numbers, samples and thermometer readings."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
             'prior',
             'refusal',
             f'the prior is the calibration of unit {prior.unit.serial}, the bags are of unit '
-            f'{serial}: make a prior of their type from the calibrations of three units or more '
-            'with thermo_comp prior',
+            f'{serial}: make a prior of the type of units with thermo_comp prior, from the '
+            'calibrations of three units or more',
         )
 
 
@@ -65,17 +65,17 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     if still < 0.5:
         yield advice(
             'motion',
-            f'the unit was still for only {100.0 * still:.0f} % of the time; vibration or '
-            'handling in the other time was cut out',
+            f'the unit was still for only {100.0 * still:.0f} % of the time; the times of '
+            'vibration or handling were left out',
         )
     rests = [interval for bag in bags for interval in bag.intervals]
     if n_equal := sum(not rest.sample_sd.any() for rest in rests):
         share = '' if n_equal == len(rests) else f' in {n_equal} of {len(rests)} rests'
         text = (
             f'at rest all samples are equal for half a second or longer{share}, without any '
-            'noise: does the driver repeat one reading, or is the resolution of the sensor too '
-            'coarse? If it is, set stuck_timeout of the node to 0, or the node drops samples that '
-            'stay equal for 2 s'
+            'noise: does the driver repeat one sample, or is the resolution of the sensor too '
+            'coarse? If the resolution is coarse, set stuck_timeout of the node to 0: by default '
+            'the node drops samples that stay equal for 2 s'
         )
         yield advice('stuck', text)
     if dead := list(_dead_axes(bags)):
@@ -134,8 +134,8 @@ def _judge_units(
             return
     yield advice(
         'compensated',
-        'the samples are not whole numbers: averaged, scaled or compensated before they were '
-        'recorded? A calibration made from scaled samples is valid for that scaling only',
+        'the samples are not whole numbers: were they averaged, scaled or compensated before the '
+        'recording? A calibration made from scaled samples is valid for that scaling only',
     )
 
 
@@ -149,9 +149,9 @@ class _DeadAxis(NamedTuple):
 
 
 def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
-    """Return why readings are constant: an axis is clipped at the largest reading, or dead."""
+    """Return why the readings of axes are constant: clipped at the full scale, or dead."""
     largest = max(float(np.abs(rest.mean).max()) for bag in bags for rest in bag.intervals)
-    # The magnitudes of the two limits of a two's complement code differ by one count.
+    # The limits of a two's complement code, such as -32768 and 32767, differ in size by one count.
     is_at_top = np.isclose([abs(axis.value) for axis in dead], largest, rtol=1e-4, atol=0.0)
     ends = {(axis.axis, axis.value > 0.0) for axis in dead}
     if not largest or not is_at_top.all() or len(ends) == 1:
@@ -159,15 +159,15 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
     # The advised full scale is just below the clipped reading, which counts as saturated.
     limit = f'--full-scale {largest * (1.0 - 1e-4):.5g}'
     return (
-        'the largest reading of the bags, with both signs or on several axes, is the full scale: '
-        f'leave out a clipped bag, or the clipped rests of a bag with {limit}'
+        'the same largest magnitude, with both signs or on several axes, is the full scale: leave '
+        f'out a clipped bag, or leave out the clipped rests of a bag with {limit}'
     )
 
 
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
     """
-    Find axes that are constant throughout a rest, but not in most of the rests, or that are
-    constant in every rest while another axis is not.
+    Find the axes that are constant throughout a rest but have noise in at least half of the rests,
+    and the axes that are constant in every rest while another axis has noise.
     """
     rests = [rest for bag in bags for rest in bag.intervals]
     alive = np.array([rest.sample_sd > 0.0 for rest in rests])
@@ -179,7 +179,7 @@ def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
 
 
 def constant_axes(bags: Sequence[ReducedBag], usual: Bools) -> Iterator[_DeadAxis]:
-    """Find axes constant throughout a rest, among those that should have noise (`usual`, (3,))."""
+    """Find axes that are constant throughout a rest, of the axes in the mask `usual`, (3,)."""
     for bag in bags:
         for rest in bag.intervals:
             is_dead = ~(rest.sample_sd > 0.0) & usual & (np.ptp(rest.mean, axis=0) == 0.0)
@@ -187,7 +187,7 @@ def constant_axes(bags: Sequence[ReducedBag], usual: Bools) -> Iterator[_DeadAxi
             for axis in np.flatnonzero(is_dead & (rest.count.sum() >= 1000)):
                 hours = (rest.end_ns - rest.start_ns) / 3600e9
                 value = float(rest.mean[0, axis])
-                text = f'{"xyz"[axis]} reads {value:g} to the bit for {hours:.2g} h'
+                text = f'{"xyz"[axis]} reads exactly {value:g} for {hours:.2g} h'
                 yield _DeadAxis(bag.source.name, int(axis), value, text)
 
 
@@ -208,7 +208,7 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
 
 
 def judge_copies(names: Sequence[str]) -> list[Finding]:
-    """Report the thermometers that repeat the board's readings."""
+    """Report the thermometers `names`, whose readings are equal to the board's."""
     return [
         advice('copy', f'temperature/{name} repeats the readings of the board: it is left out')
         for name in names

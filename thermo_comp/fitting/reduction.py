@@ -4,11 +4,11 @@
 Owns the reduction of a bag: still intervals and their windows, temperature readings, counters.
 
 The blocks of a bag are read once, in bounded memory. Samples are averaged to cells of about half a
-second (see `stillness`), and the cells of a still interval to windows of ten seconds, or less in a
-short interval; the last window of an interval may be shorter. Within a window every thermal
-regressor is linear in time to far below the noise, so the mean of a window is a sufficient
-statistic. The noise of the means is estimated by the regression, because means of a
-charge-balancing converter have less noise than the scatter of its samples implies.
+second (see `stillness`), and the cells of a still interval to windows of ten seconds. Windows of a
+short interval, and the last window of an interval, may be shorter. Within a window the deviation
+of every thermal regressor from a straight line is far below the noise, so the mean of a window is
+a sufficient statistic. The regression estimates the noise of the means, which for a
+charge-balancing converter is less than the scatter of the samples implies.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ WINDOW_S = 10.0
 
 
 class Readings(NamedTuple):
-    """One thermometer's readings over a bag: rising stamps [ns] and temperatures [degC], (n,)."""
+    """Readings of a thermometer in a bag: rising stamps [ns], temperatures [degC], shape (n,)."""
 
     stamp_ns: Ints = np.empty(0, np.int64)
     value: Floats = np.empty(0)
@@ -53,12 +53,11 @@ class StillInterval:
 
     start_ns, end_ns: stamps of the middles of the interval's first and last cell
     begin_s: start of the interval's first window, since the bag's first sample [s]
-    n_whole: number of windows of full length; a shorter window may follow
-    time, count, mean: mean time [s], number and mean of the samples of each window
-    sample_sd: median over the cells of the standard deviation of single samples, shape (3,)
-    rounding_sd: sd of the error of the mean by the converter's rounding, 0 for samples with noise,
-        shape (3,)
-    angular_rate: mean rate of each window [rad/s], or None if a part of the bag has no rate
+    n_whole: number of windows of full length; a shorter last window may follow them
+    time, count, mean: by window, mean time since the first sample [s], number and mean of samples
+    sample_sd: root of the median over the cells of the variance of single samples, shape (3,)
+    rounding_sd: sd of the error of the mean by rounding; 0 if samples have noise, shape (3,)
+    angular_rate: mean angular rate of each window [rad/s], or None if samples of the bag lack it
     """
 
     start_ns: int
@@ -79,19 +78,21 @@ class ReducedBag:
     The statistics of one bag that the fit uses.
 
     start_ns, end_ns: stamps of the first and last sample used
-    n_dropped: number of samples that are not finite or out of order
+    n_dropped: number of samples that are not finite, or whose stamps are out of order
+    n_saturated: number of samples at the full scale
     n_cells, n_still_cells: number of cells in the bag, and in its rests
-    window_s: length of a window [s]; above the requested length if the samples are slow
+    window_s: length of a window [s]; above the requested length if the sample rate is low
     cycle_s: typical interval between samples [s]
-    middle: code at zero force of the samples if the codes are unsigned, else 0
-    max_abs: largest magnitude of a reading without outliers, see `_max_abs` [input units]
+    is_integer: whether all samples are integers
+    middle: code at zero force if the samples are unsigned codes, else 0
+    max_abs: largest magnitude of a sample without outliers, see `_max_abs` [input units]
     since_s: time from the bag's first sample to the part of the bag that was read [s]
-    restless: reason why the bag cannot be used, such as no rests; '' if it can be used
-    angular_rate: whether none, a part or the whole of the bag has finite angular rates
+    restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
+    angular_rate: whether none, a part or all of the bag's samples have a finite angular rate
     n_spikes: number of readings of each thermometer that are spikes, see `is_spike`
     n_glitches: number of single samples far from their neighbours, which are left out
-    n_repeated: number of dropped samples that have the stamp of the sample before
-    parts: the bags of a recording that consists of several bags, see `joining`
+    n_repeated: number of dropped samples with the same stamp as the preceding sample
+    parts: the bags that were joined to this recording, see `joining`; () for a single bag
     """
 
     source: FitSource
@@ -120,7 +121,7 @@ class ReducedBag:
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """The bags of this recording, as a calibration states them."""
+        """The bags of this recording, for the provenance of a calibration."""
         name, sha256 = self.source.name, self.source.sha256 or ''
         return self.parts or (Source(name, sha256, self.n_samples),)
 
@@ -137,8 +138,8 @@ class ReducedBag:
 
 class _Pass:
     """
-    One pass over the blocks of a source: cells of the samples, temperature readings, possible
-    causes of a lack of rests; `has_rate`: whether all blocks have a finite angular rate.
+    The results of reading the blocks of a source once: cells of the samples, temperature readings,
+    possible causes of a lack of rests; `has_rate`: whether all angular rates are finite.
     """
 
     def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
@@ -189,10 +190,10 @@ def reduce_source(
     Read one source in blocks and keep its sufficient statistics.
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
-    3 s, or less if shorter rests determine bias and scale better; the largest variance of a rest
-    is chosen so that the rests determine bias and scale best. Slow samples make cells so long that
-    a bias which changes within minutes looks like a motion, and that short rests are lost. Slow
-    samples get cells of only 10 or 5 samples if shorter cells interrupt or lose fewer rests.
+    3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
+    variance of a rest is also chosen so that the rests determine bias and scale best. At a low
+    sample rate a cell of the usual number of samples is so long that a drift within it looks like
+    a motion, and that short rests are lost: cells of 10 or 5 samples are then tried.
     """
 
     def reduced(least: int) -> tuple[ReducedBag, float]:
@@ -204,7 +205,7 @@ def reduce_source(
         return usual
     share = usual.n_still_cells / usual.n_cells
     if share < 0.95 and source.force is None:
-        # Shorter cells are used if they increase the time at rest by more than 5 % of the bag.
+        # Cells of 10 samples are used if they increase the time at rest by over 5 % of the bag.
         shorter, _ = reduced(10)
         if shorter.n_still_cells / shorter.n_cells > share + 0.05:
             return shorter
@@ -226,13 +227,13 @@ def _reduced(
     still_sd: float,
     fewest_windows: int,
 ) -> tuple[ReducedBag, float]:
-    """Reduce a source, for one choice of cells; return also the length of a cell [s]."""
+    """Reduce a source with the cells of `accumulator`; return also the length of a cell [s]."""
     reading = _Pass(source, accumulator)
     cells = reading.cells
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        # The norms at rest choose the thresholds of a rest only if |f| at rest is gravity.
+        # |f| at rest is not gravity, so the norms of rests cannot decide on the thresholds.
         cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
@@ -259,7 +260,7 @@ def _reduced(
         n_repeated=cells.n_repeated,
         n_cells=len(cells.count),
         n_still_cells=sum(upper - lower for lower, upper in ranges),
-        # A bag without cells, that is, without a usable sample, has the options' window length.
+        # A bag without a usable sample has no cells, and gets the requested window length.
         window_s=round(per_window * cells.cell_s, 6) or window_s,
         cycle_s=_cycle_s(cells),
         is_integer=cells.is_integer,
@@ -277,8 +278,8 @@ def _cycle_s(cells: Cells) -> float:
     """Return the typical interval between samples [s]; NaN without samples."""
     if not len(cells.count):
         return np.nan
-    # The numbers of samples of two cells may differ by one. Cells whose number of samples is not
-    # within 1 of the median are left out, unless most cells are, as with bursts of samples.
+    # Complete cells have the median number of samples, or one more or less. If most cells deviate
+    # more, as with bursts of samples, cells with more than half of the median number are used.
     median = float(np.median(cells.count))
     use = np.abs(cells.count - median) <= 1.0
     if np.mean(use) < 0.5:
@@ -288,7 +289,8 @@ def _cycle_s(cells: Cells) -> float:
 
 def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     """
-    Keep plausible readings with rising stamps; average readings that are less than 0.2 s apart.
+    Keep plausible readings with rising stamps; average groups of readings over about 0.2 s if the
+    readings are closer in time.
 
     No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
     """
@@ -310,17 +312,17 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 def is_spike(value: Floats) -> Bools:
     """
-    Return which readings are more than 10 K from the median of five neighbours, shape (n,).
+    Return which readings are more than 10 K from the median of the five readings about them, (n,).
 
-    A thermometer without contact reads -127 or 85 degC for a moment. The tracker rejects spikes,
-    unless spikes have increased the noise that a fit expects of the thermometer.
+    A thermometer with a loose contact reads -127 or 85 degC for a moment. The fit estimates the
+    noise of a thermometer without spikes, so that the tracker rejects such readings as outliers.
     """
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)
         far[2:-2] = np.abs(value[2:-2] - middle) > 10.0
-        # The first and the last reading have neighbours on one side only: the step to the
-        # neighbour is that of a ramp if the next step is similar.
+        # The first reading, and the last, has neighbours on one side only. A large step to its
+        # neighbour belongs to a ramp if the following step is similar.
         for place, nearest in ((0, value[:3]), (-1, value[:-4:-1])):
             step, after = np.abs(np.diff(nearest)).tolist()
             far[place] = step > 10.0 and after < CONTINUED_SHARE * step
@@ -343,13 +345,13 @@ def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
 
 
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
-    """Find the rests, with the thresholds at which the rests best determine the triad."""
+    """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Candidates of the largest ratio of a rest's variance to that of the quietest rest, the
-    # smallest ratio first.
+    # Values tried for the largest ratio of a rest's variance to the variance of the quietest
+    # cells, in ascending order.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
-    # Candidates of the smallest length of a rest [s], the longest first.
+    # Values tried for the smallest length of a rest [s], in descending order.
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
         for runs in of_ratios:
             ranges = stillness.long_enough(cells, runs, shortest_s)
@@ -366,9 +368,10 @@ def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tupl
 
 def _joined(cells: Cells, ranges: list[tuple[int, int]], still_sd: float) -> list[tuple[int, int]]:
     """
-    Join rests that are separated by a vibration without motion, if this happens six times or more,
-    as with a compressor that cycles. There is no motion if a parabola fits the four cells on
-    either side of the vibration with a mean squared residual below 4 variances of a cell's mean.
+    Join rests that are separated by a vibration without motion, if a bag has six or more such
+    vibrations, as from a compressor that cycles. There is no motion if on each axis a parabola
+    fits the cells from four before to four after the vibration with a mean squared residual below
+    4 variances of a cell's mean.
     """
     is_calm = stillness.is_under(cells, still_sd)
     result = ranges[:1]
@@ -403,7 +406,7 @@ def _windows(
     offsets = np.arange(0, end - lower, per_window)
     count = cells.count[rows].astype(np.float64)
     total = np.add.reduceat(count, offsets)
-    # A last window with less than 90 % of the usual samples is not of full length: the bag ended.
+    # A last window with less than 90 % of the median number of samples is not of full length.
     if n_whole and total[n_whole - 1] < 0.9 * np.median(total):
         n_whole -= 1
     mean = block_means(cells.mean[rows], count, offsets)
@@ -426,8 +429,9 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
     """
     Return the sd of the error of a mean by rounding to a converter's steps, shape (3,).
 
-    `variance`: of the rounded samples of most cells; noise that shows in them averages the error.
-    `drift`: range of the means; a drift over n steps averages the errors of n + 1 steps.
+    `variance`: median variance of the rounded samples in a cell. If it is not 0, the noise of the
+    samples averages the rounding error to 0.
+    `drift`: range of the means; a drift over n steps averages the rounding errors of n + 1 steps.
     """
     steps = np.divide(drift, quantum, where=quantum > 0.0, out=np.zeros(3))
     return np.asarray(np.where(variance > 0.0, 0.0, quantum / 12.0**0.5 / (1.0 + steps)))

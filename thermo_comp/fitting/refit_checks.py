@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the checks of a chosen model for effects that no column describes: a drift after power-on, and
-slow tilts of the supports. The fit is repeated if a check finds such an effect.
+Owns two checks of a chosen model, after which a fit is repeated: whether its bias at settled
+temperatures is less certain than that of a smaller model, and whether supports tilted slowly.
 """
 
 from __future__ import annotations
@@ -22,27 +22,28 @@ from .settled_bias import settled_error
 from .unknowns import Windows
 from .windows import CURVE
 
-# Length of a piece of a rest in which a slow tilt of the support is constant [s].
+# Length of a piece of a rest in which a slow tilt of the support is taken as constant [s].
 _PIECE_S = 3600.0
-# Slow tilts are tried if the drift of left-out positions, averaged over each piece, exceeds these
-# multiples of the white noise of the average, and of the error of the left-out norms.
+# A fit with slow tilts is tried if the left-out drift, averaged over each hour, exceeds these
+# multiples of the white noise of the average, and of the RMS error of left-out norms.
 _DRIFT_TO_NOISE, _DRIFT_TO_NORMS = 6.0, 0.1
-# Smallest number of positions with left-out norms: the norms of fewer positions give no reliable
-# standard error of the gain from slow tilts.
+# Smallest number of positions whose left-out norms are scored, for a reliable standard error of
+# the gain by slow tilts.
 _FEWEST_NORMS = 6
-# Smallest log gain of the mean square left-out norm from slow tilts: 14 % of the RMS.
+# Smallest log ratio of the mean square errors of left-out norms without and with slow tilts: 0.3
+# is a decrease of the RMS by 14 %.
 _TILT_GAIN = 0.3
 SLOW_TILTS = advice(
     'tilt',
-    'left-out |f| - g is smaller if the supports may tilt from hour to hour: each hour of a rest '
-    'was fitted with its own attitude',
+    'left-out |f| - g is smaller if the supports may tilt from hour to hour: in the fit each hour '
+    'of a rest has a separate attitude',
 )
 
 
 def extrapolates(fit: Fit) -> bool:
     """
-    Whether the left-out drift of the chosen model exceeds noise, and the expected error of the
-    settled bias is larger than that of a smaller model, see `settled_bias`.
+    Whether the left-out drift of the chosen model exceeds noise, and the expected error of its
+    settled bias is larger than that of a model with fewer groups, see `settled_bias`.
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next((trial for trial in trials if trial.is_chosen), None)
@@ -60,8 +61,8 @@ def extrapolates(fit: Fit) -> bool:
 
 def may_have_slow_tilts(fit: Fit) -> bool:
     """
-    Whether the drifts of left-out positions exceed noise and a tenth of the error of left-out
-    norms. Slow tilts of a support change the axes across gravity, and hardly the norms.
+    Whether the drifts of left-out positions exceed 6 times the noise and a tenth of the error of
+    left-out norms. Slow tilts change the readings of axes across gravity, but hardly the norms.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:
@@ -73,7 +74,7 @@ def may_have_slow_tilts(fit: Fit) -> bool:
 
 def _slow_drift(data: Windows, drift: Floats) -> tuple[float, float]:
     """
-    Return the RMS over the axes of the means of drifts over each hour of a position, and the mean
+    Return the RMS, over hours and axes, of the mean drift in each hour of a position, and the mean
     number of windows per hour; `drift`: drift of each window, NaN if unknown, shape (n, 3).
     """
     known = np.isfinite(drift).all(axis=1)
@@ -88,7 +89,7 @@ def _slow_drift(data: Windows, drift: Floats) -> tuple[float, float]:
 
 
 def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
-    """Whether the left-out norms decrease if the supports may tilt from hour to hour."""
+    """Whether errors of left-out norms decrease if the supports may tilt from hour to hour."""
     before, after = fit.selected.score.norms, tilted.selected.score.norms
     n_common = np.sum(np.isfinite(before.square) & np.isfinite(after.square))
     gain = before.gain_of(after)
@@ -97,8 +98,8 @@ def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
 
 def in_pieces(bag: ReducedBag) -> ReducedBag:
     """
-    Divide the rests of a bag into pieces of equal numbers of windows, nearest to an hour each.
-    Each piece has its own attitude, as if the support had tilted between the pieces.
+    Divide each rest of a bag into equal pieces of about an hour. The fit takes each piece for a
+    separate position, with a separate attitude, as if the support had tilted between the pieces.
     """
     pieces = [piece for rest in bag.intervals for piece in _pieces(rest, bag.window_s)]
     return replace(bag, intervals=tuple(pieces))
@@ -129,12 +130,12 @@ def _pieces(rest: StillInterval, window_s: float) -> Iterator[StillInterval]:
 def of_whole_rests(
     pieces: Sequence[PositionReport], bags: Sequence[ReducedBag]
 ) -> tuple[PositionReport, ...]:
-    """Join the reports of the pieces of each rest: mean attitude, and RMS over the pieces."""
+    """Make one report per rest from those of its pieces: mean attitude, and RMS residuals."""
     result, left = [], iter(pieces)
     for bag in bags:
         for rest in bag.intervals:
             parts = list(islice(left, _n_pieces(len(rest.time), bag.window_s)))
-            # A rest of one sample has a window, and a duration of 0.
+            # A rest of one sample has a duration of 0, so its weight is the length of a window.
             share = np.array([max(part.duration_s, bag.window_s) for part in parts])
             up = share @ np.array([part.up for part in parts])
             x, y, z = (up / np.linalg.norm(up)).tolist()

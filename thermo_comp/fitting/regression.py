@@ -5,7 +5,7 @@ Owns the regression: the posterior of all unknowns under a given prior, by Gauss
 
 All unknowns have Gaussian priors (attitudes: flat on the sphere). Gauss-Newton finds the mode; the
 inverse of the Hessian is the covariance. The unknowns of positions and bags are eliminated first.
-The subtraction of a position's share from the remaining normal equations leaves the position out.
+A position is left out by subtraction of its contribution from the normal equations of the unit.
 
 References
 ----------
@@ -40,7 +40,7 @@ class Posterior:
     root: root of the covariance of the unit's unknowns, ``root @ root.T``, (n_unit, n_unit)
     variance: variances of all unknowns, shape (n,)
     square: sum of squares of the whitened residuals of each axis, shape (3,) [(m/s^2)^2]
-    log_evidence: logarithm of the marginal likelihood, without a constant of the data
+    log_evidence: logarithm of the marginal likelihood, up to a constant that depends on the data
     """
 
     prior: Prior
@@ -69,7 +69,8 @@ class Point:
     """
     The equations linearised about a state, and Gauss-Newton's step from this state under a prior.
 
-    grams: products of the base series in each position, shape (n_positions, n_base, n_base)
+    grams: weighted sums, over the windows of each position, of products of two base series, shape
+        (n_positions, n_base, n_base)
     """
 
     regression: Regression
@@ -95,7 +96,7 @@ class Point:
 
     @cached_property
     def deviation(self) -> Floats:
-        """The unknowns of the state less the mean of the prior, shape (n,)."""
+        """The unknowns of the state less their prior means, shape (n,)."""
         return self.regression.deviation(self.state, self.prior, self.layout)
 
     @cached_property
@@ -105,17 +106,17 @@ class Point:
 
     @cached_property
     def misfit(self) -> float:
-        """-2 times the log density of the data."""
+        """-2 times the log density of the data given the state, up to a constant."""
         n, sigma = len(self.regression.weight), self.prior.sigma
         each = self.square / sigma**2 + 2.0 * n * np.log(sigma)
         return float((each + self.regression.noise_determinant).sum())
 
     @cached_property
     def prior_misfit(self) -> float:
-        """-2 times the log density of the state, without the constants of the prior."""
+        """-2 times the log prior density of the state, without the prior's normalisation."""
         size = float(self.precision @ self.deviation**2)
         if self.prior.informative is not None:
-            # With an informative prior the diagonal `precision` is 0 for the unit's unknowns.
+            # `precision` is 0 for unknowns with an informative prior, so add their term.
             root = self.prior.informative.root
             size += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
         if self._has_common_start:
@@ -124,7 +125,7 @@ class Point:
 
     @property
     def energy(self) -> float:
-        """-2 times the log density of data and state, without the constants of the prior."""
+        """-2 times the log posterior density of the state, up to a constant."""
         return self.misfit + self.prior_misfit
 
     @property
@@ -133,9 +134,9 @@ class Point:
 
     @property
     def _common_variance(self) -> float:
-        """Prior variance of the sum over the bags of an initial lag state."""
-        # The prior sd of an initial lag state's mean over the bags is 0.1 of the sd in one bag,
-        # because a mean that differs from 0 is an effect of the unit.
+        """Prior variance of the sum, over the bags, of an initial lag state."""
+        # The prior sd of the mean of a lag state over the bags is 0.1 of the sd in one bag: a mean
+        # that differs from 0 is an effect of the unit.
         return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
 
     @cached_property
@@ -145,12 +146,12 @@ class Point:
 
     @property
     def norm_by_axes(self) -> Floats:
-        """Derivatives of the norm of each position w.r.t. the readings, shape (n_positions, 3)."""
+        """Derivatives of |f| in each position w.r.t. the readings, shape (n_positions, 3)."""
         return np.asarray(self.state.up @ np.linalg.inv(self.state.inverse) / self.state.kappa)
 
     @cached_property
     def norms_by_unit(self) -> Floats:
-        """Derivatives of positions' mean norms w.r.t. the unit's unknowns, (n_positions, n)."""
+        """Derivatives of positions' mean |f| w.r.t. the unit's unknowns, (n_positions, n)."""
         regression, state, layout = self.regression, self.state, self.layout
         products = regression.products(layout.used)
         at_state = regression.at_starts(products.means[:, None], state, products.base)
@@ -171,8 +172,8 @@ class Point:
 
     def without_each(self) -> Iterator[tuple[Ints, Floats]]:
         """
-        Yield the positions of each mounting in turn, and the normal equations of the unit without
-        these positions; nothing for a single mounting.
+        Yield, for each mounting, its positions and the normal equations of the unit without these
+        positions; yield nothing if there is a single mounting.
         """
         base = self.regression.products(self.layout.used).base
         at_state = self.regression.products_at(self.grams, self.state, base)
@@ -184,8 +185,8 @@ class Point:
 
     def by_offset(self, axis: int) -> Floats:
         """
-        Return the derivatives of the unit's unknowns w.r.t. the prior mean of a bias offset that
-        all positions share, shape (n_unit,).
+        Return the derivatives of the unit's estimated unknowns w.r.t. a bias offset on one axis
+        that all positions share, shape (n_unit,).
         """
         deviation = self.deviation.copy()
         deviation[self.layout.offset[:, axis]] -= 1.0
@@ -205,7 +206,7 @@ class Point:
             precision = self.precision[:n]
             factor = factored_with_prior(information, precision)
             return solved(factor, gradient - precision * deviation), factor
-        # In units of the prior's standard deviations the normal equations are well conditioned.
+        # Unknowns are scaled by the root of the prior, which makes the equations well conditioned.
         root = self.prior.informative.root
         scaled = solve_triangular(root, information, trans='T')
         scaled = solve_triangular(root, scaled.T, trans='T')
@@ -226,7 +227,7 @@ class Point:
         return step, factor
 
     def linear_step(self) -> Floats:
-        """Return the step with the nonlinear unknowns held by a damping factor."""
+        """Return the step in which damping keeps the nonlinear unknowns almost constant."""
         reduced = self._reduced(_damped(self.normal, self.layout), self.deviation)
         return self._solution(reduced)[0]
 
@@ -238,12 +239,11 @@ class Point:
         """
         Take Gauss-Newton's step.
 
-        If the step increases the energy, fractions of the step are tried in the nonlinear
-        unknowns, which enter the equations as products, and the linear unknowns are solved again
-        for each fraction.
+        If the step increases the energy, fractions of the step of the nonlinear unknowns (factors
+        of other unknowns) are tried, and the linear unknowns are solved again for each fraction.
         """
-        # The energy before the step is computed first, because the regression keeps only the last
-        # linearisation.
+        # Compute the energy and the step here before the energy after the step, because the
+        # regression keeps only the last linearisation.
         energy, (step, _) = self.energy, self.solution
         result = self.with_step(step)
         if result.energy <= energy:
@@ -260,7 +260,7 @@ class Point:
         return result
 
     def posterior(self, end: Point) -> Posterior:
-        """Return the posterior at the point `end`, with the curvature at the near point `self`."""
+        """Return the posterior at the mode `end`, with the covariance of the point `self`."""
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
         n, unit_root = layout.n_unit, inverse_root(factor)
@@ -288,7 +288,7 @@ class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
 
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
-        """Return the equations at a state, inactive weights 0, by default with all windows."""
+        """Return the equations at a state without inactive weights, by default of all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)
@@ -296,15 +296,15 @@ class Regression(Equations):
     @last_result_kept
     def linearised(self, state: State, layout: Layout, grams: Floats) -> tuple[Tangent, Normal]:
         """
-        Return the equations linearised about a state, and the normal equations for products of the
-        base series in each position.
+        Return the equations linearised about a state, and the normal equations of the windows
+        whose sums of products are `grams`, see `Point`.
         """
         base = self.products(layout.used).base
         tangent = self.tangent(state, layout, base)
         return tangent, tangent.normal(self.products_at(grams, state, base))
 
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
-        """Find the posterior at the mode in at most `n_steps` steps; with 0 steps, at `state`."""
+        """Return the posterior after at most `n_steps` steps to the mode, or at `state` with 0."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
         for _ in range(n_steps):
@@ -317,14 +317,14 @@ class Regression(Equations):
         return point.posterior(point)
 
     def step(self, state: State, prior: Prior) -> Posterior:
-        """Take one step towards the mode; the covariance is that of the equations at `state`."""
+        """Take one step towards the mode; the covariance is that of the equations before it."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
         end = point.stepped()
         return point.posterior(end if end.energy <= point.energy else point)
 
     def inactive(self, posterior: Posterior, wanted: Bools) -> Inactive:
-        """Return sparsity and quality factors of inactive `wanted` columns, (m,), at the mode."""
+        """Return the sparsity and quality factors of the inactive columns in the mask `wanted`."""
         point = self.at(posterior.state, posterior.prior)
         state, layout, sigma, n = point.state, point.layout, point.prior.sigma, point.layout.n_unit
         part, column = np.nonzero(self.windows.parts & wanted & ~layout.used)
@@ -354,9 +354,9 @@ class Regression(Equations):
 
 def _damped(normal: Normal, layout: Layout) -> Normal:
     """
-    Hold the nonlinear unknowns of normal equations to a millionth of their step, by a factor on
-    their diagonal. With an informative prior, which correlates the unknowns, a factor far above
-    1e6 would exceed the range of double precision.
+    Reduce the step of the nonlinear unknowns by about 1e6, by this factor on their diagonal of the
+    normal equations. With an informative prior, which correlates the unknowns, a factor far above
+    1e6 would cause errors of double precision.
     """
     local, unit = normal.local.copy(), normal.unit.copy()
     at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]

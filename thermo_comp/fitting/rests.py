@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the tests of what the rests of a recording show: whether temperatures and readings change in a
-rest, which attitudes were heated, and to which attitudes the unit was returned.
+Owns the tests of the rests of a recording: whether temperatures and readings change in a rest,
+which attitudes were heated, and to which attitudes the unit was returned.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from .windows import LAGS, ThermalWindows
 
 def is_constant(windows: ThermalWindows, part: Ints) -> bool:
     """
-    Whether temperatures change less (RMS) within the parts of the data than from part to part;
-    `part`: number of the part of each window, which is its position or its bag, (n,).
+    Whether the board temperature changes less (RMS) within positions, or within bags, than from
+    one to the next; `part`: number of the position, or of the bag, of each window, shape (n,).
     """
     t = windows.temperature
     within = within_positions(t[:, None], part)[:, 0]
@@ -30,17 +30,17 @@ def is_constant(windows: ThermalWindows, part: Ints) -> bool:
 
 
 def is_bench(windows: ThermalWindows, up: Floats) -> bool:
-    """Whether only one of several attitudes shows a temperature effect; `up`: attitudes."""
+    """Whether only one of several attitudes was heated or cooled; `up`: attitudes, (n, 3)."""
     n_heated = len(distinct_directions(up[_is_heated(windows)]))
     return n_heated == 1 and len(distinct_directions(up)) > 1
 
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return the positions that show an effect of temperature, shape (n_positions,): a position whose
-    temperature changes by more than a tenth of the span of all temperatures, or whose mean is as
-    far from the median; all positions if there is no such position. The short rests of a tumble in
-    a room, recorded with a ramp, do not count: their drifts hardly separate bias and scale factor.
+    Return the heated or cooled positions, shape (n_positions,): those whose temperature changes by
+    more than a tenth of the span of all temperatures, or whose mean temperature is farther than
+    this from the median; all positions if there is no such position. Short rests in other
+    attitudes in a room do not count: their drifts hardly separate bias and scale factor.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]
@@ -51,12 +51,12 @@ def _is_heated(windows: ThermalWindows) -> Bools:
 
 def is_steady(windows: ThermalWindows) -> Bools:
     """
-    Return the positions whose temperatures change by less than three sd of the thermometers' noise
-    (RMS), shape (n_positions,).
+    Return the positions whose temperatures, and their differences, change by less than three sd of
+    the thermometers' noise (RMS), shape (n_positions,).
 
-    In a steady position the thermometers' noise would look like temperature changes without drift,
-    as if the unit had no thermal response in attitudes of short rests. At a change of three sd, a
-    ninth of the mean square change is noise, and a slope would be a ninth too small.
+    In such a position the noise of the thermometers would count as temperature changes that cause
+    no drift, so the fitted slopes would be too small: by a ninth for a change of three sd, because
+    a ninth of the mean square change is then noise.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]
@@ -69,8 +69,8 @@ def is_steady(windows: ThermalWindows) -> Bools:
 
 def is_without_drift(data: Windows, scale: Floats) -> Bools:
     """
-    Return the positions in which the drift of the readings of each axis is less than three times
-    the white noise of a window (RMS), shape (n_positions,).
+    Return the positions in which the RMS drift of the samples of each axis is at most three times
+    the white noise of a window, shape (n_positions,).
     """
     drift = within_positions(data.mean / scale, data.position) * np.sqrt(data.weight)[:, None]
     square = np.add.reduceat(drift**2, data.edges[:-1], axis=0) / np.diff(data.edges)[:, None]
@@ -79,9 +79,9 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
-    Return the windows with constant columns in the positions `steady`, (n_positions,), and with
-    initial lag states of 0 in the positions `settled`, (n_positions,). Initial lag states would
-    fit the noise of a rest, as if an attitude that was not heated showed a drift per kelvin.
+    Return the windows with constant columns in the positions of the mask `steady`, (n_positions,),
+    and without effects of initial lag states in the positions of the mask `settled`,
+    (n_positions,), in which such effects would only fit the noise.
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]
@@ -97,8 +97,8 @@ def poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
     Return the number of the pose of each position, -1 for a position without a pose, shape
     (n_positions,), or None if no position has a pose.
 
-    `up`: attitudes, shape (n_positions, 3). The positions of an attitude are in one pose if the
-    unit was returned from another attitude between them, or if there is no other attitude.
+    `up`: attitudes, shape (n_positions, 3). The positions of an attitude form a pose if the unit
+    was returned to this attitude from another attitude, or if all positions have one attitude.
     """
     if len(up) == 1:
         return None

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the choice of the model: groups of columns are added to the constants one at a time.
+Owns the choice of the model: groups of columns are added to the constants in steps.
 
-The log evidence ranks the groups to be tried; the score on left-out data decides. The fit of each
-model begins from the fit of a smaller model.
+The log evidence ranks the groups to be tried; the score on left-out data decides which group is
+added. The fit of each model begins from the fit of a smaller model.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from .regression import Posterior, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalWindows
 
-#: Large initial sd of mounting offsets / `Prior.offset_scale`: by data sheets, turn-ons of
-#: tactical triads repeat within 0.3 to 1 mg, which is 10 to 20 times `Prior.offset_scale`.
+#: Large initial sd of mounting offsets, relative to `Prior.offset_scale`: by data sheets, the bias
+#: of tactical triads repeats to 0.3 .. 1 mg over turn-ons, 10 to 20 times `Prior.offset_scale`.
 LARGE_OFFSETS = 10.0
 
 
@@ -44,7 +44,6 @@ class Trial:
     score: left-out errors of the model
     posterior: fit of the model
     typical: typical prior sd of the model's columns, shape (2, m)
-    is_chosen: whether the model is the chosen model
     is_near: whether the score is within one standard error of that of the chosen model
     """
 
@@ -66,7 +65,7 @@ class Trial:
 class Selected:
     """
     The chosen model: its completed fit, its left-out score, and all models that were tried;
-    `informative`: the priors from a calibration that were compared.
+    `informative`: the priors made of one calibration for several amounts of ageing.
     """
 
     posterior: Posterior
@@ -76,7 +75,7 @@ class Selected:
 
     @property
     def lacks_effects(self) -> bool:
-        """Whether the left-out drift exceeds twice the white and slow noise of a window."""
+        """Whether the left-out drift exceeds twice the noise of a window, white and slow."""
         prior = self.posterior.prior
         noise = float(prior.sigma.mean() * np.sqrt(1.0 + prior.noise.variance))
         return self.score.rms > 2.0 * noise
@@ -86,8 +85,8 @@ class Fit(NamedTuple):
     """
     The windows of a fit, their regression, and the chosen model.
 
-    typical: typical prior sd of all columns that could have taken part, shape (2, m), or None if
-        the model has no choice of columns
+    typical: typical prior sd of all columns that the selection could have chosen, shape (2, m), or
+        None if there was no selection of columns
     of_means: for bags at constant temperatures: state of the fit to the means of the positions,
         if this fit has a curve and is worse on left-out data than the chosen fit; else None
     """
@@ -105,7 +104,7 @@ class Fit(NamedTuple):
 
 
 def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
-    """Return the model that is left after a comparison with each trial in turn."""
+    """Return the best model: each trial that is better than the chosen model replaces it."""
     for trial in trials:
         if is_better(chosen.score, trial.score):
             chosen = trial
@@ -113,7 +112,7 @@ def _best(chosen: Trial, trials: Sequence[Trial]) -> Trial:
 
 
 class Growth:
-    """Fits models of some groups, each begun from the fit of a smaller model."""
+    """Fits models made of given groups; each fit begins from the fit of a smaller model."""
 
     def __init__(self, regression: Regression, candidates: Candidates) -> None:
         self.regression = regression
@@ -126,14 +125,14 @@ class Growth:
         self.free = [group for group in names if group not in self.forced]
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
-        """Fit a model; columns that a smaller model dropped are tried again."""
+        """Fit the model of `groups`, also with columns that the fit of a smaller model dropped."""
         candidates = replace(self._candidates, typical=typical)
         initial_sd = np.where(prior.column_sd > 0.0, prior.column_sd, typical)
         is_wanted = np.isin(self._names, groups)
         prior = replace(prior, column_sd=np.where(is_wanted, initial_sd, 0.0))
         if self.regression.windows.n_poses:
-            # Attitudes and offsets of large prior sd would absorb the effect of new columns: begin
-            # with a small sd of attitudes and (unless stated) of mounting offsets.
+            # Attitudes and mounting offsets with a large prior sd would absorb the effect of new
+            # columns: begin with a small sd of attitudes and, unless stated, of mounting offsets.
             prior = replace(prior, pose_sd=0.1 * POSE_SD)
             if prior.offset_scale > 0.0:
                 least = float(min(prior.offset_sd, prior.sigma.mean()))
@@ -146,17 +145,17 @@ class Growth:
         self, before: Trial, groups: tuple[str, ...] = (), most: Floats | None = None
     ) -> Trial:
         """
-        Fit a model with further groups, from the fit of the model without them.
+        Fit the model `before` with further groups, beginning from the fit of `before`.
 
         `most`: largest typical prior sd of the new columns, shape (2, m), see `_typical`, or None
-        if `before` has a typical sd of the new columns
+        to use the typical sd of `before` for the new columns
         """
         typical = before.typical if most is None else self._typical(before, groups, most)
         posterior = before.posterior
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
     def added(self, chosen: Trial, progress: Callable[[float], None]) -> tuple[Trial, list[Trial]]:
-        """Add groups as long as left-out errors decrease; return the last model and all trials."""
+        """Add groups while left-out errors decrease; return the final model and all trials."""
         trials: list[Trial] = []
         part = 1.0
         while True:
@@ -170,15 +169,15 @@ class Growth:
             chosen = simplest_of_the_best(chosen, better)
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit a model with further groups, then the same model with bends; return all trials."""
+        """Fit `before` with further groups, then also with bends; return all these models."""
         added = tuple(group for group in groups if group in self.free)
         smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
         """
-        Fit the curve with its first column, and with more columns if they gain more than
-        `CLEAR_GAIN` in log density, because many curves explain the norms of the positions.
+        Fit the curve with its first column, and with more columns if they increase the log density
+        by more than `CLEAR_GAIN`: curves of many degrees explain the norms of few positions.
         """
         prior = constants.posterior.prior
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
@@ -195,7 +194,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus one or more groups, for the three largest possible gains."""
+        """Fit the chosen model plus one set of groups, for the three sets of largest gain."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -203,14 +202,12 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # Forward selection chooses at most 60 bend columns: a bump in the curve of an axis
-            # needs 20.
+            # Forward selection of up to 60 bend columns: a bump in the bias of an axis needs 20.
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
-        # Some groups are tried together, because one effect has columns in all of them: the curve
-        # of a part that lags by m, from the board or from the gradient, is
-        # (t - m)^2 = t^2 - 2 t m + m^2.
+        # Groups in which one effect has columns are tried together: the square of the temperature
+        # of a part with the lag m is (t - m)^2 = t^2 - 2 t m + m^2, with products and squares.
         together = PRODUCTS, (*LAGS, 'product', 'gradient_x_temperature', 'square')
         sets = [tuple(group for group in groups if group in absent) for groups in together]
         sets = [*((group,) for group in absent), *(groups for groups in sets if len(groups) > 1)]
@@ -227,15 +224,16 @@ class Growth:
 
     def _typical(self, chosen: Trial, groups: tuple[str, ...], most: Floats) -> Floats:
         """
-        Return the typical prior sd of a model with further groups. The sd of a new column is the
-        slope that explains the RMS residual of the chosen model, at most `most`.
+        Return the typical prior sd of the columns of the chosen model and of further groups. The
+        sd of a new column is the weight that explains the RMS residual, at most `most`.
         """
         regression, posterior = self.regression, chosen.posterior
         kelvins = regression.windows.kelvins
         state = posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
-            # Attitudes and offsets of rests in a pose absorb errors of the model: add their power.
+            # Attitudes and offsets of rests in a pose absorb errors of the model: add the mean
+            # squares of both to that of the residual.
             by_attitude = regression.gravity * state.from_pose
             square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
         slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
@@ -248,8 +246,8 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose by left-out data between fits begun with a small and with a large prior sd of mounting
     offsets. If left-out data do not decide, the fit begun with the large sd is chosen only if its
-    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the norms of
-    few positions equally well, but only misalignments predict the norm of another position.
+    log density exceeds the other by `CLEAR_GAIN`. Mounting offsets and misalignments explain the
+    norms of few positions equally well, but only misalignments predict the norm of a new position.
     """
     small, large = fits[0], fits[-1]
     evidence_gain = log_density(large.posterior) - log_density(small.posterior)
@@ -259,7 +257,7 @@ def better_start(fits: Sequence[Trial]) -> Trial:
 
 
 def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
-    """Return the model of the largest gain, or a smaller model that is not significantly worse."""
+    """Return the model of the largest gain or, if not significantly worse, a smaller model."""
     best = max(better, key=lambda trial: gain(before.score, trial.score))
     for trial in sorted(better, key=lambda trial: len(trial.groups)):
         if trial is best or not is_better(trial.score, best.score):
@@ -276,8 +274,8 @@ def select(
 ) -> Selected:
     """Choose the groups of columns by left-out data, and fit them."""
     growth = Growth(regression, candidates)
-    # Without a curve the drift is attributed to mountings or to noise: begin from a small and from
-    # a large prior sd of mounting offsets.
+    # A model of constants attributes the drift to mounting offsets or to noise: begin from a small
+    # and from a large prior sd of mounting offsets.
     priors = [prior]
     if prior.offset_scale > 0.0:
         large = float(prior.sigma.mean())
@@ -286,7 +284,7 @@ def select(
     constants = first = better_start(fits)
     trials = [constants]
     if CURVE in growth.free:
-        # The curve is added without a test, as it may improve the score only with other groups.
+        # The curve is added without a test: it may improve the score only with further groups.
         if regression.windows.has_drifts:
             curve = better_start([growth.extended(fit, (CURVE,)) for fit in fits])
             downweigh(regression, curve.posterior)
@@ -312,7 +310,7 @@ def select(
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
 ) -> tuple[Trial, list[Trial]]:
-    """Add groups to the curve, or to the curves of parts; return the best model and all trials."""
+    """Add groups to `first` or, if better, to `parts`; return the best model and all trials."""
     chosen, trials = first, []
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND])]
@@ -327,8 +325,8 @@ def _grown(
     trials += tried
     may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
-        # A change of slope of a part is visible only in a model with the lag of this part, not in
-        # a model whose products and squares approximate the lag. Further groups are added to a
+        # A bend of the curve of a part is found only in a model with the lag of this part, not in
+        # a model whose products and squares approximate the lag. Further groups are added to the
         # model with bends if its left-out error is below three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
@@ -340,7 +338,7 @@ def _grown(
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, with the final score, and models within one standard error."""
+    """Mark the chosen model, and the models within one standard error of its score."""
     marked = []
     for trial in trials:
         is_chosen = trial.groups == chosen.groups
@@ -357,9 +355,9 @@ def fit_all(
     candidates: Candidates,
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
-    """Fit all columns, with the informative prior of the largest log evidence if there are any."""
+    """Fit all columns, with the prior of `informative` that has the largest log density."""
     # Offsets of mountings would explain the norms of few positions as well as an ageing of the
-    # unit, so their sd is constant until an informative prior is chosen.
+    # unit, so the sd of these offsets is constant until an informative prior is chosen.
     scale = prior.offset_scale
     prior = replace(prior, offset_scale=0.0 if informative else scale)
     posterior = settle(regression, state, prior, candidates)
@@ -386,11 +384,11 @@ def finish(
     regression: Regression, chosen: Trial, candidates: Candidates
 ) -> tuple[Posterior, Score]:
     """
-    Complete the chosen model: reduce the weights of outliers, drop columns of little gain, try
-    large mounting offsets, and slow noise.
+    Complete the chosen model: reduce the weights of outliers, drop columns of little evidence, try
+    a large sd of mounting offsets, and try slow noise.
 
-    Slow noise also absorbs thermal effects that the model lacks, so it is kept only if it does not
-    worsen the correction of left-out data.
+    Slow noise may replace columns as the explanation of thermal effects, so it is kept only if the
+    correction of left-out data does not become worse.
     """
     downweigh(regression, chosen.posterior)
     posterior = settle(regression, chosen.posterior.state, chosen.posterior.prior, candidates)
@@ -411,12 +409,12 @@ def _with_large_offsets(
     regression: Regression, fitted: Trial, candidates: Candidates
 ) -> list[Trial]:
     """
-    Fit a model again from a large sd of mounting offsets; return [] if its sd is large already, or
-    if the left-out drift exceeds four times the noise of a window.
+    Repeat the fit of a model from a large sd of mounting offsets; return [] if the fitted sd is at
+    least `Prior.offset_scale`, or if the left-out drift exceeds four times the noise of a window.
 
-    A drift of the scale factor is proportional to the specific force along the axis, so drifts
-    also show the offsets of mountings; but large offsets would explain drifts that the model
-    lacks. Nine constants explain the norms of nine positions, but not their drifts.
+    Nine constants explain the norms of nine positions, whatever the mounting offsets. The drift of
+    a scale factor is proportional to the specific force along its axis, so drifts also determine
+    mounting offsets, if the model explains the drifts.
     """
     posterior = fitted.posterior
     prior, scale = posterior.prior, posterior.prior.offset_scale

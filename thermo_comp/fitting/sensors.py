@@ -3,8 +3,9 @@
 """
 Owns the estimation of thermometer and detector settings from bags, and the bags' thermal states.
 
-Rates are central differences over two minutes, which are not causal and need a recording. Noise,
-lag and ramps of the recorded test become settings of the causal thermometers and the detector.
+The rates of temperature here are central differences over two minutes, which are not causal and
+need a recording. The noise, the lag and the ramps of the test that these rates show become
+settings of the thermometers and of the regime detector, which are causal.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 @dataclass(frozen=True)
 class RateHistory:
-    """Rate of one thermometer over one bag, on a grid of ten seconds, and the rate's sd [K/s]."""
+    """Rate of a thermometer in a bag at intervals of ten seconds, and sd of its noise [K/s]."""
 
     rate: Floats
     rate_sd: float
 
     @property
     def is_resting(self) -> Bools:
-        """Whether each grid point has no ramp within five minutes before and after."""
+        """Whether there is no ramp within five minutes before and after each grid point."""
         moving = np.abs(self.rate) > max(0.2 * self.fastest, self.least_ramp)
         return np.asarray(np.convolve(moving, np.ones(61))[30:-30] < 0.5)
 
@@ -51,7 +52,7 @@ class RateHistory:
 
 
 def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
-    """Set the detector according to the noise, lags and ramps in the bags."""
+    """Return the detector settings for the noise, lags and ramps in the bags."""
     base = DetectorSettings()
     board = learn_thermometer([bag.board for bag in bags], base.board)
     case = learn_thermometer([bag.case for bag in bags], base.case)
@@ -70,27 +71,27 @@ def learn_detector(bags: Sequence[ReducedBag]) -> DetectorSettings:
 def learn_thermometer(
     recorded: Sequence[Readings], base: ThermometerSettings
 ) -> ThermometerSettings:
-    """Estimate one sensor's quantum, noise, lag and fastest ramp."""
+    """Estimate the quantum, noise, lag and fastest ramp of a thermometer from its readings."""
     long = [readings for readings in recorded if len(readings.value) >= 30]
     if not long:
         return base
     quantum = quantum_of(np.concatenate([readings.value for readings in long]))
-    # With a noise setting below 0.1 mK the thermometer's estimate would follow rounding errors.
+    # With a noise setting below 0.1 mK the estimated temperature would follow rounding errors.
     noise = max(_noise_of(long, quantum), 1e-4)
     histories = _rate_histories(recorded, noise, quantum)
     with_ramps = [history for history in histories if history.fastest > history.least_ramp]
     if not with_ramps:
         return replace(base, noise_sd_c=noise, quantum_c=quantum)
     fastest = max(history.fastest for history in with_ramps)
-    # At the beginning of a ramp the lagged temperature has the second derivative rate / lag, which
-    # is estimated from the difference of two rates one minute apart.
+    # When a ramp begins, a temperature with a first-order lag has the second derivative rate /
+    # lag, which is estimated from the difference of two rates one minute apart.
     lags = []
     for history in with_ramps:
         change = np.abs(history.rate[_BINS_PER_SIDE:] - history.rate[:-_BINS_PER_SIDE])
         if (steepest := float(np.quantile(change, 0.995)) / (_BIN_S * _BINS_PER_SIDE)) > 0.0:
             lags.append(history.fastest / steepest)
-    # The estimate of the temperature restarts after a pause longer than the lag, so the lag is at
-    # least three reading intervals.
+    # The estimate of the temperature restarts after a pause longer than the lag, so the setting of
+    # the lag is at least three times the interval between readings.
     interval_ns = max(float(np.median(np.diff(readings.stamp_ns))) for readings in long)
     least_s = min(max(30.0, 3e-9 * interval_ns), 3600.0)
     lag = float(np.clip(np.median(lags), least_s, 3600.0)) if lags else base.lag_s
@@ -98,14 +99,14 @@ def learn_thermometer(
         base,
         noise_sd_c=noise,
         quantum_c=quantum,
-        # Ramps in use may be faster than the ramps of the test, by a factor of up to 1.5.
+        # The temperature of a unit in use may change up to 1.5 times faster than in the test.
         fastest_ramp_k_min=max(base.fastest_ramp_k_min, 1.5 * 60.0 * fastest),
         lag_s=round(lag, 1),
     )
 
 
 def quantum_of(values: Floats) -> float:
-    """Return the quantum [K] of a sensor's readings, shape (n,); 0 for readings not rounded."""
+    """Return the step to which readings are rounded [K], their quantum, or 0 without rounding."""
     levels = np.unique(np.round(values, 9))
     if len(levels) < 2 or len(levels) > 0.5 * len(values):
         return 0.0
@@ -117,13 +118,12 @@ def quantum_of(values: Floats) -> float:
 
 
 def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
-    # Second differences of readings do not depend on a linear ramp; white noise of sd s gives them
-    # an sd of s sqrt(6).
+    # Second differences of readings contain no linear ramp; white noise of sd s gives s sqrt(6).
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
-    # Most rounded readings equal their neighbours, so the median of the differences is 0: use
-    # the differences' mean square without the largest 1 %, less the variance of rounding.
+    # Most rounded readings are equal to their neighbours, so the median difference is 0. The mean
+    # square without the largest 1 % is used instead, less the variance of rounding.
     square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
     noise = float(np.sqrt(max(float(square.mean()) / 6.0 - quantum**2 / 12.0, 0.0)))
     limit = 0.1 * quantum
@@ -132,10 +132,10 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
 
 def _flicker(recorded: Sequence[Readings]) -> float:
     """
-    Return the sd of the noise of readings with a wide quantum [K].
+    Return the sd of the noise of readings whose quantum is much larger than the noise [K].
 
-    At the rate r the noise of sd s moves readings of the interval h ``2 s / (r h sqrt(pi))`` times
-    over an edge between two values while the temperature passes the edge, and at least once.
+    While the temperature passes the edge between two rounded values at the rate r, readings with
+    interval h and noise of sd s change ``2 s / (r h sqrt(pi))`` times, but at least once.
     """
     moves = inverse_rates = 0.0
     for readings in recorded:
@@ -145,7 +145,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
         first = np.flatnonzero(np.diff(edges, prepend=np.nan))
         count = np.diff(np.append(first, len(edges)))
         edge, at_s = edges[first], time[changed[first]]
-        # Where the temperature turns back, it passes the same edge twice.
+        # Leave out edges where the temperature turns back, because it passes such an edge twice.
         step, apart_s = edge[2:] - edge[:-2], at_s[2:] - at_s[:-2]
         passes = np.abs(step) > 1e-9
         moves += float(np.sum(count[1:-1][passes] ** 2 - 1)) * float(np.median(np.diff(time))) ** 2
@@ -156,7 +156,7 @@ def _flicker(recorded: Sequence[Readings]) -> float:
 def _rate_histories(
     recorded: Sequence[Readings], noise: float, quantum: float
 ) -> list[RateHistory]:
-    """Return the rate in each bag with at least 30 readings and 6 minutes."""
+    """Return the rate of temperature in each bag of at least 30 readings over 6 minutes."""
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:
@@ -166,20 +166,20 @@ def _rate_histories(
         n_bins = int(time[-1] / _BIN_S)
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a minute is the change of the integral / the length of the minute.
+        # The mean over a minute is the change of the integral over the minute / 60 s.
         integral = cumulative_trapezoid(readings.value, time, initial=0)
         edges = np.interp(np.arange(n_bins + 1) * _BIN_S, time, integral)
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side
         rate = (means[_BINS_PER_SIDE:] - means[:-_BINS_PER_SIDE]) / side
         per_side = max(1.0, side * (len(time) - 1) / time[-1])
-        # Rounding errors are fully correlated while the temperature stays within a quantum.
+        # Rounding errors do not average out while the temperature changes by less than a quantum.
         spread = np.sqrt(2.0 * (noise**2 / per_side + quantum**2 / 12.0))
         result.append(RateHistory(rate, float(spread) / side))
     return result
 
 
 def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
-    """Return 0.7 times the slowest ramp longer than 10 min, at least `RAMP_K_MIN` [K/min]."""
+    """Return 0.7 times the rate of the slowest ramp over 10 min, or `RAMP_K_MIN` if larger."""
     slowest = usual / 0.7
     for history in histories:
         is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
@@ -192,7 +192,7 @@ def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
 
 
 def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> float:
-    """Return the amplitude of the ambient ripple in soaks [K], from rates and lag."""
+    """Return the amplitude of ripple of the ambient temperature in soaks [K]."""
     rates = [history.rate[history.is_resting] for history in histories]
     resting = np.concatenate(rates) if rates else np.zeros(0)
     if len(resting) < 60:
@@ -200,14 +200,14 @@ def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> flo
     noise = float(np.median([history.rate_sd for history in histories]))
     swing = float(np.quantile(np.abs(resting - np.median(resting)), 0.95))
     clean = float(np.sqrt(max(swing**2 - (2.0 * noise) ** 2, 0.0)))
-    # A ripple below the noise of the rates is not detected; the assumed ripple is at most the
-    # default.
+    # A ripple of up to 3 times the noise of the rates may be undetected: assume a ripple of this
+    # size, or of the default if the default is smaller.
     hidden = min(usual, 3.0 * noise * lag_s)
     return float(np.clip(max(clean * lag_s, hidden), 0.02, 1.0))
 
 
 def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dict[str, float]:
-    """Return T_sensor - T_board of each sensor at zero rate, from self-heating [K]."""
+    """Return T_sensor - T_board at constant temperature, due to self-heating, by sensor [K]."""
     result = {}
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]
@@ -234,7 +234,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 
 
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
-    """Return the bags without copies of the board's thermometer, and the names of the copies."""
+    """Return the bags without thermometers whose readings equal the board's, and their names."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
     is_read = any(len(bag.board.value) for bag in bags)
     copies = [
@@ -261,9 +261,8 @@ def board_span(bags: Sequence[ReducedBag], reference: float) -> tuple[float, flo
 
 def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:
     """
-    Return thermometer, stamp and value of each reading in the order of the stamps.
-
-    Readings with equal stamps are in the order of the thermometers in `inputs`.
+    Return thermometer, stamp and value of each reading in the order of the stamps, and for equal
+    stamps in the order of `inputs`.
     """
     rows: list[tuple[str, int, float]] = []
     for name in inputs:
@@ -278,9 +277,9 @@ def thermal_states(
     bag: ReducedBag, tracker: ThermalTracker, step_s: float
 ) -> tuple[float, Floats, Bools]:
     """
-    Run a tracker over a bag and sample it on a grid.
+    Run a tracker over a bag; evaluate its thermal state at intervals of `step_s`.
 
-    Returns the start of the grid [s], the states, and which states have recent readings.
+    Returns the time of the first state [s], the states, and whether each has recent readings.
     """
     readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
     reading = next(readings, None)
@@ -290,7 +289,7 @@ def thermal_states(
     board, *others = tracker.thermometers.values()
     limit_s, other_limit_s = tracker.config.temperature_timeout_s, tracker.config.case_timeout_s
     for stamp_ns in range(begin, max(bag.end_ns, begin) + step_ns, step_ns):
-        # As online, a thermal state includes the readings up to and including the state's stamp.
+        # As in the node, a state depends on all readings with a stamp up to that of the state.
         while reading is not None and reading[1] <= stamp_ns:
             tracker.read(*reading)
             reading = next(readings, None)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the base series of the windows (1, columns, their derivatives, readings), the filter that
-whitens them for slow noise, and the sums of their products.
+whitens these series for slow noise, and the sums of products of whitened series.
 
 All terms of the measurement equation (`equations`) are linear combinations of the base series, so
 the sums of the products of whitened base series in each position are sufficient statistics.
@@ -11,10 +11,10 @@ The noise is white plus exponentially correlated (first-order Gauss-Markov). Wit
 error of window k is ``c_k + e_k``: e_k is white with variance ``sigma^2 / weight_k``, c_k a
 stationary Gauss-Markov process of variance ``ratio sigma^2`` and correlation time T (IEEE Std 952,
 Annex B.4.3); a random walk is the limit for a long T. Flicker noise, the bias instability of a
-sensor, is the sum of such processes of equal variance, with the correlation times T, 10 T, 100 T
-and so on [2]_. The innovations of a Kalman filter for white plus Gauss-Markov noise, divided by
-their standard deviations, are white and contain the same information, so samples and columns that
-are filtered alike can be treated by ordinary least squares [1]_.
+sensor, is the sum of Gauss-Markov processes of equal variance, with the correlation times T, 10 T,
+100 T and so on [2]_. The innovations of a Kalman filter for white plus Gauss-Markov noise, divided
+by their standard deviations, are white and have all information of the series. If means and
+columns are filtered in this way, ordinary least squares is the optimal estimator [1]_.
 
 References
 ----------
@@ -47,13 +47,13 @@ class Whitener:
         n_steps = int(lengths.max())
         step = np.arange(n_steps)[:, None]
         self._is_there = step < lengths
-        #: Window number of each step of each position; 0 for steps beyond the position's end.
+        #: Number of the window at each step in each position; 0 after a position's last window.
         self._row = np.where(self._is_there, starts + step, 0)
         self._n = len(position)
         since = np.diff(time[self._row], axis=0, prepend=time[self._row[:1]])
         self._interval = interval = np.where(self._is_there, since, 0.0)
-        #: Candidate correlation times [s]: from 3 windows to a sixth of a position's length, in
-        #: steps of half a decade.
+        #: Correlation times to try [s]: from 3 windows to a sixth of the median length of a
+        #: position, in steps of half a decade.
         self.times_s: list[float] = []
         span_s = float(np.median(interval.sum(axis=0)))
         typical_s = float(np.median(interval[1:][self._is_there[1:]])) if n_steps > 1 else 1.0
@@ -61,10 +61,10 @@ class Whitener:
         while time_s <= span_s / 6.0:
             self.times_s.append(time_s)
             time_s *= 10.0**0.5
-        #: The correlation time after the longest candidate, up to which a search may go [s].
+        #: Upper bound of the correlation time in a search: half a decade above `times_s` [s].
         self._longest_s = time_s
-        #: Number of processes of flicker noise: the longest correlation time, from 3 windows on in
-        #: factors of ten, is at least the length of a position.
+        #: Number of processes of flicker noise. Their correlation times are 3 windows times powers
+        #: of ten, up to a time at least as long as a position.
         self.n_flicker = 1 + math.ceil(math.log10(max(span_s / (3.0 * typical_s), 1.0)))
 
     def shows(self, time_s: float) -> bool:
@@ -78,10 +78,10 @@ class Whitener:
         self, series: Floats, weight: Floats, noises: Sequence[Noise]
     ) -> Iterator[tuple[Ints, Bools, Floats, Floats]]:
         """
-        Run the Kalman filter over series, shape (n, m), for k noises of equally many processes.
+        Run the Kalman filter over series, (n, m), for k noises with equal numbers of processes.
 
-        Yields for each step: window of each position, whether the position has such a window,
-        innovations, (k, n_positions, m), and their variances [sigma^2], (k, n_positions).
+        Yields for step j: number of the j-th window of each position, whether the position has j
+        windows, innovations, (k, n_positions, m), and their variances [sigma^2], (k, n_positions).
         """
         times_s = np.array([[noise.times_s] for noise in noises])
         # Stationary covariance of the processes, which are independent of each other.
@@ -120,11 +120,11 @@ class Whitener:
         """
         Find the Gauss-Markov noise of residuals, shape (n, 3), by their profile likelihood.
 
-        The axes have a common variance ratio and correlation time; their white variances are
-        profiled out. The result is white noise unless slow noise raises twice the log likelihood
-        by 9.2, the 1 % point of a chi-square with two degrees of freedom.
+        The axes have a common variance ratio and correlation time; the likelihood is maximised
+        over the white variance of each axis. The result is white noise unless slow noise raises
+        twice the log likelihood by 9.2, the 1 % point of a chi-square with two degrees of freedom.
         """
-        # Candidates of the ratio of the Gauss-Markov variance to the white variance of a window.
+        # Ratios to try of the Gauss-Markov variance to the white variance of a window.
         ratios = 10.0 ** np.arange(-2.5, 3.6, 0.5)
         candidates = [Noise(float(ratio), time_s) for time_s in self.times_s for ratio in ratios]
         if not candidates:
@@ -152,7 +152,7 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return where the parabola through `values[at - 1 : at + 2]` is smallest, from -1 to 1."""
+    """Return the place of the minimum of the parabola through three values about `at`, -1..1."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
@@ -163,14 +163,14 @@ def _vertex(values: Floats, at: int) -> float:
 @dataclass(frozen=True)
 class Base:
     """
-    The base series of some columns, in this order: 1; the columns; for each column with a lag its
-    derivative w.r.t. the lag's initial state; t of the nonlinear terms; the temperatures of a
-    support (`Windows.tilt`); the measured values of the three axes less the mean of the position.
+    The base series of the active columns, in this order: 1; the columns; for each column with a
+    lag its derivative w.r.t. the initial state of the lag; t, if there are nonlinear terms; the
+    functions `Windows.tilt`; the readings of the three axes less their mean in the position.
 
-    columns: the active columns; lagged: indices in `columns` of the columns with a lag
+    columns: numbers of the active columns; lagged: indices in `columns` of columns with a lag
     lag: number of the lag of each column in `lagged`
-    at_start, t, tilts, measured: indices of the derivatives w.r.t. the initial lag states, of t
-        for nonlinear terms, (1,) or (0,), of a support's temperatures, of the measured values
+    at_start, t, tilts, measured: indices of the derivatives w.r.t. the initial lag states, of t,
+        (1,) or (0,), of the functions `Windows.tilt`, and of the readings, in the base series
     """
 
     columns: Ints
@@ -198,12 +198,11 @@ class Base:
 @dataclass(frozen=True)
 class Products:
     """
-    Sums over the windows of the products of each two base series.
+    Sums, over windows, of the products of all pairs of whitened base series.
 
-    base: the base series
-    means: mean of each series in each position, shape (n_positions, n_base)
-    cells: products in each position and section, shape (n_cells, n_base, n_base)
-    first: first cell of each position; section: section of each cell
+    means: mean of each series (not whitened) in each position, shape (n_positions, n_base)
+    cells: sums over each cell, the windows of one position and section, (n_cells, n_base, n_base)
+    first: index of the first cell of each position; section: section number of each cell
     """
 
     base: Base
@@ -214,11 +213,11 @@ class Products:
 
     @cached_property
     def of_positions(self) -> Floats:
-        """Products summed over each position, shape (n_positions, n_base, n_base)."""
+        """Sums of products over each position, shape (n_positions, n_base, n_base)."""
         return np.asarray(np.add.reduceat(self.cells, self.first, axis=0))
 
     def without(self, sections: Ints) -> Floats:
-        """Products summed over each position without some sections, shape of `of_positions`."""
+        """Return the sums over each position, without the windows of the given sections."""
         result: Floats = self.of_positions.copy()
         left_out = np.flatnonzero(np.isin(self.section, sections))
         position = np.searchsorted(self.first, left_out, side='right') - 1
@@ -228,9 +227,8 @@ class Products:
 
 class Series:
     """
-    The series of the windows, in m/s^2 by the nominal scale factors.
+    The base series of a fit's windows; readings are converted to m/s^2 by nominal scale factors.
 
-    windows: the data
     nominal_scale: nominal scale factors [input units per m/s^2], shape (3,)
     t: board temperature less the reference for nonlinear terms [K], shape (n, 1) or (n, 0)
     """
@@ -247,7 +245,7 @@ class Series:
         # Derivatives below 1e-9 are set to 0, because arithmetic with denormal numbers is slow.
         self._starts = np.where(np.abs(windows.start) < 1e-9, 0.0, windows.start) / self.rms
         values, vectors = np.linalg.eigh(windows.start_covariance)
-        # The initial lag states are strongly correlated: few components have nearly all variance.
+        # The initial lag states are so correlated that few principal components suffice.
         kept = values > 1e-6 * values.max(initial=0.0)
         #: Root of the prior covariance of the initial lag states, shape (n_lags, r).
         self.start_root = vectors[:, kept] * np.sqrt(values[kept])
@@ -262,13 +260,13 @@ class Series:
         self.reweigh(windows.weight * shares)
 
     def reweigh(self, weight: Floats) -> None:
-        """Use weights of the windows, shape (n,), in all products."""
+        """Set the weights of the windows, shape (n,)."""
         self.weight = weight
         self.noise: Noise | None = None
         self._products: Products | None = None
 
     def whiten(self, noise: Noise) -> None:
-        """Use a noise model, with which the series are whitened."""
+        """Set the noise for which the series are whitened."""
         if noise == self.noise:
             return
         self.noise, self._products = noise, None
@@ -276,7 +274,7 @@ class Series:
         self.noise_determinant = self.whitener.log_determinant(self.weight, noise)
 
     def products(self, used: Bools) -> Products:
-        """Return the products of the active columns, shape (2, m), for the current noise."""
+        """Return the sums of products for the active columns, (2, m), and the noise last set."""
         active = np.flatnonzero(used.any(axis=0))
         if self._products is None or not np.array_equal(self._products.base.columns, active):
             base = Base.of(active, self.windows.lag, self._n_t, self.windows.tilt.shape[1])
@@ -293,8 +291,8 @@ class Series:
 
     def products_of(self, columns: Ints, base: Base, state: State) -> tuple[Floats, Floats]:
         """
-        Return the products of some columns, at the initial lag states of `state`, with each other
-        and with a base, in each position, shapes (n_positions, k, k) and (n_positions, k, n_base).
+        Return the sums of products of k columns, at the initial lag states of `state`, with each
+        other and with base series, shapes (n_positions, k, k) and (n_positions, k, n_base).
         """
         values, lag = self.columns[:, columns], self.windows.lag[columns]
         start = (state.start @ self.start_root.T)[self.windows.bag]
@@ -316,13 +314,13 @@ class Series:
         return np.hstack((self._ones, self.columns[:, base.columns], at_start, self._others))
 
     def starts(self, state: State, base: Base) -> Floats:
-        """Return the initial state of the lag of each column with a lag, (n_positions, m) [K]."""
+        """Return the initial lag state of each column in `base.lagged`, (n_positions, m) [K]."""
         return np.asarray((state.start @ self.start_root.T)[self.bag_of_position][:, base.lag])
 
     def at_starts(self, rows: Floats, state: State, base: Base) -> Floats:
         """
-        Convert linear functions of the base series, (n_positions, k, n_base), from columns at the
-        prior mean of the initial lag states to columns at the initial lag states of `state`.
+        Convert linear functions of the base series, (n_positions, k, n_base): the columns, which
+        have initial lag states at the prior mean, get the initial lag states of `state`.
         """
         if not len(base.lagged):
             return rows
@@ -333,6 +331,6 @@ class Series:
         return result
 
     def products_at(self, products: Floats, state: State, base: Base) -> Floats:
-        """Convert products of base series as `at_starts` does, (n_positions, n_base, n_base)."""
+        """Convert sums of products as `at_starts` does, shape (n_positions, n_base, n_base)."""
         half = self.at_starts(products, state, base)
         return self.at_starts(np.swapaxes(half, 1, 2), state, base)

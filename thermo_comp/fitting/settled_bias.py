@@ -3,8 +3,8 @@
 """
 Owns the expected error of the bias at constant temperatures, after all lags have settled.
 
-Bags that all begin at one temperature show lags only together with the temperature itself, so
-their settled bias is an extrapolation.
+In bags that all begin at one temperature the lags change together with the board temperature, so
+such bags do not determine the bias after the lags have settled: it is extrapolated.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from ..typing import Floats
 from .regression import Posterior, Regression
 
-# Number of windows that are sufficient for the mean sd of the bias in the windows.
+# Number of windows that are sufficient to compute the RMS, over the windows, of the bias sd.
 _N_WINDOWS = 500
 
 
@@ -24,9 +24,9 @@ def settled_error(
     """
     Return the expected error of the settled bias [m/s^2]; infinite for a model without a curve.
 
-    The error is the root sum of squares of the sd of the settled bias, and of the left-out drift
-    beyond the noise, `excess` [m/s^2], times the ratio of that sd to the sd in the windows, at
-    least 1. `settled`: columns at settled temperatures, shape (k, m).
+    The error is the root sum of squares of two terms: the posterior sd of the settled bias; and
+    `excess`, the left-out drift beyond the noise [m/s^2], times the ratio (if above 1) of this sd
+    to that of the bias in the windows. `settled`: columns at settled temperatures, shape (k, m).
     """
     if not posterior.layout.used[0].any():
         return np.inf
@@ -35,13 +35,13 @@ def settled_error(
         _sd_of_changes(posterior, columns - columns.mean(axis=0))
         for columns in (settled / regression.rms, seen)
     )
-    # `seen_sd` is 0 if the temperature, and with it every column, is constant in the windows.
+    # `seen_sd`, the sd in the windows, is 0 if all columns are constant in the windows.
     growth = max(sd / seen_sd, 1.0) if seen_sd else 1.0
     return float(np.hypot(sd, excess * growth))
 
 
 def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
-    """Return the RMS sd of the bias [m/s^2] of three axes due to columns, shape (k, m)."""
+    """Return the RMS, over axes and rows of columns (k, m), of the sd of the bias [m/s^2]."""
     parts = posterior.layout.by_weights(columns, np.zeros(3))
     square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)
     return float(np.sqrt(square / (3 * len(columns))))

@@ -23,7 +23,7 @@ from .known_force import USUAL_FORCE, ForceOptions, KnownForce, known_force
 
 
 def angular_velocity(block: object) -> Floats | None:
-    """Return the angular rate [rad/s] of a block of Imu messages; None for none, or zeros only."""
+    """Return the angular rate [rad/s] of a block of Imu messages; None if absent or all 0."""
     imu = getattr(block, 'imu', None)
     if imu is None or (imu.angular_velocity_covariance[:, 0] == -1.0).any():
         return None
@@ -34,11 +34,11 @@ def angular_velocity(block: object) -> Floats | None:
 @dataclass(frozen=True)
 class FitSource:
     """
-    One bag, table, array or simulated run.
+    A bag, table, array or simulated run.
 
-    blocks: returns, at each call, a new iterable of the blocks in file order
+    blocks: function that returns a new iterable of the blocks in file order
     force: known |f|, or None if |f| is gravity
-    reader: returns the last reader of the recording, or None for arrays
+    reader: function that returns the last reader of the recording, or None for arrays
     """
 
     name: str
@@ -53,7 +53,7 @@ def fit_sources(
     paths: Sequence[str | Path], topics: Topics | None = None, force: ForceOptions = USUAL_FORCE
 ) -> tuple[list[FitSource], Input]:
     """
-    Make sources of recordings; each recording is opened by this function and again by the fit.
+    Make sources of recordings; a fit opens each recording again.
 
     Raises RecordingError if a recording cannot be read or lacks a topic, and FitError if a
     recording is given twice, or if some recordings have counts and some have Imu messages.
@@ -85,7 +85,7 @@ def recording_source(
     force: ForceOptions = USUAL_FORCE,
 ) -> tuple[FitSource, RecordingInfo]:
     """
-    Make a source of a recording, which is opened by this function and again for each pass.
+    Make a source of a recording; each iteration over its blocks opens the recording again.
 
     `require`: topics that the recording must have; `force`: the user's options about |f|, which
     replace the bag's metadata

@@ -14,12 +14,12 @@ from ..typing import Floats, Ints
 
 class Normal(NamedTuple):
     """
-    Normal equations of each axis without any prior, in the order of `Tangent`.
+    Normal equations of each axis without the prior; the order of unknowns is that of `Tangent`.
 
     local: products of the derivatives w.r.t. the unknowns of positions and bags with all
         derivatives and the residual, shape (n_positions, 3, n_local, k + 1)
-    unit: products of the derivatives w.r.t. the unknowns of the unit and of the residual with each
-        other, sum over the positions, shape (3, n, n)
+    unit: products of the derivatives w.r.t. the unknowns of the unit, and of the residual, with
+        each other, summed over the positions, shape (3, n, n)
     """
 
     local: Floats
@@ -40,20 +40,20 @@ class Tangent:
     """
     The equations linearised about a state, as coefficients of the base series at this state.
 
-    The derivative of the readings w.r.t. an unknown is a factor times one base series or one of a
-    few combinations of base series. For axis i, position p and unknown u the derivative is
-    ``factor[p, i, u]`` times series ``place[u]``, in the order base series, combinations. An axis
-    has unknowns of the position (2 of the attitude, stretch, offset, tilts), then those of the bag
-    (initial lag states, turn-on offset), then those of the unit (kappa, bias, weights, nonlinear
-    coefficients, radius, 3 of the misalignment, 2 of each pose). The last "unknown" is the
-    residual, measured minus predicted.
+    The derivative of the readings w.r.t. an unknown is a factor times a base series, or times one
+    of the combinations `combined` of base series. For axis i, position p and unknown u the
+    derivative is ``factor[p, i, u]`` times the series of index ``place[u]``; combinations are
+    counted after the base series. The unknowns of an axis are those of the position (2 of the
+    attitude, stretch, offset, tilts), then those of the bag (initial lag states, turn-on offset),
+    then those of the unit (kappa, bias, weights, nonlinear coefficients, radius, 3 of the
+    misalignment, 2 of each pose). The last place is for the residual, measured minus predicted.
 
     combined: the combinations of base series, shape (n_positions, 3, n_base, n_combined)
     place: index of the series of each unknown, shape (k + 1,)
     factor: factor of the series of each unknown, shape (n_positions, 3, k + 1)
     n_local: number of unknowns of position and bag
-    n_bias: number of unknowns after kappa with factor 1: the bias and its weights
-    n_scale: number of weights of the scale, which follow those of the bias
+    n_bias: number of unknowns after kappa that have the factor 1: the bias and its weights
+    n_scale: number of weights of the scale, which follow the weights of the bias
     scale: factor of the weights of the scale, shape (n_positions, 3)
     """
 
@@ -74,8 +74,8 @@ class Tangent:
         place = self.place[first:]
         n, bias = len(place), slice(1, 1 + self.n_bias)
         scale = slice(bias.stop, bias.stop + self.n_scale)
-        # Sums over the positions of the products of the base series, times powers of the factor of
-        # the scale's weights.
+        # Sums over the positions of the products of the base series, times the powers 0, 1 and 2
+        # of the factor of the scale's weights.
         powers = np.stack([self.scale**k for k in range(3)])
         sums = np.tensordot(powers.transpose(2, 0, 1), products, 1)
         unit = np.empty((3, n, n))
@@ -91,7 +91,7 @@ class Tangent:
         return Normal(rows_of[:, :, :first], unit)
 
     def _rows(self, unknowns: Ints, products: Floats, with_combined: Floats) -> Floats:
-        """Return the normal equations of some unknowns, (n_positions, 3, m, k + 1)."""
+        """Return the rows of the normal equations of m unknowns, (n_positions, 3, m, k + 1)."""
         n, series = products.shape[-1], self.place[unknowns]
         base, combined = np.flatnonzero(series < n), np.flatnonzero(series >= n)
         by_series = np.empty((*with_combined.shape[:2], len(series), n + with_combined.shape[-1]))
@@ -106,14 +106,15 @@ class Tangent:
         return np.asarray(result)
 
     def at(self, places: Ints) -> Tangent:
-        """Return the equations of some positions."""
+        """Return the equations of the positions `places`."""
         kept = {name: getattr(self, name)[places] for name in ('combined', 'factor', 'scale')}
         return replace(self, **kept)
 
     def of(self, rows: Floats) -> Floats:
         """
-        Apply the derivatives to linear functions of the base series, such as their means, shape
-        (n_positions, m, n_base); return their derivatives, shape (n_positions, 3, m, k + 1).
+        Return the derivatives of m linear functions of the readings, such as the mean, shape
+        (n_positions, 3, m, k + 1). `rows`: these functions of the base series, shape
+        (n_positions, m, n_base)
         """
         combined = rows[:, None] @ self.combined
         of_base = np.broadcast_to(rows[:, None], (*combined.shape[:3], rows.shape[2]))

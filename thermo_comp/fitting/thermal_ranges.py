@@ -27,14 +27,13 @@ def union(ranges: Iterable[Range]) -> Range:
 
 def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range:
     """
-    Return the valid range of a quantity that is a power (`order`) of a heat flow: the range of its
-    values with a margin, extended to ramps twice as fast, since the response to a heat flow is
-    linear. The range of a temperature (order 0) is not extended to faster ramps.
+    Return the valid range of a quantity that is proportional to a power (`order`) of a heat flow:
+    the range of its values with a margin, extended by a factor 2^order to ramps of twice the rate,
+    as heat flow is proportional to the rate. The range of a temperature (order 0) is not extended.
     """
     ratio = 2.0**order
     lower, upper = float(np.min(values)), float(np.max(values))
-    # The margin is 2 % of the span, so that thermometer noise does not put the fitted data outside
-    # the valid range.
+    # The margin of 2 % of the span allows for the noise of thermometers in use.
     margin = max(0.02 * (upper - lower), smallest_margin)
     lower, upper = lower - margin, upper + margin
     return min(lower, ratio * lower), max(upper, ratio * upper)
@@ -42,25 +41,25 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 def temperature_range(windows: ThermalWindows) -> Range:
     """Return the valid range of board temperatures [degC]."""
-    # The calibration of a test at one temperature is valid within 0.5 K, or within 50 K without a
-    # thermometer, because then the covariance of the slope covers the unknown curve.
+    # A calibration from one temperature is valid within 0.5 K of it or, without a thermometer,
+    # within 50 K, because the covariance then includes an unknown slope over temperature.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 
 def soak_gradient(windows: ThermalWindows, known: Calibration | None) -> Range | None:
     """
-    Return the first sensor's gradient in soaks and the gradient's robust scatter [K], from a prior
-    calibration that states both, or None without the sensor or a soak.
+    Return the gradient of the first sensor in soaks and its robust scatter [K], from the prior
+    calibration `known` if it has both; None without the sensor or without a soak.
     """
     if known is not None and known.soak_gradient_k is not None:
         return known.soak_gradient_k
     rate = 60.0 * np.abs(windows.rate)
-    # If the rate is noisy, the slowest tenth of the windows counts as soak.
+    # If the rate is noisy, the tenth of the windows with the smallest rates counts as soak.
     slowest = max(0.2 * RAMP_K_MIN, float(np.quantile(rate, 0.1)))
     is_soak = rate <= slowest
     if not windows.gradient.any() or slowest > RAMP_K_MIN or is_soak.sum() < 5:
         return None
-    # While a soak settles, the gradient changes with the rate: fit a line over the rate.
+    # The gradient at rate 0 follows from a line over the rate, which is not yet 0 in a soak.
     gradient, by_rate = windows.gradient[is_soak], np.vander(windows.rate[is_soak], 2)
     slope, middle = np.linalg.lstsq(by_rate, gradient, rcond=None)[0].tolist()
     scatter = np.abs(gradient - by_rate @ (slope, middle))
@@ -71,11 +70,11 @@ def rest_gradient_range(
     windows: ThermalWindows, lag_s: float, known: Calibration | None
 ) -> Range | None:
     """
-    Return the range of the first sensor's gradient, less the part of ramps, ``lag_s * rate``.
+    Return the range of the first sensor's gradient less ``lag_s * rate``, its change in ramps.
 
     The range of a prior calibration, `known`, is included. If the prior has no range, the result
-    is None without the sensor, without ramps, which determine the lag, or for a range beyond
-    100 K, as in bags that are too short for a rate.
+    is None without the sensor, without ramps, which determine the lag, or for values above 100 K,
+    as in bags that are too short for a rate.
     """
     lower, upper = valid_range(windows.gradient - lag_s * windows.rate, 0.01)
     is_small = max(-lower, upper) < 100.0
@@ -87,8 +86,8 @@ def rest_gradient_range(
 
 def measured_board_lag(windows: ThermalWindows) -> float:
     """
-    Return the lag of the board behind the case [s], negative if the board leads; NaN without ramps
-    or without a case temperature.
+    Return the lag of the board temperature behind that of the case [s], negative if the board
+    leads; NaN without ramps or without a case temperature.
     """
     return _slope_of_gradient(windows) if _has_gradients(windows) else np.nan
 
@@ -100,7 +99,7 @@ def _has_gradients(windows: ThermalWindows) -> bool:
 
 
 def usable_board_lag(windows: ThermalWindows) -> float:
-    """Return the lag of the board behind the case [s], or `USUAL_BOARD_LAG_S` if implausible."""
+    """Return the lag of the board behind the case [s]; `USUAL_BOARD_LAG_S` if not 1..1e5 s."""
     lag = _slope_of_gradient(windows)
     return lag if 1.0 <= lag <= 1e5 else USUAL_BOARD_LAG_S
 

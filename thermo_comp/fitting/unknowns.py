@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 #: Built-in prior sd of a bias [m/s^2]: 100 mg, above the data sheets of consumer MEMS.
 BIAS_SD = 1.0
-#: Built-in prior sd of a relative scale factor.
+#: Built-in prior sd of an axis' scale factor, relative to the mean of the axes.
 SCALE_SD = 0.05
 #: Typical sd of the attitude of a unit that is returned to a pose by hand [rad].
 POSE_SD = 1e-3
-#: Built-in prior sd of an element of the misalignment [rad] of a triad of single sensors.
+#: Smallest built-in prior sd of an element of the misalignment [rad], see `misalignment_scale`.
 MISALIGNMENT_SD = 1e-3
 
 
@@ -40,10 +40,10 @@ class Windows:
     """
     The data of a fit: windows sorted by position and time, with every column of the table.
 
-    position, bag: position and bag of each window, from 0; a position lies in one bag, shape (n,)
-    section: number of the program section, from 0, rising with time in a position, shape (n,)
+    position, bag: number of each window's position (within one bag), and bag, from 0, shape (n,)
+    section: number of the section of the program, from 0, see `windows.N_SECTIONS`, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
-    weight: number of samples divided by that of a typical window, shape (n,)
+    weight: number of samples divided by the median number of a window, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
     columns: values of the columns in their physical units, with the initial lag states at their
         prior mean, shape (n, m)
@@ -53,20 +53,20 @@ class Windows:
     lag: number of the lag of each column; -1 for none, shape (m,)
     start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
     start_covariance: prior covariance of the initial lag states [K^2], shape (n_lags, n_lags)
-    in_scale: columns that the scale may have as well as the bias, shape (m,)
-    tilt: temperatures with which a support may tilt, divided by their RMS, shape (n, k)
+    in_scale: whether each column may act on the scale as well as on the bias, shape (m,)
+    tilt: functions of temperature, of RMS 1, of which a support's tilt is a sum, shape (n, k)
     forces: known |f| and nonlinear terms, or None if |f| is gravity in all positions
     undisturbed: factors of the weights, below 1 for disturbed windows, shape (n,), or None if the
         fit estimates them
-    acts_on: axes that each column acts on, shape (m, 3); None for all
-    pose: number of the pose to which the unit was returned in each position, -1 for none, shape
-        (n_positions,), or None if the unit was not returned
-    has_prior: whether the prior is a calibration
+    acts_on: axes on which each column acts, shape (m, 3); None if on all axes
+    pose: number of the pose of each position, -1 without a pose, shape (n_positions,), or None if
+        the unit was never returned to an attitude
+    has_prior: whether the fit has a prior calibration
     board: temperature of the board [degC] and the variance of its estimate [K^2], shape (n, 2), or
         None if unknown
     board_noise: sd of the noise of a reading of the board's thermometer [K]
-    settled: values of the columns at constant temperatures over the range of the windows, when all
-        lags have settled, shape (k, m), or None if unknown
+    settled: values of the columns at k constant temperatures over the range of the windows, with
+        settled lags, shape (k, m), or None if the fit does not use them
     """
 
     position: Ints
@@ -99,7 +99,7 @@ class Windows:
 
     @cached_property
     def share(self) -> Floats:
-        """Prior sd of each axis's weights / column_sd; 1e-6 where `acts_on` is false, (3, m)."""
+        """Prior sd of weights / `Prior.column_sd`: 1, or 1e-6 if not in `acts_on`, (3, m)."""
         acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(acts.T, 1.0, 1e-6)
 
@@ -124,8 +124,8 @@ class Windows:
         """
         Number of the mounting of each position, from 0, shape (n_positions,).
 
-        Successive positions of a bag whose readings differ by less than 2 degrees are rests of one
-        mounting, which a knock or a gap interrupted.
+        Successive positions of a bag whose mean readings differ in direction by less than 2
+        degrees are rests of one mounting, interrupted by a knock or a gap.
         """
         first, bag = self.edges[:-1], self.bag_of_position
         means = np.add.reduceat(self.mean, first, axis=0) / np.diff(self.edges)[:, None]
@@ -145,22 +145,22 @@ class Windows:
 
     @property
     def n_turn_ons(self) -> int:
-        """Number of turn-ons, one for each bag."""
+        """Number of turn-ons: each bag counts as one turn-on."""
         return len(np.unique(self.bag))
 
     @cached_property
     def has_turn_ons(self) -> bool:
         """
-        Whether turn-on offsets are unknowns: several turn-ons, or a prior calibration, and at
-        least two mountings per turn-on on average. Fewer mountings do not separate both kinds of
-        offsets; without a prior the offset of a single turn-on is part of the bias.
+        Whether the fit has turn-on offsets as unknowns: if there are several turn-ons or a prior
+        calibration (else the offset of a single turn-on is part of the bias), and on average two
+        or more mountings per turn-on, which separate turn-on offsets from mounting offsets.
         """
         least = 1 if self.has_prior else 2
         return least <= self.n_turn_ons <= (int(self.mounting[-1]) + 1) / 2
 
     @property
     def inner(self) -> Ints:
-        """Windows that are followed by two further windows of their position."""
+        """Indices of windows that are followed by two further windows of their position."""
         return np.flatnonzero(self.position[2:] == self.position[:-2])
 
     @property
@@ -175,8 +175,8 @@ class Noise(NamedTuple):
     The slow noise: one Gauss-Markov process; or flicker noise (bias instability), the sum of
     several such processes of equal variance, whose correlation times rise by factors of ten.
 
-    ratio: stationary variance of each process / white variance of a typical window; 0 without
-        slow noise
+    ratio: stationary variance of each process, divided by the white-noise variance of a window of
+        weight 1; 0 without slow noise
     time_s: the shortest correlation time [s]
     n_times: number of Gauss-Markov processes
     """
@@ -192,21 +192,21 @@ class Noise(NamedTuple):
 
     @property
     def variance(self) -> float:
-        """Variance of all Gauss-Markov processes / white variance of a typical window."""
+        """Variance of the sum of the processes / white-noise variance of a window of weight 1."""
         return self.ratio * self.n_times
 
     @property
     def rate(self) -> float:
-        """Rate of the equivalent random walk at short times / white sd [1/sqrt(s)]."""
+        """Rate of the random walk at short times / white-noise sd of a window [1/sqrt(s)]."""
         return math.sqrt(sum(2.0 * self.ratio / time_s for time_s in self.times_s))
 
 
 @dataclass(frozen=True)
 class InformativePrior:
     """
-    Gaussian prior of the unit's parameters in the order of `Layout`.
+    Gaussian prior of the unit's parameters in the order of `Layout`, from a prior calibration.
 
-    mean: shape (n_unit,)
+    mean: mean of the parameters, shape (n_unit,)
     root: upper triangular R with ``R.T @ R`` the inverse covariance, shape (n_unit, n_unit)
     log_density: log prior density of the ageing that this prior assumes
     is_changed: whether the covariance is far wider than that of the prior calibration
@@ -228,24 +228,23 @@ class Prior:
     misalignment_sd: sd of the elements of M [rad]
     column_sd: sd of the weights of the columns, each divided by its RMS, in the bias [m/s^2] and
         in the scale (relative); 0 for an inactive column, shape (2, m)
-    offset_sd: sd of the bias offset of each position and axis, of mounting and turn-on [m/s^2]
-    turn_on_sd: sd of the bias offset that all positions of a bag share, its turn-on [m/s^2]
-    sigma: sd of the white noise of a typical window [m/s^2], shape (3,)
+    offset_sd: sd of the bias offset of a position on each axis [m/s^2], due to its mounting and,
+        if turn-on offsets are no unknowns, to its turn-on
+    turn_on_sd: sd of the bias offset of a turn-on, common to the positions of a bag [m/s^2]
+    sigma: sd of the white noise of a window of weight 1 [m/s^2], shape (3,)
     least_sigma: lower bound of sigma [m/s^2]; by default it is below the noise of any sensor
     noise: slow noise
-    offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd [m/s^2]; 0: both
-        are constant
+    offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd, 0: constant [m/s^2]
     misalignment_scale: value of misalignment_sd before the data are used [rad]
-    unseen_misalignment_sd: sd of the elements of M [rad] in the covariance of a fit whose
-        positions do not show M, and whose `misalignment_sd` is constant; 0 for other fits
-    tilt_sd: sd of the tilt of a support [rad per RMS of the temperature]
-    pose_sd: sd of the attitude of a position about its pose [rad]; the prior of other attitudes is
-        flat
+    unseen_misalignment_sd: sd of the elements of M [rad] in the published covariance, if positions
+        near the faces do not determine M and `misalignment_sd` is a smaller constant; else 0
+    tilt_sd: sd of the coefficients of the tilts of a support [rad], see `Windows.tilt`
+    pose_sd: sd of attitudes about their pose [rad]; the prior of attitudes without pose is flat
     start_variance_ratio: variance of the initial lag states / their variance in the node's prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive coefficient, shape (2 k,)
-    informative: prior that replaces all sd of the unit's parameters; with an informative prior
-        column_sd only marks the active columns
+    informative: prior that replaces all sd of the unit's parameters; column_sd is then only used
+        to mark the active columns by values above 0
     """
 
     bias_sd: Floats
@@ -277,16 +276,16 @@ class State:
     weights: weights of the columns, each divided by its RMS, in the bias [m/s^2] and in the scale
         (relative), shape (2, 3, m)
     misalignment: elements of the inverse of M below the diagonal, shape (3,)
-    up: attitude of each position, shape (n_positions, 3)
+    up: upward unit vector of each position, its attitude, shape (n_positions, 3)
     offset: bias offset of each position [m/s^2], shape (n_positions, 3)
-    tilt: tilts of the support along the attitude's tangents, shape (n_positions, k, 2)
+    tilt: coefficients of the support's tilts along the tangents [rad], shape (n_positions, k, 2)
     start: initial lag states of each bag, in units of their sd, shape (n_bags, r)
     turn_on: bias offset of each bag's turn-on [m/s^2], shape (n_bags, 3) or (n_bags, 0)
     nonlinear: nonlinear coefficients in the order of `Forces`, shape (3, 2 k)
-    radius: relative error of the radius, shape (1,) or (0,)
+    radius: relative error of a centrifuge's radius, common to all positions, shape (1,) or (0,)
     stretch: relative error of the known |f|, shape (n_positions, 1) or (n_positions, 0)
-    pose: the poses to which the unit was returned, shape (n_poses, 3)
-    pose_of: pose of each position, -1 for none, shape (n_positions,); (0,) without poses
+    pose: upward unit vectors of the poses, shape (n_poses, 3)
+    pose_of: number of each position's pose, -1 without one, (n_positions,); (0,) without poses
     """
 
     kappa: Floats
@@ -312,8 +311,8 @@ class State:
     @cached_property
     def tangents(self) -> Floats:
         """
-        Two vectors perpendicular to each attitude, shape (n, 3, 2). The tangents of an attitude in
-        a pose are those of the pose, projected perpendicular to the attitude.
+        Two vectors perpendicular to each attitude, shape (n, 3, 2). For an attitude with a pose,
+        the vectors are the tangents of the pose, projected perpendicular to the attitude.
         """
         result = tangent_basis(self.up)
         if self.pose.size:
@@ -329,7 +328,7 @@ class State:
 
     @property
     def from_pose(self) -> Floats:
-        """Rotation from a pose to each attitude in it, along the pose's tangents, (k, 2) [rad]."""
+        """Rotation of k attitudes from their poses, along the tangents of the pose, (k, 2)."""
         posed = self.pose_of[self.pose_of >= 0]
         change = self.up[self.pose_of >= 0] - self.pose[posed]
         return np.asarray(np.einsum('pi,pij->pj', change, self.pose_tangents[posed]))
@@ -345,13 +344,13 @@ def tangent_basis(up: Floats) -> Floats:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross products of vectors, several times faster than `numpy.cross`, (n, 3)."""
+    """Return the cross products of vectors, (n, 3), several times faster than `numpy.cross`."""
     after, before = [1, 2, 0], [2, 0, 1]
     return np.asarray(a[:, after] * b[:, before] - a[:, before] * b[:, after])
 
 
 def inverse_misalignment(misalignment: Floats) -> Floats:
-    """Return A = M^-1, from output frame to sensitivity axes: lower triangular, diagonal of 1."""
+    """Return the inverse of M, from its three elements below the diagonal of 1, (3, 3)."""
     matrix = np.eye(3)
     matrix[1, 0], matrix[2, 0], matrix[2, 1] = misalignment
     return matrix

@@ -3,10 +3,10 @@
 """
 Owns the error of an axis at temperatures at which no position had gravity along this axis.
 
-The drift of a bias shows in each attitude, but a scale factor shows in |f| only where gravity acts
-along its axis. A recording in one attitude at new temperatures therefore extends the range of all
-axes, and determines the scale factor of one axis there. The scale factors of the other axes are
-extrapolated: their error is part of the lack of fit.
+A scale factor has an effect on the readings only if gravity acts along its axis. A recording in
+one attitude at new temperatures extends the temperature range of the calibration, but determines
+only the scale factor of the vertical axis at these temperatures. The scale factors of the other
+axes are extrapolated, and the error of this extrapolation is added to the lack of fit.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from .selection import Fit
 from .thermal_ranges import Range, union
 from .windows import CURVE, PART
 
-#: Smallest share of gravity along an axis in a position that determines the axis' scale factor. At
-#: a half, the error of |f| is a quarter of the scale factor's error.
+#: Smallest component of gravity along an axis, in g, for a position to determine the scale factor
+#: of the axis. At 0.5, the relative error of |f| is a quarter of that of the scale factor.
 LEAST_GRAVITY_SHARE = 0.5
-#: Share of the temperature range of an axis by which its scale curve continues without error. The
-#: ranges of the positions of one test differ by about this share.
+#: Extrapolation of a scale factor without added error, relative to the temperature range of the
+#: positions along its axis; the ranges of the positions of one test differ by about this ratio.
 FREE_RANGE_SHARE = 0.1
 #: Extrapolation of a scale factor above which a position is advised [K].
 LEAST_KELVINS = 2.0
@@ -36,16 +36,16 @@ def with_unseen_axes(
     fit: Fit, lacks: Sequence[tuple[LackOfFit, ...]], known: Calibration | None
 ) -> list[tuple[LackOfFit, ...]]:
     """
-    Add the error of axes at temperatures at which no position determines their scale factor.
+    Add the error of extrapolated scale factors to the lack of fit of each regime, `lacks`.
 
-    `lacks`: lack of fit of each regime on left-out data; `known`: calibration that was the prior.
-    The lack of fit of the prior holds for an axis at temperatures at which no new position
-    determines the axis' scale factor.
+    `known`: calibration that was the prior, or None. At temperatures at which no position of the
+    bags determines the scale of an axis, the lack of fit of the axis is at least the prior's.
     """
     (lower, upper), (new_lower, new_upper) = _known_ranges(fit, known), _seen(fit, None)
     slope = _unknown_slope(fit) * fit.regression.gravity
     ends = _ends(fit, known)
-    # The variance is interpolated linearly; five temperatures approximate the square.
+    # The variance grows with the square of the distance in K, but is interpolated linearly
+    # between temperatures, so five temperatures are used.
     between = [
         np.linspace(edge, end, 5)
         for edge, end in zip((lower.max(), upper.min()), ends, strict=True)
@@ -92,9 +92,9 @@ def judge_unseen_axes(fit: Fit, known: Calibration | None) -> list[Finding]:
 
 def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
     """
-    Return the ends of the ranges of board temperature in which the scale factor of each axis is
-    known, shape (2, 3) [degC]; infinite for an axis that no position determines at any
-    temperature, as its covariance is that of the fit's prior.
+    Return the range of board temperature of each axis without an added error of its scale factor,
+    shape (2, 3) [degC]. The range is infinite for an axis along which no position has gravity,
+    because the fit's prior covariance of its scale factor includes the error.
     """
     lower, upper = _seen(fit, known)
     reach = FREE_RANGE_SHARE * (upper - lower)
@@ -105,7 +105,7 @@ def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
 def _seen(fit: Fit, known: Calibration | None) -> Floats:
     """
     Return the lowest and the highest board temperature of the positions with gravity along each
-    axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) for none.
+    axis, and of a prior calibration, shape (2, 3) [degC]; (inf, -inf) if there are none.
     """
     temperature = fit.windows.temperature[:, np.newaxis]
     is_along = np.abs(fit.posterior.state.up) >= LEAST_GRAVITY_SHARE
@@ -127,8 +127,8 @@ def _ends(fit: Fit, known: Calibration | None) -> Range:
 
 def _unknown_slope(fit: Fit) -> float:
     """
-    Return the sd of the unknown slope of a scale factor [1/K]: half of the slope of the scale
-    curves, RMS of the axes.
+    Return the sd of the slope of an extrapolated scale factor [1/K]: half of the RMS, over the
+    axes, of the slopes of the fitted scale curves.
     """
     windows, state = fit.windows.data, fit.posterior.state
     is_curve = np.isin(windows.groups, (CURVE, PART)) & (windows.kelvins > 0.0)
@@ -137,7 +137,7 @@ def _unknown_slope(fit: Fit) -> float:
 
 
 def _variance(points: Sequence[LackOfFit], at: Floats) -> Floats:
-    """Return the variance of a lack of fit at board temperatures, shape (n, 3) [m^2/s^4]."""
+    """Return the variance of a lack of fit at board temperatures `at`, shape (n, 3)."""
     if not points:
         return np.zeros((len(at), 3))
     celsius = [point.temperature_c for point in points]

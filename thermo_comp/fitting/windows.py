@@ -3,8 +3,8 @@
 """
 Owns the table of windows and columns of the regression, made from reduced bags.
 
-The thermal tracker of the compensator is run over the bags' readings, and the columns are those of
-`unit.columns`, so a column has the same values in the fit and online.
+Fit and compensator use the same thermal tracker and the same columns, of `unit.columns`, so a
+column has the same values in the fit and online.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from .unknowns import Windows
 #: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
 #: slope at a temperature), and the curves over the temperatures of parts.
 CURVE, SET, BEND, PART = 'curve', 'set', 'bend', 'part'
-#: Groups of columns that, added to the curve, make it a curve over a part's temperature.
+#: Groups whose columns, with those of the curve, form the curves over a part's temperature.
 PART_SUMS = ('board', 'product', 'square')
 #: Groups of columns linear in a difference of temperatures; groups of the products of such a
 #: difference with temperature, and of its squares.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
-#: Smallest number of windows of a rest: fewer windows do not determine the rest's noise.
+#: Smallest number of windows into which a rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20
-# Number of temperatures at which the settled columns are evaluated.
+# Number of temperatures at which the columns are evaluated for settled lags, see `_settled`.
 _N_SETTLED = 9
-#: Number of sections of equal length into which a position is divided. The bags repeat the
-#: chamber's program, so a section is the same part of the program in all positions.
+#: Number of sections of equal length into which a position is divided. The chamber's program is
+#: the same in all positions, so section k is the same part of the program in each position.
 N_SECTIONS = 6
 
 
@@ -53,7 +53,7 @@ class Sets:
     """
     Families of the curves of the static and of the dynamic set; their coefficients are not used.
 
-    is_shared: whether the dynamic curve is the static curve plus a difference, or a separate curve
+    is_shared: whether the dynamic curve is the static curve plus a difference; else it is separate
     """
 
     static: TemperatureFunction
@@ -69,12 +69,12 @@ class Sets:
 
     @property
     def has_cubic(self) -> bool:
-        """Whether the curves that both sets share have the columns t, t^2 and t^3."""
+        """Whether static and dynamic set share a curve with the columns t, t^2 and t^3."""
         return self.is_shared and isinstance(self.static, Polynomial) and self.static.n_free == 3
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of static and dynamic curve; the family of a sum is that of higher order."""
+        """Families of static and dynamic curve; a shared dynamic curve gets the higher order."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
@@ -85,7 +85,7 @@ class Sets:
 
     @property
     def level(self) -> int:
-        """Index of the column of the dynamic set's level."""
+        """Index of the column of the level of the dynamic set, which is the weight w itself."""
         return self.static.n_free
 
 
@@ -95,7 +95,7 @@ class Model:
     The model of a fit: curves and columns, and the settings of the thermal state.
 
     name: name of the model in the provenance
-    parts: the lag of the part of each axis, or None if the lags are not known
+    parts: the lag of the part of each axis, or None in a model without one lag per axis
     sensors: thermometers other than the board's; the first is the case's
     """
 
@@ -109,7 +109,7 @@ class Model:
 
     @property
     def acts_on(self) -> Bools | None:
-        """Axes that each column of the response acts on, shape (k, 3); None for all."""
+        """Axes on which each column of the response acts, shape (k, 3); None if on all axes."""
         if self.parts is None:
             return None
         own = [(part, part.of_gradient) for part in self.parts]
@@ -120,7 +120,7 @@ class Model:
 
     @cached_property
     def part_curves(self) -> PartCurves:
-        """Curves over the temperatures of parts; empty if parts or columns are not known."""
+        """Curves over the temperatures of parts; empty without `parts`, or without its columns."""
         parts = self.parts if self.sets.has_cubic else None
         return curves_of(parts or (), self.columns, len(self.sets.groups))
 
@@ -130,9 +130,9 @@ class Track(NamedTuple):
     The thermal states of a tracker over a bag, without lags and plays.
 
     start_s, step_s: start and step of the time grid [s]
-    states: thermal states, shape (n, width); is_known: which states are known, shape (n,)
-    settled_s: time from which the estimate of the board temperature is settled [s]: until coarse
-        readings change, the temperature is only known to a step of the readings
+    states: thermal states, shape (n, width); is_known: which states are valid, shape (n,)
+    settled_s: time from which the estimate of the board temperature is accurate [s]: until coarse
+        readings first change, the error of the estimate is up to a step of the readings
     """
 
     start_s: float
@@ -147,13 +147,13 @@ class ThermalWindows:
     """
     The windows of a regression with their thermal states.
 
-    model: model of the columns
-    data: samples and columns for the regression
+    data: means of the samples, and columns, for the regression
     temperature, rate: of the board [degC, K/s], shape (n,); weight: of the dynamic set, shape (n,)
     gradient: T_case - T_board [K], shape (n,)
-    raw: columns of the response without powers of t and ranges, shape (n, k)
-    angular_rate: mean angular rate [rad/s], shape (n, 3), or (n, 0) if a bag has none
-    typical_count: number of samples of a typical window
+    raw: values u of the columns of the response, before they are limited to their ranges and
+        multiplied by powers of t, shape (n, k)
+    angular_rate: mean angular rate [rad/s], shape (n, 3), or (n, 0) if a bag has no angular rate
+    typical_count: median number of samples of a window
     rests: bag and interval of each position
     tracks: thermal states of each bag
     """
@@ -177,7 +177,7 @@ class ThermalWindows:
 
     @property
     def was_measured(self) -> bool:
-        """Whether the columns depend on a recorded temperature, which may be constant."""
+        """Whether a temperature was recorded, which may be constant over the bags."""
         return self.has_temperature or bool(self.data.columns[:, 0].any())
 
     @property
@@ -193,7 +193,7 @@ class _Rows(NamedTuple):
     thermal: board temperature [degC], its rate [K/s], weight of the dynamic set, gradient [K], and
         the columns of the response without powers of t, as in `ThermalWindows`, shape (n, 4 + k)
     columns: values of the columns, as in `Windows`
-    start: derivatives of the k response columns w.r.t. their initial lag states, shape (n, k)
+    start: derivatives of the k response columns w.r.t. the initial states of their lags, (n, k)
     angular_rate: mean angular rate [rad/s], shape (n, 3) or (n, 0)
     """
 
@@ -216,7 +216,7 @@ def thermal_windows(
     temperature settles, and while readings of a thermometer are missing. A bag without any
     temperature is taken to be at the reference temperature, where all columns are 0.
 
-    `tracks`: thermal states of the bags, if they were computed before with the same detector
+    `tracks`: thermal states of the bags, if already computed with the detector of `model`
     """
     spec = memory_of(model.columns, model.sensors)
     tracks = tracks or [_track(bag, model, spec) for bag in bags]
@@ -267,9 +267,9 @@ def _rows(
     table: ColumnTable,
 ) -> _Rows:
     """
-    Average the used windows of a rest to windows of 60 s, or shorter windows in a short rest.
+    Average the windows of a rest selected by `use` to windows of 60 s, shorter in a short rest.
 
-    `states`: thermal states, (width, n); `begin_s`: start of the lags, since the first sample [s]
+    `states`: thermal states, (width, n); `begin_s`: time at which the lags begin [s]
     """
     time, count = interval.time[use], interval.count[use]
     window_s = min(60.0, float(time[-1] - time[0]) / (FEWEST_WINDOWS - 1) or 60.0)
@@ -315,15 +315,15 @@ def _windows(
     tilt = np.column_stack((t, gradient, (t + gradient) ** 2))
     tilt_rms = np.sqrt(np.mean(tilt**2, axis=0))
     is_tilting = tilt_rms > 0.0
-    # The scale has no hysteresis, no bends and no level of the dynamic set, because the relative
-    # scale is 1 at the reference temperature in both regimes.
+    # The scale factor has no level of the dynamic set, as the relative scale is 1 at the reference
+    # temperature in both regimes, and no columns whose term does not act on scale (`has_scale`).
     in_scale = [True] * n_curves + [c.term.has_scale for c in columns] + [True] * len(curves.axis)
     in_scale[model.sets.level] = False
     start = np.hstack((np.zeros((len(t), n_curves)), rows.start))
     lag = np.array([-1] * n_curves + [lags.get(c.source, -1) for c in columns], np.int64)
     of_part = rows.columns @ curves.sums.T
     kelvins = _kelvins(model, rows.columns, rows.thermal[:, 5:], t, gradient)
-    # The columns of a curve over a part's temperature have at most one lag, the lag of the part.
+    # The columns of a curve over a part's temperature have no lag, or the lag of this part.
     lag_of_part = np.where(curves.sums != 0.0, lag, -1).max(axis=1, initial=-1)
     settled = _settled(model, spec, rows, table)
     return Windows(
@@ -350,8 +350,8 @@ def _windows(
 
 def _settled(model: Model, spec: MemorySpec, rows: _Rows, table: ColumnTable) -> Floats:
     """
-    Return the columns at constant temperatures over the range of the windows, with settled lags
-    and the median gradient at rest, shape (k, m).
+    Return the columns at `_N_SETTLED` constant board temperatures over the range of the windows,
+    with settled lags and the median gradient of the static regime, shape (_N_SETTLED, m).
     """
     board, is_static = rows.thermal[:, 0], rows.thermal[:, 3] <= 0.5
     some = is_static if is_static.any() else np.ones_like(is_static)
@@ -376,7 +376,7 @@ def _sections(position: Ints, time: Floats) -> Ints:
 def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Floats) -> Floats:
     """
     Return the temperature change that corresponds to the RMS of each column [K], shape (m,): the
-    RMS divided by the largest slope of the column in these data; 0 for a constant column.
+    RMS divided by the largest slope of the column over temperature; 0 if this slope is 0.
     """
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
@@ -384,7 +384,7 @@ def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Flo
     curves = model.sets.columns(grid, np.full_like(grid, 0.5))
     steepest = [float(np.abs(np.gradient(curve, grid)).max()) for curve in curves]
     rms = np.sqrt(np.mean(values**2, axis=0))
-    # The level of the dynamic set is an effect of ramps, equivalent to the RMS gradient [K].
+    # The level of the dynamic set changes by 1 for a temperature change of the RMS gradient [K].
     steepest[model.sets.level] = 1.0 / flow
     for column, series in zip(model.columns, raw.T, strict=True):
         steepest.append(column.term.steepest(column, series, flow) * farthest**column.power)
@@ -396,8 +396,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     """Run the tracker over the readings of a bag."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
-        # Without a thermometer assume that the unit has been at the reference temperature for
-        # 1e9 s, so that all lags are 0.
+        # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.
         still = np.zeros((2, Layout(spec).width))
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
@@ -418,7 +417,7 @@ def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
     """Return a time grid [s], and the thermal states on this grid with their lags."""
     states = track.states
     grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
-    # The lags are evaluated on the whole grid at once, which is much faster than at each reading.
+    # The lags of all grid points are computed at once, which is faster than reading by reading.
     layout = Layout(spec)
     gradients = [states[:, layout.places[Gradient(name)]] for name in spec.sensors]
     memory = memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)

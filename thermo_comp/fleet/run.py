@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a run over a fleet: fits the tests without a valid result, and stores the results."""
+"""Owns a run over a fleet: fits the tests that have no stored result, and stores the results."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from .work import FleetOptions, UnitOutcome, connected, run, sha256
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
 _FORMAT = 3
 _LONGEST_NAME = 100
-# Largest number of units listed on the page; the table has all units.
+# Largest number of units listed on the page; the table lists all units.
 _MOST_ROWS = 60
-# Verdicts on the bags of a fit that contradict the fit: more data would not change these verdicts.
+# Verdicts of tests whose bags contradict their fit, which more data would not change.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )
@@ -43,7 +43,7 @@ CALIBRATION, CERTIFICATE, RESULT = 'calibration.yaml', 'certificate.html', 'resu
 
 @dataclass(frozen=True)
 class FleetResult:
-    """The result of a run over a fleet: rows sorted by name, statistics, files."""
+    """The result of a run over a fleet: rows of the units sorted by name, statistics, files."""
 
     rows: tuple[Row, ...]
     summary: Summary
@@ -53,7 +53,7 @@ class FleetResult:
     page: Path
     prior: Path | None
     no_prior: str  # reason if there is no prior
-    skipped: tuple[str, ...] = ()  # folders of tables without a bag
+    skipped: tuple[str, ...] = ()  # folders with tables but no bag
 
     @property
     def n_fitted(self) -> int:
@@ -79,10 +79,11 @@ def fit_fleet(
     progress: Callable[[int, int, Row | None], None] = lambda *_: None,
 ) -> FleetResult:
     """
-    Fit all units without a stored result; ThermoCompError or OutputError if no unit can be fitted.
+    Fit all units without a stored result. Raises ThermoCompError if the folder of bags has none, a
+    package is missing or the Dask cluster cannot be used, OutputError if a file cannot be written.
 
-    `progress` gets the number of finished tests, the number of all tests, and the row of the last
-    finished test, or None before the first fit.
+    `progress` is called with the number of finished tests, the number of all tests, and the row of
+    the last finished test, or None before the first fit.
     """
     _require_packages()
     storage = Storage(url)
@@ -136,22 +137,21 @@ def _require_packages() -> None:
 
 
 def _in_prior(row: Row) -> bool:
-    """Whether a unit may contribute to the prior: complete data and a valid calibration."""
+    """Whether the prior may use a unit: its data are complete and its calibration is valid."""
     return is_valid(row) and row['is_whole'] == 1
 
 
 def lacks_data(row: Row) -> bool:
     """
-    Whether a unit's data are incomplete, so that a fit with the prior of the type makes sense.
-
-    Data that contradict themselves or the fit are not incomplete: a prior would hide the fault.
+    Whether a unit's data are incomplete, so that the unit is fitted again with the prior of its
+    type. Data that contradict themselves or the fit do not count: a prior would hide the fault.
     """
     is_contradicted = str(row['verdict']) in _CONTRADICTIONS
     return row['is_whole'] == 0 and not is_contradicted
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
-    """Build the prior from the valid units; without a prior, return the reason."""
+    """Build the prior from units for which `_in_prior` holds; or return None and the reason."""
     # If a unit was tested several times, only the last test is used.
     tests = sorted((row for row in rows if _in_prior(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
@@ -185,17 +185,17 @@ def render_fleet(
     shares = ReportFigure(
         'residuals',
         'How large are the residuals of |f| in the fleet?',
-        'Share of the units whose residual at rest is below the value: raw (constants at the '
-        'reference temperature), and with each unit’s calibration. If a curve is steep, the '
-        'units are alike; inspect the units in a tail to the right.',
+        'Share of the units whose residual at rest is below a value: raw (corrected with the '
+        'constants at the reference temperature alone), and corrected with each unit’s '
+        'calibration. A steep curve means similar units; inspect the units at its right end.',
         partial(draw_shares, curves),
     )
     distances = ReportFigure(
         'distances',
-        'Which units stand out, and in what?',
+        'Which units stand out, and in which quantity?',
         'Each stroke is a unit, at its distance from the fleet’s median, divided by the root of '
-        'the sum of the variances of the units and of the unit’s own fit. Diamonds beyond the '
-        'lines are the outliers in the table.',
+        'the sum of two variances: that over the units, and that of the unit’s fit. Diamonds '
+        'beyond the lines are the outliers in the table.',
         partial(
             draw_distances,
             [spread.quantity.label for spread in summary.spreads],
@@ -203,7 +203,7 @@ def render_fleet(
             [spread.limit for spread in summary.spreads],
         ),
     )
-    # With fewer than eight units no outliers are sought: all limits are infinite.
+    # A fleet of fewer than eight units is not searched for outliers: all limits are infinite.
     is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
     return render(
         'fleet.html',
@@ -221,7 +221,7 @@ def render_fleet(
 
 
 class Results:
-    """The folder of results, created if missing; ThermoCompError if this is impossible."""
+    """The folder of results, which is created; ThermoCompError if it cannot be created."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -231,12 +231,12 @@ class Results:
             raise ThermoCompError(f'{folder}: cannot be created: {error.strerror}') from error
 
     def folder_of(self, name: str, with_prior: object = False) -> Path:
-        """Return the folder of a unit's files, inside the folder of results for any name."""
+        """Return the folder of a unit's files; it is inside the folder of results for any name."""
         kind = 'with_prior' if with_prior else 'units'
         return self.folder.joinpath(kind, *map(_safe, name.split('/')))
 
     def certificate_of(self, row: Row) -> str:
-        """Return the path of a unit's certificate relative to the folder; '' without one."""
+        """Return the path of a unit's certificate in the folder of results; '' without one."""
         path = self.folder_of(str(row['name']), row['prior']) / CERTIFICATE
         return path.relative_to(self.folder).as_posix() if path.is_file() else ''
 
@@ -258,15 +258,15 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """Store an outcome and return the row; a failed fit keeps an earlier calibration."""
+        """Store an outcome and return the row; if the fit failed, keep an earlier calibration."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):
             texts = (row['problem'], f'{folder / CALIBRATION} of an earlier run stays')
             return row_of(**{**row, 'problem': '; '.join(map(str, filter(None, texts)))})
         if outcome.calibration:
-            # The record is written last: until then the hash in the old record does not fit the
-            # calibration, and the unit counts as not fitted.
+            # The record is written last: until then the hash in the old record differs from that
+            # of the new calibration, so the unit counts as not fitted.
             content = outcome.calibration.encode()
             files.write_atomically(folder / CALIBRATION, content, files.CALIBRATION)
             (folder / CERTIFICATE).unlink(missing_ok=True)
@@ -280,13 +280,13 @@ class Results:
 
 
 def _key(unit: FoundUnit, options: FleetOptions) -> dict[str, Any]:
-    """Return everything that a unit's result depends on, for JSON."""
+    """Return all inputs on which a unit's result depends, for JSON."""
     files = [list(file) for bag in unit.bags.values() for file in bag]
     return {'format': _FORMAT, 'options': options.digest(), 'files': files}
 
 
 def _safe(part: str) -> str:
-    """Turn any name into a valid file name."""
+    """Return a valid file name for any name."""
     name = quote(part, safe=" +,=@()'")
     if name.strip('.') and len(name) <= _LONGEST_NAME:
         return name

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the statistics of a fleet: robust spreads of the units, outliers, drift between tests."""
+"""Owns the statistics of a fleet: robust spreads over units, outliers, drift between tests."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -17,19 +17,20 @@ from ..judging.verdicts import Verdict
 from ..typing import Bools, Floats
 from .table import COLUMNS, Column, Row, is_fitted
 
+# Probability of one or more false outliers, and of one or more false drifts, in a fleet.
 _FALSE_ALARMS = 0.05
-# Smallest number of units among which outliers are sought.
+# Smallest number of units of a fleet that is searched for outliers.
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# Largest ratio of a unit's own sd to the spread over the units; with a larger ratio the data do
-# not determine the quantity, and the value is about that of the prior of the fit.
+# Largest ratio of the sd of a value by its fit to the spread over the units. With a larger ratio
+# the data do not determine the quantity, and its value is about that of the prior of the fit.
 _LARGEST_SD = 5.0
 # Smaller residuals and noises are replaced by this number, so that their logarithms are finite.
 _LEAST = 1e-12
 #: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
-#: Columns of the constants, whose changes between two tests of a unit are drift.
+#: Columns of bias, scale and misalignment; their changes between two tests of a unit are drift.
 _CONSTANTS = tuple(column for column in QUANTITIES if column.sd and '_slope_' not in column.name)
 
 
@@ -37,8 +38,9 @@ class Spread(NamedTuple):
     """
     Spread of a quantity over the units about its median, and the distance `z` of each unit.
 
-    Only units whose data determine the quantity (`is_counted`) enter `middle`, `sd` and `limit`.
-    A distance is divided by the root of the sum of squares of `sd` and of the unit's own sd.
+    Only units whose data determine the quantity (`is_counted`) are used for `middle`, `sd` and
+    `limit`. A distance z from the median is in units of the root of the sum of squares of `sd` and
+    of the sd of the unit's value by its fit.
     """
 
     quantity: Column
@@ -46,9 +48,9 @@ class Spread(NamedTuple):
     values: Floats
     is_counted: Bools
     middle: float
-    sd: float  # 1.4826 times the median absolute deviation (of logarithms: times `middle`)
+    sd: float  # 1.4826 times the median absolute deviation (for logarithms, times `middle`)
     z: Floats
-    limit: float = float('inf')  # smallest distance of an outlier; infinite with too few units
+    limit: float = float('inf')  # smallest |z| of an outlier; infinite with too few units
 
     @property
     def counted(self) -> Floats:
@@ -58,7 +60,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Outlier:
-    """A unit that is `z` standard deviations away from the fleet's median `middle`."""
+    """A unit whose value is `z` (see `Spread`) from the fleet's median `middle`."""
 
     name: str
     serial: str
@@ -83,13 +85,13 @@ class Retest:
 
     @property
     def worst(self) -> Drift:
-        """The change that is the largest in standard deviations."""
+        """The change with the largest ratio to its standard deviation."""
         return max(self.changes, key=_sds)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of a fleet: number of units by verdict; outliers and drifts, largest first."""
+    """Statistics of a fleet: numbers of units by verdict; outliers and drifts, largest first."""
 
     verdicts: dict[str, int]
     spreads: tuple[Spread, ...]
@@ -98,7 +100,7 @@ class Summary:
 
 
 def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
-    """Compute the statistics of a fleet; `earlier` are rows of earlier tables, for the drift."""
+    """Compute the statistics of a fleet; `earlier`: rows of earlier tables, to find drifts."""
     fitted = [row for row in rows if is_fitted(row)]
     measured = [spread for quantity in QUANTITIES if (spread := spread_of(quantity, fitted))]
     n_comparisons = sum(len(spread.names) for spread in measured)
@@ -119,7 +121,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
         if abs(z) > spread.limit
     ]
     wide = Verdict.WIDE.value
-    # Replace the amount in the verdict WIDE by 'little', so that equal verdicts count together.
+    # The verdict WIDE contains a number, which is replaced to count all such units together.
     texts = (str(row['verdict']) for row in rows)
     verdicts = (f'{wide} little' if text.startswith(wide) else text for text in texts)
     return Summary(
@@ -154,8 +156,8 @@ def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
 
 def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
     """
-    Choose the units whose data determine a quantity: units are added in the order of their own sd,
-    until the own sd of a unit exceeds five times the spread of the units chosen with it.
+    Choose the units whose data determine a quantity: units are added in the order of the sd by
+    their fits, until this sd exceeds five times the spread of the units chosen so far.
     """
     order = np.argsort(own_sd, kind='stable')
     n = len(values)
@@ -174,7 +176,7 @@ def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
 
 
 def _deviations(quantity: Column, values: Floats, middle: float) -> Floats:
-    """Return the differences of values from the median: of values, in ppm, or of logarithms."""
+    """Return the deviations from the median, of values, in ppm or of logarithms (`Column.by`)."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':
@@ -187,7 +189,7 @@ def _robust_sd(deviations: Floats) -> float:
 
 
 def outlier_limit(n_units: int, n_comparisons: int) -> float:
-    """Return the smallest distance of an outlier, by Student's t; infinite below eight units."""
+    """Return the smallest |z| of an outlier, by Student's t; infinite below eight units."""
     from scipy.stats import t
 
     if n_units < _UNITS_NEEDED or not n_comparisons:
@@ -227,7 +229,7 @@ def _drifts(rows: Sequence[Row], earlier: Sequence[Row]) -> list[Retest]:
 
 
 def _sds(drift: Drift) -> float:
-    """Return the size of a change divided by its standard deviation; 0 if the sd is not known."""
+    """Return the magnitude of a change / its standard deviation; 0 if the sd is unknown."""
     return abs(drift.change) / drift.sd if drift.sd > 0.0 else 0.0
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the table of a fleet, a row per unit: the columns, the cells of a fit, and the files."""
+"""Owns the table of a fleet, with a row per unit: the columns, the cells of a fit, the files."""
 
 import csv
 import io
@@ -30,16 +30,16 @@ from ..unit.prediction import in_a_soak
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
 
-#: Values of the column `verdict` for tests without a verdict of `evaluate`.
+#: Values of the column `verdict` for tests that `evaluate` has not judged.
 REFUSED, FAILED, NOT_JUDGED = 'refused', 'failed', 'not judged'
 # Characters with which a formula in a spreadsheet begins.
 _FORMULA = ('=', '+', '-', '@')
-# Names of findings that show incomplete data: the calibration partly follows from the prior.
+# Names of findings of incomplete data: a part of the calibration then follows from the prior.
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
 class Column(NamedTuple):
-    """A column of the table: name with the unit of measurement, kind of value, meaning."""
+    """A column of the table: name, which includes the unit of measurement, kind, meaning."""
 
     name: str
     kind: str  # text, whole, number
@@ -52,61 +52,62 @@ class Column(NamedTuple):
 
 _BELOW = ((1, 0), (2, 0), (2, 1))
 _TABLE = (
-    ('name', 'text', 'folder of the bags, or serial; the folder of the results'),
-    ('serial', 'text', "serial in the bags' metadata, or the folder's name"),
+    ('name', 'text', 'folder of the bags, or serial; also the name of the folder of results'),
+    ('serial', 'text', "serial in the bags' metadata, else the name of the folder"),
     ('lot', 'text', '`lot` in the metadata, else the folder above the unit'),
     ('verdict', 'text', 'verdict of evaluate on the bags of the fit; or refused, failed'),
     ('reason', 'text', 'numbers that decided the verdict'),
     ('problem', 'text', 'reason why there is no calibration'),
     ('reservations', 'text', 'reservations on the certificate'),
-    ('left_out', 'text', 'bags that were left out, each with its reason'),
-    ('chosen', 'text', 'topics chosen by their type, as the usual name is missing'),
-    ('n_bags', 'whole', 'bags found'),
-    ('n_left_out', 'whole', 'bags left out'),
-    ('n_torn', 'whole', 'bags that were cut off, and are read up to the cut'),
-    ('n_positions', 'whole', 'still positions'),
-    ('n_samples', 'whole', 'accelerometer samples'),
-    ('n_bytes', 'whole', 'size of the bags'),
-    ('model', 'text', 'the model of the fit'),
+    ('left_out', 'text', 'bags that the fit did not use, each with its reason'),
+    ('chosen', 'text', 'topics chosen by their type, because the usual name is missing'),
+    ('n_bags', 'whole', 'number of bags of the unit'),
+    ('n_left_out', 'whole', 'number of bags that the fit did not use'),
+    ('n_torn', 'whole', 'number of incomplete bags, of which the readable part was used'),
+    ('n_positions', 'whole', 'number of positions at rest'),
+    ('n_samples', 'whole', 'number of accelerometer samples'),
+    ('n_bytes', 'whole', 'size of the bags in bytes'),
+    ('model', 'text', 'model of the fit'),
     ('is_whole', 'whole', '1 if the bags determine every parameter: then the prior may use them'),
     ('prior', 'text', 'SHA-256 of the prior.yaml used in the fit'),
-    ('start', 'text', 'UTC of the first sample'),
-    ('hours', 'number', 'total length of the bags'),
-    ('gravity_m_s2', 'number', 'local gravity used'),
-    ('reference_temperature_c', 'number', 'T_ref: reference temperature of the constants'),
-    ('lowest_c', 'number', 'lower end of the calibrated range'),
-    ('highest_c', 'number', 'upper end of the calibrated range'),
+    ('start', 'text', 'time of the first sample, UTC'),
+    ('hours', 'number', 'total duration of the bags'),
+    ('gravity_m_s2', 'number', 'local gravity assumed in the fit'),
+    ('reference_temperature_c', 'number', 'T_ref, the temperature at which constants are stated'),
+    ('lowest_c', 'number', 'lower end of the calibrated range of the board temperature'),
+    ('highest_c', 'number', 'upper end of the calibrated range of the board temperature'),
     ('cooling_k_min', 'number', 'fastest calibrated fall of the board temperature, negative'),
     ('heating_k_min', 'number', 'fastest calibrated rise of the board temperature'),
     ('scale_{0}', 'number', '{1}: scale factor at T_ref, input units per m/s^2'),
     ('scale_sd_{0}_ppm', 'number', '{1}: standard deviation of the scale factor'),
-    ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the static scale at T_ref'),
-    ('scale_slope_sd_{0}_ppm_k', 'number', '{1}: sd of the scale slope; empty: not determined'),
+    ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the scale over temperature, static, T_ref'),
+    ('scale_slope_sd_{0}_ppm_k', 'number', '{1}: sd of the scale slope; empty if undetermined'),
     ('bias_{0}_ug', 'number', '{1}: bias in a soak at T_ref'),
     ('bias_sd_{0}_ug', 'number', '{1}: standard deviation of the bias'),
-    ('bias_slope_{0}_ug_k', 'number', '{1}: slope of the static bias at T_ref'),
-    ('bias_slope_sd_{0}_ug_k', 'number', '{1}: sd of the bias slope; empty: not determined'),
+    ('bias_slope_{0}_ug_k', 'number', '{1}: slope of the bias over temperature, static, T_ref'),
+    ('bias_slope_sd_{0}_ug_k', 'number', '{1}: sd of the bias slope; empty if undetermined'),
     ('m_{0}_urad', 'number', 'element `{1}` of the misalignment matrix'),
     ('m_sd_{0}_urad', 'number', 'standard deviation of `{1}`'),
     ('noise_{0}_ug_sqrt_hz', 'number', '{1}: white noise'),
     (
         'board_lag_s',
         'number',
-        'lag of the board behind the case in ramps; negative: the board leads',
+        'lag of the board temperature behind that of the case in ramps; negative if it leads',
     ),
     ('window_s', 'number', 'length of the windows at rest'),
-    ('raw_ug', 'number', '|f| - g at rest, RMS, corrected by the constants at T_ref alone'),
-    ('static_ug', 'number', '|f| - g at rest, RMS, static regime'),
-    ('dynamic_ug', 'number', '|f| - g at rest, RMS, dynamic regime'),
-    ('all_ug', 'number', '|f| - g at rest, RMS'),
-    ('peak_ug', 'number', 'largest |f| - g of a window at rest'),
-    ('unseen_ug', 'number', '|f| - g of each position with a fit to all other positions, RMS'),
-    ('claimed_ug', 'number', 'RMS of the claimed standard deviation of the windows'),
+    ('raw_ug', 'number', 'RMS of |f| - g at rest, corrected with the constants at T_ref alone'),
+    ('static_ug', 'number', 'RMS of |f| - g at rest in the static regime, corrected'),
+    ('dynamic_ug', 'number', 'RMS of |f| - g at rest in the dynamic regime, corrected'),
+    ('all_ug', 'number', 'RMS of |f| - g at rest in both regimes, corrected'),
+    ('peak_ug', 'number', 'largest magnitude of |f| - g of a window at rest, corrected'),
+    ('unseen_ug', 'number', 'RMS of |f| - g, or of the drift, of positions left out in turn'),
+    ('claimed_ug', 'number', 'RMS over the windows of the claimed standard deviation of |f|'),
     ('cpu_s', 'number', 'processor time of reading and fit'),
     ('tool_version', 'text', 'version of thermo_comp that fitted the unit'),
     ('calibration_sha256', 'text', 'SHA-256 of calibration.yaml'),
 )
-# Quantities compared between units: label, unit, how (values, ppm of the median, logarithms), sd.
+# Quantities compared between units: label, unit, scale of the comparison (values, ppm of the
+# median, logarithms), column of the sd.
 _COMPARED = {
     'scale_{0}': ('scale factor {1}', 'ppm', 'ppm', 'scale_sd_{0}_ppm'),
     'scale_slope_{0}_ppm_k': ('slope of scale {1}', 'ppm/K', 'value', 'scale_slope_sd_{0}_ppm_k'),
@@ -121,7 +122,7 @@ _COMPARED = {
 
 
 def _places(name: str) -> dict[str, str]:
-    """Return the replacements of {0} and {1} in the name of a column: axes, or elements of M."""
+    """Return what replaces {0} and {1} in the name of a column: axes, or elements of M."""
     if '{0}' not in name:
         return {'': ''}
     if name.startswith('m_'):
@@ -137,7 +138,7 @@ COLUMNS = tuple(
 
 
 def row_of(**known: Any) -> dict[str, Cell]:
-    """Build a row from the given cells; other texts are empty, other numbers None."""
+    """Build a row from the given cells; missing texts are empty, missing numbers None."""
     row: dict[str, Cell] = {col.name: '' if col.kind == 'text' else None for col in COLUMNS}
     strange = known.keys() - row.keys()
     if strange:
@@ -156,7 +157,7 @@ def is_fitted(row: Row) -> bool:
 
 
 def is_valid(row: Row) -> bool:
-    """Whether a unit's calibration is valid on the bags of its fit."""
+    """Whether `evaluate` judges a unit's calibration as valid on the bags of its fit."""
     return str(row['verdict']).startswith((Verdict.VALID.value, Verdict.WIDE.value))
 
 
@@ -180,7 +181,7 @@ def fitted_cells(
         'm_sd_{0}_urad': np.array(calibration.misalignment_sd) * 1e6,
         'noise_{0}_ug_sqrt_hz': np.array(calibration.noise_density_m_s2_sqrt_hz) / MICRO_G,
     }
-    # Without a prior, too few positions do not separate the slopes of bias and scale: no sd.
+    # Without a prior, few positions do not separate the slopes of bias and scale: omit their sd.
     is_separable = has_prior or len(distinct_directions(up)) >= POSITIONS_NEEDED
     for quantity, unit, slope, sd in _slopes(calibration):
         parts[f'{quantity}_slope_{{0}}_{unit}'] = slope
@@ -224,9 +225,8 @@ def fitted_cells(
 
 def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats]]:
     """
-    Yield bias, then scale: name, unit, slopes of the static curves at T_ref and sd, shapes (3,).
-
-    The sd is NaN for an axis whose curve the fit has left out: its slope of 0 is not measured.
+    Yield, for bias and for scale: name, unit, slopes of the static curves at T_ref and their sd,
+    (3,). The sd is NaN if the fit has left out the curve of an axis: its slope is not measured.
     """
     layout, posterior = parameter_layout(calibration), calibration.posterior
     K = np.array([axis.scale_factor for axis in calibration.axes])
@@ -251,7 +251,7 @@ def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats
 
 
 def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
-    """Write the table as Parquet, with the meanings of the columns, and as CSV with all digits."""
+    """Write the table as Parquet, with the meanings of the columns, and as CSV."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -275,7 +275,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read a table of an earlier run; missing columns are empty. Else ThermoCompError."""
+    """Read a table of an earlier run, ThermoCompError if it is none; missing columns are empty."""
     from pyarrow import ArrowException, parquet
 
     try:

@@ -16,7 +16,7 @@ from ..errors import RecordingError, ThermoCompError
 from ..recording.reader import open_recording
 from ..text import one_line
 
-# Attributes in a listing of files that change with the content, the most reliable first.
+# Attributes of a file in a listing that change with its content, the most reliable first.
 _STAMPS = (
     *('ETag', 'etag', 'md5Hash', 'content_md5', 'generation', 'version_id'),
     *('mtime', 'LastModified', 'last_modified', 'updated', 'created'),
@@ -31,7 +31,7 @@ class StoredFile(NamedTuple):
     stamp: str
 
 
-#: Files of each bag, several for a rosbag2 bag, by the path of the bag in the fleet's folder.
+#: Files of each bag (a rosbag2 bag has several), by the path of the bag in the fleet's folder.
 Bags = dict[str, list[StoredFile]]
 
 
@@ -45,7 +45,7 @@ class FoundUnit:
 
 
 class Storage:
-    """A local folder or a URL of a known protocol, like ``s3://bucket/bags``."""
+    """The folder of a fleet: a local folder, or a URL like ``s3://bucket/bags`` for fsspec."""
 
     def __init__(self, url: str) -> None:
         import fsspec
@@ -57,7 +57,7 @@ class Storage:
             raise ThermoCompError(f'{url}: {words(error)}') from error
         self._root = str(root).rstrip('/')
         self._is_local = 'file' in self._fs.protocol
-        # The absolute path or the URL, which is valid whatever the working directory is.
+        # The absolute path or the URL, which does not depend on the working directory.
         self.address = self._root if self._is_local else url
         self.name = self._root.rpartition('/')[2]
 
@@ -82,7 +82,7 @@ class Storage:
 
     @contextmanager
     def here(self, name: str, files: Sequence[StoredFile]) -> Iterator[Path]:
-        """Yield the local path of a bag, or of a copy of a remote bag; raises OSError."""
+        """Yield the path of a local bag, or of a temporary copy of a bag; raises OSError."""
         if self._is_local:
             yield Path(self._root, name)
             return
@@ -98,10 +98,10 @@ class Storage:
 
 
 def _scan(root: str) -> Iterator[str]:
-    """Yield the files of a local tree; links, which fsspec does not follow, are followed."""
+    """Yield the files of a local tree, following links (fsspec does not follow links)."""
     for folder, folders, names in os.walk(root, followlinks=True):
         here = Path(folder).resolve()
-        # Skip links to a containing folder: the scan would never end.
+        # Skip links to a folder that contains the link, because the scan would never end.
         folders[:] = [n for n in folders if Path(folder, n).resolve() not in (here, *here.parents)]
         yield from (str(path) for name in names if (path := Path(folder, name)).is_file())
 
@@ -113,7 +113,7 @@ def words(error: Exception) -> str:
 
 
 def find_units(storage: Storage) -> list[FoundUnit]:
-    """Find a fleet's units; ThermoCompError if the folder cannot be listed or has no bag."""
+    """Find the units of a fleet; ThermoCompError if the folder cannot be listed or has no bag."""
     bags = group_files(storage.files())
     if not bags:
         raise ThermoCompError(
@@ -133,10 +133,10 @@ def find_units(storage: Storage) -> list[FoundUnit]:
 
 
 def folders_of_tables(storage: Storage) -> tuple[str, ...]:
-    """Return the folders with tables, which `convert` reads, and without a bag."""
+    """Return the folders that have tables, which `convert` can make bags of, but no bag."""
     stored = storage.files()
     with_bags = [f'{_folder(name)}/' for name in group_files(stored)]
-    # fleet.csv, the result of an earlier run, is not a table to convert.
+    # fleet.csv is the result of an earlier run, not a table of samples.
     tables = {
         _folder(file.name)
         for file in stored
@@ -152,7 +152,7 @@ def folders_of_tables(storage: Storage) -> tuple[str, ...]:
 
 
 def group_files(files: Sequence[StoredFile]) -> Bags:
-    """Group the files of a fleet into bags, in the order of their names."""
+    """Group the files of a fleet into bags, sorted by name."""
     by_folder: dict[str, list[StoredFile]] = defaultdict(list)
     for file in files:
         by_folder[_folder(file.name)].append(file)
@@ -167,7 +167,7 @@ def group_files(files: Sequence[StoredFile]) -> Bags:
 
 
 def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
-    """Whether a folder is a rosbag2 bag, also without metadata, as after a killed recorder."""
+    """Whether a folder is a rosbag2 bag; a killed recorder leaves a bag without metadata.yaml."""
     stems = [file.name.rpartition('.')[0].rpartition('_') for file in stored]
     usual = f'{folder}/{folder.rpartition("/")[2]}'
     return any(file.name == f'{folder}/metadata.yaml' for file in inside) or all(
@@ -185,5 +185,5 @@ def _serial(storage: Storage, name: str, files: Sequence[StoredFile]) -> str:
         with storage.here(name, files) as path, open_recording(path, require=()) as reader:
             return reader.info.metadata.get('serial') or storage.name
     except (RecordingError, OSError):
-        # A bag that cannot be read becomes a unit of its own, whose row shows the problem.
+        # A bag that cannot be read is listed as a separate unit, whose row states the problem.
         return name

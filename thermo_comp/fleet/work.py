@@ -23,7 +23,7 @@ from ..unit.calibration_file import dump_calibration
 from .table import FAILED, REFUSED, Cell, fitted_cells, row_of
 from .units import FoundUnit, Storage, words
 
-_WAIT_S = 30.0
+_WAIT_S = 30.0  # time to wait for a Dask scheduler, and for its first worker
 _UNIT_OF: dict[str | None, Literal['counts', 'm/s^2']] = {'counts': 'counts', 'imu': 'm/s^2'}
 
 
@@ -34,7 +34,7 @@ def sha256(content: str | bytes) -> str:
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """Options of the fits of all units; serial and input unit come from the bags."""
+    """Options of the fits of all units, except for serial and input, which the bags state."""
 
     fit: FitOptions
     topics: Topics | None = None
@@ -46,7 +46,7 @@ class FleetOptions:
         return '' if self.fit.prior is None else sha256(dump_calibration(self.fit.prior))
 
     def digest(self) -> str:
-        """Return the SHA-256 of everything except the bags that a result depends on."""
+        """Return the SHA-256 of the version, prior and options, on which a result depends."""
         plain = replace(self, fit=replace(self.fit, prior=None))
         content = {'version': __version__, 'prior': self.prior_sha256, **asdict(plain)}
         return sha256(json.dumps(content, sort_keys=True, default=repr))
@@ -54,11 +54,11 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class UnitOutcome:
-    """The result of the work on a unit, small enough to send between processes."""
+    """The result of reading and fitting a unit, in a size suitable for messages of Dask."""
 
     row: dict[str, Cell]
     hashes: dict[str, str]  # SHA-256 of each bag
-    is_final: bool  # False if a file system or worker failed: a repetition may succeed
+    is_final: bool  # False if a file system or worker failed: a later run may succeed
     calibration: str = ''
     certificate: str = ''
 
@@ -77,11 +77,11 @@ def _started_row(unit: FoundUnit, **known: Any) -> dict[str, Cell]:
 
 
 def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcome:
-    """Read and fit a unit; a bad bag does not stop the fit, a bad unit does not stop the fleet."""
+    """Read and fit a unit; unusable bags are left out, and a failure is stated in the row."""
     began = time.process_time()
     storage = Storage(url)
     hashes = dict.fromkeys(unit.bags, '')
-    # Of each bag only the statistics of its cells are kept, some kilobytes per hour.
+    # Only the statistics of each bag are kept in memory, some kilobytes per hour of the bag.
     bags: dict[str, ReducedBag] = {}
     problems = []
     is_final = True
@@ -92,8 +92,8 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
                 source, info = recording_source(path, options.topics, require=('accel', 'board'))
                 how = replace(options.fit, input=_UNIT_OF[info.input])
                 bags[name] = reduce_bag(replace(source, sha256=hashes[name]), how)
-        except RecordingError as error:  # noqa: PERF203 - a bad bag does not stop the others
-            # Name the bag by its path in the fleet, not by the path of a local copy.
+        except RecordingError as error:  # noqa: PERF203 - the other bags are still read
+            # Name the bag by its path in the fleet, not by the path of a temporary copy.
             problems.append(': '.join(part for part in (name, error.key, error.message) if part))
             is_final = is_final and not isinstance(error.__cause__, OSError)
         except OSError as error:
@@ -127,7 +127,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
         how = replace(options.fit, input=next(iter(kinds)), serial=serial)
         row, calibration, page = _fitted(row, list(bags.values()), how, options.certificates)
     except FitError as refusal:
-        # A prior can replace missing data, but not contradictory data.
+        # A fit with a prior is useful for incomplete data, but not for contradictory data.
         is_whole = 0 if isinstance(refusal, UndeterminedError) else None
         row.update(verdict=REFUSED, problem=one_line(str(refusal)), is_whole=is_whole)
     except ThermoCompError as failure:
@@ -139,7 +139,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
 def _fitted(
     row: dict[str, Cell], bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
 ) -> tuple[dict[str, Cell], str, str]:
-    """Fit bags; return the whole row, the calibration file and the certificate as texts."""
+    """Fit bags; return the complete row, and calibration file and certificate as texts."""
     from ..report.evidence import evidence_of_fit
     from ..report.page import render_report
 
@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Let workers that start in the context ignore Ctrl-C; afterwards raise KeyboardInterrupt."""
+    """Make workers started in the context ignore Ctrl-C; at its end raise KeyboardInterrupt."""
     heard: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -182,12 +182,12 @@ def _uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def connected(scheduler: str | None = None, n_workers: int | None = None) -> Iterator[Any]:
-    """Yield a client of a running cluster, with this version on all workers, or of a new one."""
+    """Yield a client of the cluster at the address `scheduler`, or of a new local cluster."""
     import dask
     from distributed import Client
     from distributed.utils import get_mp_context
 
-    # The fleet table reports failures of workers; Dask's log is not needed.
+    # Silence the log of Dask: the fleet table states the failures of workers.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     quiet = {
         'logging.distributed': 'critical',
@@ -230,7 +230,7 @@ def version() -> str:
 def run(
     client: Any, url: str, units: Sequence[FoundUnit], options: FleetOptions
 ) -> Iterator[tuple[FoundUnit, UnitOutcome]]:
-    """Process units; yield each unit when done, with its outcome or the reason of a failure."""
+    """Process units on a cluster; yield each unit with its outcome, in the order of completion."""
     from distributed import as_completed
 
     futures = client.map(process_unit, units, url=url, options=options, pure=False, batch_size=256)
@@ -244,7 +244,7 @@ def run(
 
 
 def outcome_of(future: Any, unit: FoundUnit) -> UnitOutcome:
-    """Return a task's outcome; if the task failed, an outcome that a later run replaces."""
+    """Return the outcome of a task; if the task failed, an outcome that is not final."""
     from distributed import KilledWorker
 
     if future.status == 'finished':
