@@ -3,9 +3,9 @@
 """
 Owns the limits of a calibration's bias and scale over its temperatures.
 
-The largest bias, level plus curve, is twice the full scale. The largest effect of a column on the
-bias is a million times this limit, far beyond any instrument, so that nothing overflows; so is the
-largest effect of a parameter's sd, relative to the limit of the bias or of the scale.
+The largest bias, level plus curve, is twice the full scale. The effect of a column on the bias,
+and of a parameter's sd on bias or scale, may be a million times the limit of bias or scale: far
+beyond any instrument, but without overflow.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale: the bias of samples in an offset code is half of their range.
 FULL_SCALES = 2.0
-#: Largest accepted effect of a column or of a parameter's uncertainty / largest bias.
+#: Largest accepted effect of a column or of a parameter's sd / limit of the bias or scale.
 WORST = 1e6
 #: Number of temperatures at which a function of temperature is checked.
 _GRID = 513
