@@ -84,13 +84,13 @@ class DetectorSettings:
     relaxed_rate_k_min: Annotated[
         float,
         QUANTITIES['ramp'],
-        'Limit of the rate of a sensor, K/min: above the limit the dynamic state does not end.',
+        'Rate below which a sensor has relaxed, so that the dynamic state may end, K/min.',
     ] = 0.05
     dwell_s: Annotated[
         float,
         QUANTITIES['dwell'],
-        'Time for which the rates must be below the relaxed rate before the dynamic state ends; '
-        'shortest duration of the dynamic state, s.',
+        'Shortest time for which the rates must be below `relaxed_rate_k_min` before the dynamic '
+        'state ends, s.',
     ] = 60.0
     closes: Annotated[
         Closes,

@@ -134,7 +134,7 @@ class ParameterLayout(NamedTuple):
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """Encode a covariance with the lowest rank for `tolerance`; ValueError for other matrices."""
+    """Encode a covariance; the factor omits at most `tolerance` of each variance."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')
