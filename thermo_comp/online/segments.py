@@ -60,7 +60,7 @@ class Segment(NamedTuple):
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    slow: SlowState  # the same object in successive segments with equal arguments
+    slow: SlowState  # successive segments with equal arguments have the same object
 
 
 _NO_STATE: Final = SlowState((), [], 0.0)

@@ -261,9 +261,9 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             of_unit.draw_rates,
             'Bias of the gyroscope over temperature, in a soak and in ramps, less the '
             'value at the reference temperature and less a straight line, whose slope stands '
-            'above each panel. Hatched: 95 % band; it includes the uncertainty of the constant '
+            'above each panel. Hatched: 95 % band, including the uncertainty of the constant '
             'due to the Earth’s rate and the turn-on offset.',
-            '' if judged is None else f'Judged on these bags, {judged}.',
+            '' if judged is None else f'Verdict on these bags: {judged}.',
         )
 
 

@@ -40,7 +40,7 @@ class LagBank:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the input: the next value initialises the lags again."""
+        """Forget the input: at the next value all lags start at 0."""
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0

@@ -67,9 +67,9 @@ class Fault(Enum):
     NONE = 'none'
     #: Readings that have been equal for longer than noise explains: used with a growing variance.
     STILL = 'stands still'
-    #: Readings that stay equal while the other sensor's temperature changes: they are not used.
+    #: Readings, not used, that stay equal while the other sensor's temperature changes.
     FROZEN = 'frozen'
-    #: A reading that changed faster than any part of a unit can: it is not used.
+    #: A reading, not used, that has changed faster than the temperature of any part can.
     STEP = 'jumped'
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
     #: as with a loose thermometer: its readings are used, with a larger variance.

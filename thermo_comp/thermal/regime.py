@@ -209,7 +209,7 @@ class _Watch:
 
 
 def _obvious(sensor: Thermometer, rate: float) -> int:
-    """Sign of the sensor's rate if it exceeds `rate` by `OBVIOUS_SIGMAS` sd, otherwise 0."""
+    """Sign of the sensor's rate if above `rate` in magnitude by `OBVIOUS_SIGMAS` sd, else 0."""
     margin = abs(sensor.rate) - rate
     if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
         return 1 if sensor.rate > 0.0 else -1

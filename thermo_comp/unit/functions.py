@@ -41,7 +41,7 @@ _FARTHEST_KNOT = 2000.0
 
 
 def hold(value: Floats, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Floats:
-    """Limit values to a range in the same unit."""
+    """Limit values to the range from `lower` to `upper`."""
     return np.asarray(np.minimum(np.maximum(value, lower), upper))
 
 
