@@ -152,7 +152,7 @@ TEXT = dump_calibration(RICH)
         ('- [0.001, 1.0, 0.0]', '- [0.7, 1.0, 0.0]', 'misalignment[1][0]', 'below 0.5'),
         ('sensors: [case, frame]', 'sensors: [case]', 'response[1].sensor', "got 'frame'"),
         ('sensors: [case, frame]', 'sensors: [case, case]', 'sensors', 'different names'),
-        ('sensors: [case, frame]', 'sensors: []', 'sensors', 'at least one'),
+        ('sensors: [case, frame]', 'sensors: []', 'sensors', 'must be one or more'),
         ('sensors: [case, frame]', 'sensors: [board]', 'sensors', 'none of them board'),
         ('- kind: gradient\n', '- kind: then\n', 'response[0].kind', "'gradient', .* got 'then'"),
         ('tau_s: 600.0', 'tau_s: 0.0', 'response[3].tau_s', 'greater than 0 for board, got 0'),

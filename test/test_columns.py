@@ -165,7 +165,7 @@ def test_a_new_kind_of_column_is_one_class(monkeypatch):
     # d(bias)/d(rate) = 2 * 3e6 rate; 300 counts per m/s^2.
     by_rate = (2.0 * 3e6 * rate / 300.0) ** 2 * variance
     assert line[VARIANCES[2]] - correction.noise[2] == pytest.approx(by_rate, rel=1e-6)
-    with pytest.raises(ValueError, match=r'keep the largest bias by the column within'):
+    with pytest.raises(ValueError, match=r'keep the largest effect of the column within'):
         calibration(response=(term('rate_square', (1e13, 0.0, 0.0), range=(0.0, 1e9)),))
 
 

@@ -150,7 +150,7 @@ def test_a_file_keeps_nonlinear_terms_and_refuses_impossible_terms():
         with pytest.raises(CalibrationError, match='nonlinearity') as caught:
             parse_calibration(text.replace(before, after).encode())
         assert said in str(caught.value)
-    with pytest.raises(ValueError, match='each once, in this order'):
+    with pytest.raises(ValueError, match='at most one each, in this order'):
         replace(BENT, terms=(CUBE, SQUARE))
 
 

@@ -113,7 +113,7 @@ def test_certificate_has_the_residual_of_each_position_left_out(page):
     shown = [position.residual_rms.get(LEFT_OUT) for position in evidence().positions]
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
-    assert 'Left out: with a fit to the other positions' in page.text
+    assert 'Left out: RMS of |f| − g by a fit to the other positions' in page.text
 
 
 def test_page_needs_no_network_and_runs_nothing(page):

@@ -31,7 +31,7 @@ from .windows import WINDOW_S, corrected_windows, sum_length
 
 # Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
 _LARGEST_NOISE_RATIO = 4.0
-# Smallest sd of the noise of a sample whose axis is never constant in a rest [counts].
+# Noise sd of a sample from which an axis is never constant in a rest [counts].
 _DEAD_NOISE = 0.5
 # Smallest significant change of a constant between calibrations, in standard deviations.
 _SIGNIFICANT_SDS = 3.0
@@ -39,7 +39,7 @@ _SIGNIFICANT_SDS = 3.0
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Judgements of calibrations, by name; the notes list the recordings that were not judged."""
+    """Judgements by the name of the calibration; `notes`: recordings that were not judged."""
 
     bags: tuple[ReducedBag, ...]
     judgements: dict[str, Judgement]
@@ -96,7 +96,7 @@ def open_bags(
 
 
 def _dead_axes(bag: ReducedBag, calibration: Calibration) -> str:
-    """Describe the axes of counts that are constant in a rest although they have noise."""
+    """Describe axes of counts that are constant in a rest in spite of their calibrated noise."""
     unit, density = calibration.unit, np.array(calibration.noise_density_m_s2_sqrt_hz)
     if unit.input != 'counts':
         return ''
@@ -157,8 +157,8 @@ def evaluate(
         )
         if judgement is None:
             raise RecordingError(
-                f'no window of {window_s:g} s at rest was corrected: nothing to judge; rests '
-                'longer than a window (--window), with temperatures, are needed',
+                f'no window of {window_s:g} s at rest was corrected: nothing to judge; record '
+                'rests longer than a window (--window), with temperatures',
                 path=', '.join(map(str, paths)),
             )
         judgements[name] = judgement
@@ -174,9 +174,9 @@ def evaluate(
 @dataclass(frozen=True)
 class Epoch:
     """
-    A calibration of a history, in a soak at the first calibration's reference temperature: bias of
-    x, y, z [ug] and change of scale since the first calibration [ppm], shape (6,); an unknown sd
-    is NaN.
+    Constants of a calibration in a soak at the reference temperature of the unit's first
+    calibration: bias of x, y, z [ug] and change of scale since the first calibration [ppm], shape
+    (6,); an unknown sd is NaN.
     """
 
     date: str
@@ -205,8 +205,8 @@ class Drift:
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
-    Sort the calibrations of the first calibration's unit by date. Only the first of several
-    calibrations from the same bags is kept, because two models of the same data show no change.
+    Sort by date the calibrations with the serial number of the first given calibration. Of several
+    calibrations from the same bags, which show no change of the unit, only the first is kept.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []
@@ -229,7 +229,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
 
 
 def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
-    """List the changes from each calibration to the next; their errors are assumed independent."""
+    """List the changes from each calibration to the next; all errors are taken as independent."""
     return [
         Drift(
             earlier=before.date,

@@ -72,13 +72,13 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """Exit code: 0 for a valid calibration whose gyroscope, if any, is not refuted; else 1."""
+        """Exit code: 1 if not valid, or for a gyroscope to recalibrate or no better; else 0."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 
     @property
     def headline_rms(self) -> float:
-        """RMS error: of positions left out if the fit has them, else of windows in the ranges."""
+        """RMS error of left-out positions if known, else of windows in the calibrated ranges."""
         in_sample = self.sections['all'].rms
         return self.left_out_rms if np.isfinite(self.left_out_rms) else in_sample
 
@@ -168,7 +168,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
             np.ravel([each_set.temperature_range_c for each_set in sets]),
             np.ravel([each_set.rate_range_k_min for each_set in sets]),
         )
-        text = f'{_windows(outside.n, windows)}, all outside, at {judged}; calibrated at {known}'
+        text = f'{_windows(outside.n, windows)}, all at {judged}; calibrated at {known}'
         return Verdict.OUTSIDE, f'{text}; {_numbers(outside)}'
     worst = max([s.rms for s in sections.regimes or [full]] + [judgement.headline_rms])
     ratio = sections.worst_ratio
@@ -191,10 +191,11 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
         parts = [f'{ug_text(left_out)} RMS of |f| - g on positions left out; in sample {parts[0]}']
     if tolerance is not None:
         where = 'on positions left out' if worst == left_out else 'in the worse regime'
-        parts.append(f'{ug_text(worst)} {where}, {ug_text(tolerance)} tolerated')
+        parts.append(f'{ug_text(worst)} RMS {where}, limit {ug_text(tolerance)}')
     elif claims:
         parts.append(
-            f'largest RMS / claimed of a regime {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}'
+            f'largest ratio of RMS to claimed in a regime {ratio:.2g}, '
+            f'limit {verdicts.LARGEST_RATIO:g}'
         )
     else:
         parts.append(
@@ -207,7 +208,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
     if outside.n:
         parts.append(
             f'{_windows(outside.n, windows)} outside the calibrated ranges not judged: '
-            f'{ug_text(outside.rms)}'
+            f'{ug_text(outside.rms)} RMS'
         )
     return kind, '; '.join(parts)
 
@@ -234,7 +235,7 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
     gravity = windows.gravity
-    # Windows with a large claimed sd, as while the lags are unknown, have a small weight.
+    # Windows with a large claimed sd, such as the first ones of a bag, have a small weight.
     weight = 1.0 / np.maximum(windows.claimed_sd, _SMALLEST_NORM_SD) ** 2
     precision = means_by(windows.position, weight)
     force = (
@@ -253,7 +254,7 @@ def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[A
     )
     residuals = np.concatenate(((sizes - 1.0) / sd, np.zeros(3)))
     shift = np.linalg.lstsq(rows, residuals, rcond=None)[0]
-    # Residuals in excess of the claimed errors increase the sd of the shifts.
+    # If the residuals exceed the claimed errors, increase the sd of the shifts.
     freedom, left = len(sd) - 6, float(np.sum((residuals - rows @ shift) ** 2))
     excess = max(1.0, left / freedom) if freedom > 0 else 1.0
     spread = np.sqrt(np.diag(np.linalg.pinv(rows.T @ rows)) * excess)
@@ -277,7 +278,7 @@ def change_texts(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
 
 
 def rms_by_axis(windows: Windows) -> Floats:
-    """Return the RMS force of each axis about position means, static and dynamic, (2, 3)."""
+    """Return by regime and axis the RMS of the force less its mean in the position, (2, 3)."""
     about = within_positions(windows.force, windows.position)
     return np.array(
         [

@@ -23,7 +23,7 @@ LARGEST_RATIO = 2.0
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Largest ratio of a |f| to the next smaller |f| of the windows, for both to be one level of |f|.
+# Largest ratio of a window's |f| to the next smaller |f| at which both are summarised together.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
@@ -49,11 +49,11 @@ class Verdict(Enum):
 @dataclass(frozen=True)
 class Section:
     """
-    Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or changes of the angular rate
-    [rad/s].
+    Residuals of the `n` windows of a section: ``|f| - g`` [m/s^2], or angular rate less its mean
+    in the rest [rad/s].
 
-    `raw` values are corrected with the constants at the reference temperature alone, other values
-    with the whole calibration; `claimed_rms`: RMS of the claimed sd of the windows, or NaN.
+    `raw` values are corrected only with the constants at the reference temperature, the other
+    values with the whole calibration; `claimed_rms`: RMS of the claimed sd of the windows, or NaN.
     """
 
     n: int
@@ -121,7 +121,7 @@ def _section(raw: Floats, residual: Floats, claimed: Floats, rows: Bools | Ints)
 
 @dataclass(frozen=True)
 class RateJudgement:
-    """The judgement of a gyroscope; `sections` hold changes of the angular rate [rad/s]."""
+    """The judgement of a gyroscope by its rates less their mean in each rest [rad/s]."""
 
     kind: Verdict
     reason: str
@@ -171,7 +171,7 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
         bias, change = SlowUncertainty(triad, correction).of_bias(windows.gyro[:, 9:], mean_of)
         slow = np.square([axis.residual_sd_m_s2 for axis in triad.static.axes()])
         # Errors due to thermometer noise and unknown initial lag states nearly vanish in the mean
-        # of a rest, so a change from the mean has their whole variance.
+        # of a rest, so a change from this mean has the whole variance of these errors.
         of_thermometers = np.maximum(variance - np.array(correction.noise) - slow - bias, 0.0)
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
@@ -190,8 +190,9 @@ def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | N
 def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict, str]:
     total, outside = sections['all'], sections['outside']
     if not total.n:
-        return Verdict.OUTSIDE, f'{counted(outside.n, "window")} of {window_s:g} s, all outside'
-    text = f'{_mdeg(total.rms)} RMS of changes at rest, {_mdeg(total.raw_rms)} raw'
+        windows = f'{counted(outside.n, "window")} of {window_s:g} s'
+        return Verdict.OUTSIDE, f'{windows}, all outside the calibrated ranges'
+    text = f'{_mdeg(total.rms)} RMS about the mean of each rest, {_mdeg(total.raw_rms)} raw'
     over = f'over {counted(total.n, "window")} of {window_s:g} s'
     if not claims:
         kind = Verdict.NO_BETTER if total.rms > total.raw_rms else Verdict.NO_CLAIM
@@ -199,7 +200,7 @@ def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict
     ratio = sections.worst_ratio
     text = (
         f'{text}, {_mdeg(total.claimed_rms)} claimed {over}; '
-        f'largest RMS / claimed of a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
+        f'largest ratio of RMS to claimed in a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
     # At constant temperature the correction is constant, so a residual as large as the raw
     # residual is not a fault.

@@ -30,7 +30,7 @@ from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# Distance outside a calibrated range that noise can explain, so that a window counts as inside
+# Largest distance outside a calibrated range at which a window counts as inside, because of noise
 # [half ranges].
 _RANGE_TOLERANCE = 0.02
 # Smallest number of samples of a used partial sum / median over all partial sums.
@@ -99,7 +99,7 @@ class Windows:
 
 
 def sum_length(window_s: float) -> float:
-    """Choose the duration of a window's partial sums [s], 10 s or less: a share of `window_s`."""
+    """Divide `window_s` by a whole number, for a duration of partial sums of 10 s or less [s]."""
     return window_s / float(np.ceil(window_s / reduction.WINDOW_S))
 
 
@@ -120,7 +120,7 @@ def corrected_windows(
 ) -> Windows:
     """
     Build the windows of bags, corrected if there is a calibration; raises RecordingError if the
-    samples are too slow for windows of `window_s`.
+    sample rate is too low for windows of `window_s`.
     """
     if calibration is not None:
         gravity = calibration.gravity_m_s2 if gravity is None else gravity
@@ -133,8 +133,7 @@ def corrected_windows(
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(Correction(calibration).noise)
-        # The converter adds the rounding error to the next sample, so a mean has no rounding
-        # error.
+        # The converter adds the remainder of rounding to the next sample, so a mean has none.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
@@ -208,8 +207,8 @@ def _table(
         per = max(1, round(window_s / bag.window_s))
         if abs(per * bag.window_s - window_s) > 1e-6 * window_s:
             raise RecordingError(
-                f'its samples are too slow for windows of {window_s:g} s: {bag.window_s:g} s or '
-                'a multiple of it are needed (--window)',
+                f'the sample rate is too low for windows of {window_s:g} s: give --window as '
+                f'{bag.window_s:g} or a multiple',
                 path=bag.source.name,
             )
         sums: list[_Table] = [np.zeros(0, kind)]
@@ -250,7 +249,7 @@ def _table(
 
 def _joined(sums: _Table) -> _Table:
     """
-    Join the partial sums of each row to a window; drop windows that are not corrected entirely.
+    Join the partial sums of each row to a window; drop windows with uncorrected partial sums.
     """
     result = sums[:, 0].copy()
     result['count'] = sums['count'].sum(axis=1)

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correction of whole arrays at once, bit-identical to that of single samples.
+Owns the correction of arrays of samples, with the same bits as sample by sample.
 
-The compensator takes each temperature reading separately, as for single samples. The segments
-between the readings are collected, evaluated together and applied to all samples with the
-arithmetic of single samples.
+The compensator uses the temperature readings one by one. The segments between the readings are
+collected, evaluated together and applied to all samples with the arithmetic of single samples.
 """
 
 from dataclasses import dataclass, fields
@@ -56,7 +55,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct a block's samples, and angular rates (n, 3), with the bits of single samples."""
+    """Correct a block's samples and angular rates (n, 3), with the same bits as one by one."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -119,13 +118,13 @@ def _runs(compensator: Compensator, stamps: Stamps, arrivals: _Arrivals) -> list
 def _push(
     compensator: Compensator, arrivals: _Arrivals, place: int, due_ns: int = EVER_NS
 ) -> None:
-    """Queue the readings before sample number `place`, whose stamp is `due_ns` if known."""
+    """Queue the readings before sample number `place`; `due_ns`: stamp of this sample."""
     thermal = compensator.thermal
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # As in the node, a full queue applies its oldest readings; after the first sample only
-            # readings up to the stamp of the next sample are applied.
+            # As in the node, the oldest readings of a full queue are applied; after the first
+            # sample only those up to the stamp of the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the plausibility checks of samples: a stuck converter, samples faster than the converter, and
-|f| at rest, which must be gravity.
+Owns the plausibility checks of samples: a stuck converter, more samples than the converter can
+make, and |f| at rest, which must be gravity.
 
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
 calibration, or the calibration of another unit, |f| at rest differs from gravity by more than the
 claimed uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
-scatter is the sensor's noise and its mean agrees with the mean of the previous window. A step of
-|f| from a rest to another rest is not a motion, and is judged within a second.
+scatter is within the sensor's noise and its mean agrees with the mean of the previous window. A
+step of |f| from a rest to another rest is judged within a second.
 """
 
 import math
@@ -24,8 +24,8 @@ from .status import GravityResidual
 
 #: Smallest number of equal samples in a row at which the converter counts as stuck.
 STUCK_SAMPLES: Final = 50
-#: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck.
-#: A turn by 1.2 degrees makes this change; noise and the steps of a converter at rest do not.
+#: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck: the
+#: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
 MOTION: Final = 0.2
 #: Largest accepted ratio of the long-term rate of samples to the calibrated rate.
 LARGEST_RATE: Final = 1.5
@@ -33,18 +33,19 @@ LARGEST_RATE: Final = 1.5
 #: or duration [s].
 BURST_SAMPLES: Final = 50
 BURST_S: Final = 0.25
-#: Largest relative deviation of the samples' rate at which the calibrated noise applies.
+#: Largest relative deviation of the sample rate from the calibrated rate at which the calibrated
+#: noise applies and no warning is given.
 RATE_TOLERANCE: Final = 0.1
-_WINDOW_S: Final = 1.0  # time over which the rate of samples is measured [s]
+_WINDOW_S: Final = 1.0  # time over which the sample rate is measured [s]
 #: Duration of a window of the gravity check [ns]: shortest, and longest if samples are few.
 WINDOW_NS: Final = 1_000_000_000
 LONGEST_WINDOW_NS: Final = 30_000_000_000
 # Shortest time between two samples of a window of the gravity check [ns].
 PROBE_NS: Final = 90_000_000
 SMALLEST_WINDOW: Final = 5  # smallest number of samples in a window of the gravity check
-#: Largest ratio of a still window's scatter to the noise of its samples.
+#: Largest ratio of a still window's scatter to the noise of its samples (both as sd).
 SCATTER_FACTOR: Final = 3.0
-#: Largest change of the mean between two still windows beyond noise [m/s^2]: half a milli-g.
+#: Largest change of the mean between two still windows in addition to noise [m/s^2]: 0.5 mg.
 LARGEST_CHANGE: Final = 5e-3
 #: Number of still windows averaged into one residual, with exponentially falling weight.
 MEMORY_WINDOWS: Final = 30.0
@@ -64,11 +65,11 @@ Run: TypeAlias = tuple[tuple[float, float, float, int], int, float]
 
 class StuckCheck:
     """
-    Counts equal readings in a row of each axis, which are stuck after the time-out [s], 0 = never.
+    Counts consecutive equal readings of each axis; `timeout_s` [s]: 0 = nothing is stuck.
 
-    Samples are stuck if all three axes repeat their readings, or if an axis repeats its reading
-    while both other axes change by `motion` [input unit]: no motion leaves an axis at exactly the
-    same number. At rest an axis with noise below the converter's step may repeat its reading.
+    After the time-out samples are stuck if all three axes repeat their readings, or if an axis
+    repeats its reading while both other axes change by `motion` [input unit]. One axis alone may
+    repeat its reading at rest, if its noise is below the converter's step.
     """
 
     def __init__(self, timeout_s: float, motion: float) -> None:
@@ -98,7 +99,7 @@ class StuckCheck:
         return len(moved) == 3 or max(moved, default=0.0) > self.motion
 
     def find(self, stamps: Ints, samples: Floats) -> Bools:
-        """Find the samples (n > 0, 3) that the stream drops as stuck or as three exact zeros."""
+        """Find the samples (n > 0, 3) that `Compensator` drops as stuck or as three zeros."""
         n = len(stamps)
         columns = samples.T
         changes = np.empty((3, n), dtype=np.bool_)
@@ -141,7 +142,7 @@ def _larger(most: float, change: float, other: float) -> float:
 
 
 class RateCheck:
-    """Compares the rate of samples with the calibrated rate, at the start of each segment."""
+    """Compares the sample rate with the calibrated rate, at the start of each segment."""
 
     def __init__(self, cycle_s: float, counts_cycles: bool = True) -> None:
         self._cycle_s, self._counts_cycles = cycle_s, counts_cycles
@@ -156,13 +157,13 @@ class RateCheck:
     def noise_excess(self) -> float:
         """
         Excess of the noise variance of a sample over the calibrated variance, relative to the
-        calibrated variance, because of the rate of samples.
+        calibrated variance, because of a sample rate above the calibrated rate.
         """
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
     def update(self, n_seen: int, stamp_ns: int) -> None:
-        """Update the rate with the number of samples so far and the stamp of the latest [ns]."""
+        """Update the rate with the number of samples so far and the latest sample's stamp [ns]."""
         last = self._last
         self._last = (n_seen, stamp_ns)
         if last is None:
@@ -185,7 +186,7 @@ class RateCheck:
 
 
 def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float:
-    """Return the variance along a force, given the covariance xx, xy, xz, yy, yz, zz."""
+    """Return the variance of |f| of a force with the covariance xx, xy, xz, yy, yz, zz."""
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance
     square = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)
@@ -193,7 +194,7 @@ def variance_along(force: Sequence[float], covariance: Sequence[float]) -> float
 
 
 class GravityCheck:
-    """Compares |f| with gravity in still windows; a tolerance of 0 refutes no calibration."""
+    """Compares |f| with gravity in still windows; a tolerance of 0 means no limit of |f|."""
 
     def __init__(self, gravity: float, tolerance: float = 0.0) -> None:
         self.gravity = gravity
@@ -247,7 +248,7 @@ class GravityCheck:
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
-        # Limit of the difference of two samples at rest, with four sd of its noise.
+        # Largest difference of two samples at rest, including four sd of the noise difference.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
         was_resting, reference = (
             self._is_resting,
@@ -280,7 +281,7 @@ class GravityCheck:
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
         last, self._last_mean = self._last_mean, mean
-        # Limit of the difference of two means at rest, with four sd of its noise.
+        # Largest difference of two means at rest, including four sd of the noise difference.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
         is_still = (
             scatter <= SCATTER_FACTOR**2 * noise_variance
@@ -291,7 +292,7 @@ class GravityCheck:
             self.result = self.result and self.result._replace(is_still=False)
             return
         size = math.hypot(*mean)
-        # The noise of the samples averages out in a window, the calibration's error does not.
+        # The mean of a window reduces the noise of the samples, but not the calibration's error.
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
         if self._judge(abs(size - self.gravity), math.sqrt(variance)):

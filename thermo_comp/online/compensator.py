@@ -6,8 +6,8 @@ regime and status.
 
 A temperature reading applies from the first later-arriving sample with an equal or later stamp, so
 stamps and order of arrival determine the output, and a node that received all messages in order
-publishes the bits of the offline replay. The rate of the samples, and |f| against gravity, are
-checked at the first sample of each segment only, to save time.
+publishes the same bits as the offline replay. To save time, the sample rate and |f| at rest are
+checked at the first sample of each segment only.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from .checks import MOTION, GravityCheck, StuckCheck
 from .segments import EVER_NS, SEGMENT_NS, Model, ThermalSide
 from .status import CompensatorConfig, Counters, GravityResidual
 
-#: Smallest backward step of the stamps that is a jump of time, as in a bag that loops [ns].
+#: Smallest backward step of the stamps that counts as a jump of time, as in a looped bag [ns].
 TIME_JUMP_NS: Final = 1_000_000_000
 #: A forward step of the stamps above both limits ([ns], [cycles]) is accepted only if a reading or
-#: a second sample confirms it: a single damaged stamp would erase the thermal memory.
+#: a second sample confirms the step; otherwise a damaged stamp would erase the thermal memory.
 LEAP_NS: Final = 15_000_000_000
 LEAP_CYCLES: Final = 10.0
 #: Age above which a board temperature is stale: number of reading intervals, and lower bound [s].
@@ -46,10 +46,10 @@ SWAPPED: Final = (
     'the board leads the case in ramps: are temperature/board and temperature/case swapped, is '
     'the case thermometer loose, or is the unit heated from inside?'
 )
-HELD: Final = 'outside the calibrated range, held at its edge'
+HELD: Final = 'outside the calibrated range: corrected as at the edge of the range'
 CONTINUED: Final = (
     'outside the calibrated range: curves continued along their tangent for '
-    f'{TANGENT_SPANS:g} of the range, then held'
+    f'{TANGENT_SPANS:g} of the range, then constant'
 )
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
@@ -72,16 +72,14 @@ class CompensatorStatus:
     regime: Regime = Regime.UNKNOWN
     direction: int = 0  # temperature change: -1 cooling, +1 heating, 0 neither
     is_settled: bool = False  # whether the unknown initial lag states have decayed
-    #: Ages of each thermometer's last used reading at the last sample [s]; infinite without a
-    #: reading.
+    #: Time from the last used reading of board or case to the last sample [s]; inf without one.
     board_age_s: float = math.inf
     case_age_s: float = math.inf
     is_board_stale: bool = True
     is_board_lost: bool = True
     is_case_lost: bool = True
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
-    #: Whether the board temperature has led that of the case in a ramp: most likely the two topics
-    #: are swapped.
+    #: Whether the board temperature has changed before the case in a ramp: topics swapped?
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
     #: Whether |f| at rest differs from gravity by more than the tolerance: nothing is published.
@@ -103,7 +101,7 @@ class Compensator:
         self._use(model.calibration)
         self.stuck = self._stuck_check()
         self.last_ns = self.event_ns = EVER_NS
-        #: Stamp of a sample that is far ahead of the sample before and is not confirmed yet.
+        #: Stamp of a sample far ahead of all earlier stamps, which no second stamp has confirmed.
         self.leapt_ns: int | None = None
         self.reading_ns = EVER_NS  # the latest stamp of a reading
         #: The present segment: start [ns], result of `Correction.line`, and misalignment.
@@ -133,7 +131,7 @@ class Compensator:
         return gravity, self.config.gravity_tolerance_m_s2
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> None:
-        """Queue a reading [degC] of ``'board'`` or another of the calibration's thermometers."""
+        """Queue a reading [degC] of ``'board'`` or of one of the calibration's `sensors`."""
         self.thermal.push(name, stamp_ns, celsius)
         self.event_ns = min(self.event_ns, stamp_ns)
         self.reading_ns = max(self.reading_ns, stamp_ns)
@@ -196,7 +194,7 @@ class Compensator:
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
         """
-        Correct the first sample after a reading or the end of a segment, and check the samples.
+        Correct the first sample after a reading or the end of a segment, and run the checks.
         """
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
@@ -209,7 +207,7 @@ class Compensator:
         fresh_ns = thermal.fresh_until_ns
         if stamp_ns > fresh_ns:
             thermal.count_unmeasured(1)
-            # Until a temperature arrives, every sample is checked in full and counted as dropped.
+            # Until a temperature arrives, each sample takes this path and is counted as dropped.
             self.event_ns = EVER_NS
             self.last_ns = stamp_ns
             return None
@@ -226,7 +224,7 @@ class Compensator:
             is_good &= is_sound(rate_line)
             self.rate_line = rate_line.tolist()
         if not is_good:
-            # While the correction is not finite, every sample is checked in full and dropped.
+            # While the correction is not finite, each sample takes this path and is dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
@@ -236,7 +234,7 @@ class Compensator:
         self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
         if self.gravity.is_refuted and not is_too_fast:
-            # Samples dropped for |f| still feed the gravity check, which may accept |f| again.
+            # The gravity check uses samples dropped for |f|, too, so that it may accept |f| again.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
@@ -293,9 +291,9 @@ class Compensator:
         """
         Build a compensator that continues from the last sample with another model or settings.
 
-        The states of thermometers, regime and memory that the new model also has are kept. The
-        present compensator does not change, so a failure has no effect; afterwards only the
-        present or the new compensator may continue.
+        The states of thermometers, regime and memory are kept if the new model has the same
+        detector settings, lags and plays; otherwise only the last temperatures are kept. The
+        present compensator does not change; afterwards only one of the two may continue.
         """
         new = copy(self)
         new.take_over(model, config)
@@ -310,7 +308,7 @@ class Compensator:
         is_same = self.calibration == model.calibration
         self._use(model.calibration)
         if is_same and self._gravity_settings == before:
-            # A change of other settings does not end a stop by the check of |f|.
+            # Only other settings have changed: a stop by the check of |f| persists.
             self.gravity = gravity
         self.stuck = self._stuck_check()
         if self.stuck.limit_ns == stuck.limit_ns:
@@ -337,8 +335,7 @@ class Compensator:
             math.inf if used_ns is None else (stamp_ns - used_ns) * 1e-9
             for used_ns in (board_ns, case_ns)
         )
-        # The board temperature is stale at half the time-out at the latest: a warning precedes the
-        # error.
+        # The warning of a stale board temperature comes at half the time-out or earlier.
         timeout_s = self.config.temperature_timeout_s
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
         state = thermal.sample(stamp_ns)
@@ -367,7 +364,7 @@ class Compensator:
 
     @property
     def scale_sd(self) -> tuple[float, ...]:
-        """Sd of the relative scale of each axis in the present segment, () before the first."""
+        """Sd of each axis' relative scale in the present segment; () before the first segment."""
         line = self._segment[1]
         return tuple(math.sqrt(max(0.0, line[place])) for place in SCALE_VARIANCES if line)
 

@@ -3,10 +3,10 @@
 """
 Owns the segments: time intervals between temperature readings, with a correction linear in time.
 
-A segment ends at a temperature reading, or after one second. The correction is evaluated in full
-at both ends of a segment, so a sample costs a few operations, the output has no steps between two
-readings, and a batch needs one evaluation per segment. The variance due to the parameters and
-initial lag states, which changes slowly, is evaluated at the first segment in each ten seconds.
+A segment ends at a temperature reading, or after one second. The correction is evaluated at both
+ends of a segment and interpolated, so a sample takes a few operations, the output has no steps
+between two readings, and a batch needs one evaluation per segment. The slowly varying variance due
+to the parameters and initial lag states is evaluated at the first segment in each ten seconds.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ from .status import CompensatorConfig, Counters
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
 SLOW_NS: Final = 10_000_000_000  # time for which `SlowState`, and so its variance, is held [ns]
-YOUNG_READINGS: Final = 30  # board readings after a start that determine the board's rate
+YOUNG_READINGS: Final = 30  # number of board readings that determine the board's rate
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
 UNMEASURED_SD_K: Final = 10.0
@@ -54,13 +54,13 @@ class Segment(NamedTuple):
     """A time interval with a linear correction, and the checks that apply to its samples."""
 
     start_ns: int
-    # False for the second part of a segment that the end of a block or a call has cut.
+    # False if an earlier call, or the block before, has opened this segment.
     is_new: bool
     is_too_fast: bool  # whether samples come faster than the converter can make them
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
     start: tuple[float, ...]  # thermal state at the start of the segment
     end: tuple[float, ...]  # thermal state at the end of the segment
-    slow: SlowState  # the same object in successive segments with equal arguments
+    slow: SlowState  # successive segments with equal arguments have the same object
 
 
 _NO_STATE: Final = SlowState((), [], 0.0)
@@ -92,7 +92,7 @@ class Model:
 
 
 class ThermalSide:
-    """Queued readings, thermal state and segments, which streaming and batch share."""
+    """Queued readings, thermal state and segments, for single samples and for arrays."""
 
     def __init__(self, model: Model, config: CompensatorConfig, counters: Counters) -> None:
         self.counters = counters
@@ -138,7 +138,7 @@ class ThermalSide:
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # A stop because of the samples' rate persists while the unit is the same.
+            # A stop because of the sample rate persists while the unit is the same.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
@@ -191,7 +191,7 @@ class ThermalSide:
 
     @property
     def is_unmeasured(self) -> bool:
-        """Whether a constant correction is applied to a unit without a temperature reading."""
+        """Whether the correction is constant and no temperature reading has been received."""
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
@@ -213,7 +213,7 @@ class ThermalSide:
 
     def count_unmeasured(self, n_samples: int) -> None:
         """
-        Count samples as dropped: the board temperature is missing, or older than allowed.
+        Count samples as dropped because the board temperature is missing or too old.
         """
         if self.tracker.board.stamp_ns is None:
             self.counters.n_no_temperature += n_samples
@@ -258,8 +258,7 @@ class ThermalSide:
         if key != self._slow_key:
             self._slow_key = key
             if self.is_unmeasured:
-                # Without a temperature reading, evaluate the variance at a temperature one sd from
-                # the reference temperature.
+                # Evaluate the variance one sd of the unknown temperature from the reference.
                 end_state = (end_state[BOARD] + UNMEASURED_SD_K, *end_state[1:])
             memory = self.tracker.memory
             shares = memory.remaining_shares(start_ns + SEGMENT_NS)

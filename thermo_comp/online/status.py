@@ -14,7 +14,7 @@ class CompensatorConfig(ThermalConfig):
     """Settings of the compensator; ValueError if a value is out of its range."""
 
     #: Time after which samples that repeat their values on all axes, or on one axis while the two
-    #: other axes change, are dropped [s]; three zeros are dropped at once; 0 = no such drops.
+    #: other axes change, are dropped [s]; three zeros are dropped at once; 0 = neither is dropped.
     stuck_timeout_s: NotNegative = 2.0
     #: Gravity at the place of use [m/s^2]; 0 = the gravity of the calibration.
     local_gravity_m_s2: NotNegative = 0.0
@@ -43,7 +43,7 @@ DROPPED = tuple(field.name for field in fields(Dropped))
 
 @dataclass(slots=True)
 class Counters(Dropped):
-    """Numbers of samples and readings, published and dropped."""
+    """Numbers of published and dropped samples, used and rejected readings, and time jumps."""
 
     n_out: int = 0
     n_board: int = 0

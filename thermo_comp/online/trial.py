@@ -35,7 +35,7 @@ def tried(calibration: Calibration, path: str | Path | None = None) -> None:
         rule = f'cannot be applied: {type(error).__name__}: {error}'
         raise CalibrationError(rule, path) from error
     if not is_sound:
-        rule = 'cannot be applied: a result is not finite, or its covariance is not valid'
+        rule = 'cannot be applied: a force is not finite, or its covariance not positive definite'
         raise CalibrationError(rule, path)
 
 
@@ -61,7 +61,7 @@ def _samples(model: Model) -> Iterator[Corrected]:
         compensator = Compensator(model, CompensatorConfig(gravity_tolerance_m_s2=0.0))
         for k, size in enumerate((1e-3 * largest, largest, -largest)):
             for name in model.inputs:
-                # The other thermometers read k = 0, 1, 2 K more than the board thermometer.
+                # The other thermometers read k K more than the board thermometer.
                 celsius_there = celsius + k * (name != BOARD_INPUT)
                 compensator.push(name, k * _STEP_NS, celsius_there)
             row = compensator.process(k * _STEP_NS, size, 0.5 * size, size)

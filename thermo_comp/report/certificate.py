@@ -42,10 +42,10 @@ class Result(NamedTuple):
 
 class StateResult(NamedTuple):
     """
-    One axis in a soak or a ramp at one temperature of the board.
+    Bias and scale of one axis in a soak or a ramp, at one temperature of the board.
 
-    A deviation is the bias or scale less a straight line over temperature: the line through the
-    value in a soak at the reference temperature, with the fitted slope of soaks.
+    A deviation is the bias or scale less a straight line over temperature, which has the slope of
+    a line fitted to the soak and goes through the value in a soak at the reference temperature.
     """
 
     program: str
@@ -59,7 +59,7 @@ class StateResult(NamedTuple):
 
 
 class AxisOverTemperature(NamedTuple):
-    """Bias and scale of one axis by state, and slopes of the straight lines [micro-g/K, ppm/K]."""
+    """Rows of bias and scale of one axis, and slopes of both lines [micro-g/K, ppm/K]."""
 
     axis: str
     bias_slope: float
@@ -89,10 +89,10 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
         drift = drift_k * _slope(calibration)
         slope = f'{drift_k:g} K times the slope of the correction'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
-    beyond = 'residual in excess of noise, attitude and model'
+    beyond = 'RMS of |f| − g in excess of noise, attitude and model'
     # The claimed sd already contains the uncertainty of gravity that was given to the fit.
     gravity = unclaimed_gravity_sd(evidence, info)
-    in_fit = 'given to the fit, included in the model' if evidence.gravity_sd else ''
+    in_fit = 'given to the fit: included in the model' if evidence.gravity_sd else ''
     return (
         Contribution('noise', 'A', noise, seconds),
         Contribution('gravity', 'B', gravity, info.gravity.source or in_fit),
@@ -189,7 +189,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # The known part of a withheld expanded uncertainty sets the digits of value and deviation.
+        # If U is withheld, its part without gravity sets the digits of value and deviation.
         digits = np.where(known * sd > 0.0, known * sd, _four_digits(value))
         sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         for k, table in enumerate(tables):
@@ -238,7 +238,7 @@ def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
 
 
 def conformity(evidence: Evidence) -> tuple[str, str]:
-    """Return the statement of conformity ('' if none is made), and its rule or the reason."""
+    """Return the statement of conformity and its rule, or '' and why no statement is made."""
     judgement = evidence.judgement
     if judgement is None:
         return '', 'No recording was judged: no statement of conformity is made.'

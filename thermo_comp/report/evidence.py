@@ -42,7 +42,7 @@ _SIMULATED = 'truth'
 
 @dataclass(frozen=True)
 class Position:
-    """A still position: direction of the force in the output frame, RMS |f| - g by correction."""
+    """A still position: direction of the force in the output frame, RMS |f| - g per correction."""
 
     number: int
     bag: int
@@ -57,9 +57,9 @@ class Evidence:
     The content of a report; missing parts are None or empty.
 
     `windows`: windows at rest of all bags; `judgement`: judgement of `windows`; `steps`: residuals
-    after each step of the model; `left_out`: by `Windows.position` the RMS of ``|f| - g`` of a fit
-    to the other positions [m/s^2]; `findings`: reservations about calibration or bags; `checks`:
-    passed checks; `gravity_sd`: uncertainty of gravity included in the covariance [m/s^2].
+    after each step of the model; `left_out`: for each `Windows.position` its RMS of ``|f| - g`` by
+    a fit to the other positions [m/s^2]; `findings`: reservations about calibration or bags;
+    `checks`: passed checks; `gravity_sd`: sd of gravity included in the covariance [m/s^2].
     """
 
     serial: str
@@ -112,7 +112,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Class of the verdict: valid, valid with reservations, not valid, or nothing judged."""
+        """Valid: good, valid with reservations: reserved, not valid: poor, no verdict: open."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -131,7 +131,7 @@ class Evidence:
 
     @property
     def forces(self) -> dict[str, Floats]:
-        """Specific force of the windows, raw and corrected; {} if not known."""
+        """Specific force of the windows, raw and corrected; {} for counts without calibration."""
         windows = self.windows
         if windows is None or not len(windows):
             return {}
@@ -149,14 +149,14 @@ class Evidence:
 
     @cached_property
     def least_known(self) -> LeastKnown | None:
-        """The attitude with the largest uncertainty; None without a calibration."""
+        """The attitude with the largest sd of |f|; None without a calibration."""
         if self.calibration is None:
             return None
         return least_known(self.calibration, np.array([rest.up for rest in self.positions]))
 
     @cached_property
     def positions(self) -> tuple[Position, ...]:
-        """The still positions, with attitudes computed from the best correction of `forces`."""
+        """The still positions, with attitudes computed from the last entry of `forces`."""
         windows = self.windows
         if windows is None or not self.forces:
             return ()
@@ -186,7 +186,7 @@ class Evidence:
         return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return each axis' residual from its position's mean [m/s^2], (n, 3), by correction."""
+        """Return per correction the force less |f| in the position's mean direction, (n, 3)."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -218,7 +218,7 @@ def evidence_of_bags(
 
     `window_s` and `tolerance` are as for `evaluate`; an empty `serial` accepts any calibration;
     `others` are earlier or later calibrations of the unit. Raises CalibrationError for a
-    calibration of another unit; RecordingError if the samples are too slow for the windows.
+    calibration of another unit; RecordingError if the sample rate is too low for the windows.
     """
     windows = judgement = None
     serials = sorted({bag.source.serial for bag in bags if bag.source.serial})
@@ -270,7 +270,7 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
     """Return the reservations about a calibration, except advice to record more positions."""
     lower, upper = calibration.dynamic.rate_range_k_min
     notes = [
-        f'the bags hold no {name} ramp: the correction in such ramps is extrapolated'
+        f'the bags have no {name} ramp: the correction in {name} ramps is extrapolated'
         for name, rate in (('heating', upper), ('cooling', -lower))
         if rate < _SLOWEST_RAMP_K_MIN
     ]
@@ -278,8 +278,8 @@ def _against(calibration: Calibration) -> tuple[str, ...]:
         left_out = part.left_out_rms_m_s2
         if part.section == 'all' and left_out is not None and left_out >= part.raw_rms_m_s2:
             notes.append(
-                f'the RMS on positions left out, {ug_text(left_out)}, is no better than '
-                f'{ug_text(part.raw_rms_m_s2)} raw: the fit does not predict a new attitude'
+                f'the RMS on positions left out, {ug_text(left_out)}, is not below the raw RMS, '
+                f'{ug_text(part.raw_rms_m_s2)}: the fit does not predict a new attitude'
             )
     if not calibration.has_uncertainty:
         notes.append('the calibration states no uncertainty')

@@ -19,7 +19,7 @@ from .evidence import LEFT_OUT, RAW, Evidence, Position, required
 from .html import number
 from .trace import ShownBag
 
-# Time over which the readings that count as zero drift are averaged [s]; shorter than any ramp.
+# Time at the start of a position whose mean reading counts as zero drift [s].
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
@@ -119,7 +119,7 @@ def draw_gravity(evidence: Evidence) -> Figure:
 def _panels(
     evidence: Evidence, heights: Sequence[float], *, more: float = 0.0, is_flagged: bool = False
 ) -> tuple[Figure, list[Axes], ShownBag, float]:
-    """Return figure, panels over time (dynamic regime in grey), shown bag and time unit [s]."""
+    """Return figure, panels over time (dynamic regime grey), shown bag, unit of time axis [s]."""
     shown = required(evidence.shown)
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
@@ -127,7 +127,7 @@ def _panels(
     spans: list[tuple[float, float]] = []
     for stretch in shown.stretches:
         if stretch.regime == Regime.DYNAMIC:
-            # Join heating and cooling that follow each other: no bright line between the spans.
+            # Join successive heating and cooling, so that no bright line is between them.
             start = spans.pop()[0] if spans and spans[-1][1] == stretch.start else stretch.start
             spans.append((start, stretch.stop))
     for axes in panels[:-1] if is_flagged else panels:
@@ -212,7 +212,7 @@ def draw_every_position(evidence: Evidence) -> Figure:
         value = row - 0.5 * residual[rows] / limit
         dynamic = windows.is_dynamic[rows]
         axes.axhline(row, color='black', linewidth=0.4)
-        # The regimes differ by line width, because dashes would hide noise.
+        # The lines of the regimes differ in width, because dashes would hide noise.
         for is_drawn, color, width in ((~dynamic, style.BLACK, 1.4), (dynamic, style.RED, 0.7)):
             axes.plot(time, np.where(is_drawn, value, np.nan), color=color, linewidth=width)
     axes.set_ylim(len(shown) - 0.4, -0.6)

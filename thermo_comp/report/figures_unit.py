@@ -21,7 +21,7 @@ from .temperature_curves import Curve, curves, slopes
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
 _BOARD = 'T board, °C'
-# Line, hatch and marker of a soak and of ramps.
+# Line, hatch and marker of each program.
 _LOOKS: dict[str, tuple[style.Line, str, str]] = {
     'soak': (style.STATIC_LINE, '////', 'o'),
     'heating': (style.DYNAMIC_LINE, '\\\\\\\\', '^'),
@@ -93,9 +93,9 @@ def _draw_less_line(
 
 def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
     """
-    Average the residual in each soak of each position; return temperatures (n,), and the residual
-    as a bias [micro-g] and as a scale error [ppm], (n, 6). The scale error is NaN if the axis
-    senses less than half of gravity.
+    Average the residual in each soak of each position. Return temperatures (n,), and the residual
+    as an error of the bias [micro-g] and of the scale [ppm], (n, 6). The error of the scale is NaN
+    if the force along the axis is below half of gravity.
     """
     windows, residual = evidence.windows, evidence.axis_residuals().get(CHOSEN)
     if windows is None or residual is None:
@@ -111,7 +111,7 @@ def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
 
 
 def draw_shares(curves: Mapping[str, Floats]) -> Figure:
-    """Draw the share of units below each residual [micro-g], by section."""
+    """Draw the percentage of units below each RMS residual [micro-g], by section."""
     figure = style.new_figure(2.6)
     axes = figure.subplots()
     drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}
@@ -134,7 +134,7 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
 def draw_distances(
     labels: Sequence[str], distances: Sequence[Floats], limits: Sequence[float]
 ) -> Figure:
-    """Draw each unit's distance from the fleet's median, by quantity; an outlier is a diamond."""
+    """Draw each unit's distance from the fleet's median, by quantity; outliers are diamonds."""
     figure = style.new_figure(0.6 + 0.19 * len(labels))
     axes = figure.subplots()
     known = [limit for limit in limits if np.isfinite(limit)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the typography of pages and figures, and the HTML, which can neither run nor load code."""
+"""Owns the typography of pages and figures, and HTML pages that cannot run or load code."""
 
 import datetime as dt
 import math
@@ -68,7 +68,7 @@ def _css_text(value: str) -> Markup:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Format a number with `digits` significant digits, without superfluous decimals."""
+    """Format a number with `digits` significant digits, at most `digits` of them decimals."""
     if not math.isfinite(value):
         return '–'
     if value == 0.0:
@@ -97,13 +97,13 @@ def rounded(value: float, expanded: float) -> tuple[str, str]:
     if not 0.0 < expanded < math.inf:
         return number(value, 6), '–'
     place = 1 - math.floor(math.log10(expanded))
-    if round(expanded, place) >= 10.0 ** (2 - place):  # one place less: 0.0996 rounds to 0.10
+    if round(expanded, place) >= 10.0 ** (2 - place):  # 0.0996 rounds to 0.10: one place less
         place -= 1
     texts = (f'{round(x, place) + 0.0:.{max(place, 0)}f}' for x in (value, expanded))
     return minus(next(texts)), next(texts)
 
 
 def label_text(value: str, limit: int = 40) -> str:
-    """Return a text of unknown origin for a figure: printable, at most `limit` characters."""
+    """Make a text from a file printable for a figure, with at most `limit` characters."""
     clean = ''.join(c if c.isprintable() else ' ' for c in value).strip()
     return clean if len(clean) <= limit else f'{clean[: limit - 1]}…'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the report as files, a page and PNGs, and the list of its figures with their texts."""
+"""Owns the report as an HTML page and PNG files, and the list of its figures with their texts."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -78,7 +78,7 @@ def render_report(
     *,
     figures: Sequence[tuple[ReportFigure, str]] | None = None,
 ) -> str:
-    """Return the page with the given figures, by default all that the evidence allows."""
+    """Return the page with the given figures, by default all for which `evidence` has data."""
     if figures is None:
         figures = drawn_figures(figures_of(evidence))
     info = info or CertificateInfo()
@@ -127,7 +127,7 @@ def schuler_peak(bias: float) -> float:
 
 
 def remarks_of(bag: ReducedBag) -> list[str]:
-    """Return remarks on a bag: lost samples, no rest, several rests, no case temperature."""
+    """Return remarks on a bag, such as lost samples or a missing case temperature."""
     n = len(bag.intervals)
     return [
         text
@@ -145,7 +145,7 @@ def remarks_of(bag: ReducedBag) -> list[str]:
 
 
 def _judged_bags(evidence: Evidence) -> list[str]:
-    """Return sentences on the judged bags and, if so, on a shown bag without known regime."""
+    """Return sentences on the judged bags and on a shown bag in which no regime was found."""
     collected = []
     if evidence.judgement is not None:
         board = evidence.judgement.windows.board
@@ -155,7 +155,7 @@ def _judged_bags(evidence: Evidence) -> list[str]:
         )
     shown = evidence.shown
     if shown is not None and all(stretch.regime == Regime.UNKNOWN for stretch in shown.stretches):
-        collected.append('The regime was never known: the bag is too short for the detector.')
+        collected.append('The regime is not known: the shown bag is too short for the detector.')
     return collected
 
 
@@ -177,7 +177,7 @@ def drawn_figures(figures: Sequence[ReportFigure]) -> list[tuple[ReportFigure, s
 
 
 def figures_of(evidence: Evidence) -> list[ReportFigure]:
-    """List the figures that the evidence allows, in order."""
+    """List the figures for which `evidence` has data, in the order of the page."""
     return [
         ReportFigure(
             draw.__name__.removeprefix('draw_'),
@@ -198,36 +198,36 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     bag = f'Bag {label_text(shown.bag.source.name, 60)}.'
     read = f'Grey: dynamic regime. {bag} After Fig.'
     yield (
-        'How did the unit follow the chamber?',
+        'How did the temperatures of case and board change?',
         of_bags.draw_temperatures,
-        'Readings of both thermometers. The board lags behind the case, so the case '
-        f'shows the start of a ramp first. {read} 3 of the paper.',
+        'Readings of the case and the board thermometer. The board lags behind the case, so a '
+        f'ramp begins first at the case. {read} 3 of the paper.',
     )
     window_s = 0.0 if windows is None else windows.window_s
     yield (
-        'When do the readings drift, and does the flag mark it?',
+        'When do the readings drift, and does the regime flag mark these times?',
         of_bags.draw_dynamics,
         f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
         f'rates of the temperatures and, below, the second derivative of the {shown.leader} '
-        'temperature, whose pulses open and close the dynamic state; (c) the regime that follows, '
-        'with its direction, unknown until the detector has enough readings. '
+        'temperature, which has a pulse at the start and the end of a ramp; (c) regime and '
+        'direction, unknown until the detector has enough readings. '
         f'{read} 4 of the paper.',
     )
     if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
         return
     yield (
-        'Which residual does the correction leave on each axis?',
+        'Which residual remains on each axis after the correction?',
         of_bags.draw_residuals,
-        'Residual of each axis in the output frame. The attitude in a position is not known: '
-        'the mean direction measured there replaces it. Each panel has a separate scale. '
+        'Residual of each axis in the output frame: corrected force less a vector of length g in '
+        'the mean measured direction of the position. Each panel has a separate scale. '
         f'{read} 6 of the paper.',
     )
     yield (
         'Does |f| stay constant over the whole program?',
         of_bags.draw_gravity,
         f'|f| from the three axes, less local gravity {evidence.gravity or 0.0:.6g} m/s²; '
-        'of an ideal unit at rest zero at any temperature. Above: before and after '
-        'the correction; below: after the correction, in a larger scale. '
+        'zero for an ideal unit at rest at any temperature. Above: before and after '
+        'the correction; below: after the correction, enlarged. '
         f'{read} 7 of the paper.',
     )
 
@@ -241,16 +241,16 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
     yield (
         'Which bias and scale are corrected, and how uncertain are they?',
         of_unit.draw_functions,
-        'Bias and scale factor over temperature, in a soak and in ramps through the whole range '
-        'that begin in a soak at its end, less the value at '
-        f'{calibration.reference_temperature_c:g} °C (grey line) and less a straight line, whose '
-        'slope stands above each panel.',
-        'Hatched: 95 % band of the fit, its largest half width above the panel; where the band '
-        'is wider than the distance of two curves, the bags do not distinguish them.'
+        'Bias and scale factor over temperature, in a soak and in ramps that begin in a soak at '
+        'an end of the range and go to the other end. The value at '
+        f'{calibration.reference_temperature_c:g} °C (grey line) and a straight line are '
+        'subtracted; the slope of the line stands above each panel.',
+        'Hatched: 95 % band of the fit; its largest half width stands above the panel. The bags '
+        'do not distinguish curves that are closer together than the band is wide.'
         if has_band
         else '',
-        'Circles: measurement in each soak of each position, with the whole residual attributed '
-        'to bias or to scale; to scale only if the axis has half of gravity or more.'
+        'Circles: measurement in each soak of each position, with the whole residual taken as an '
+        'error of the bias or of the scale; of the scale only for axes with half of g or more.'
         if evidence.windows is not None and evidence.residuals
         else '',
     )
@@ -261,9 +261,9 @@ def _of_unit(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             of_unit.draw_rates,
             'Bias of the gyroscope over temperature, in a soak and in ramps, less the '
             'value at the reference temperature and less a straight line, whose slope stands '
-            'above each panel. Hatched: 95 % band; it includes the uncertainty of the constant '
+            'above each panel. Hatched: 95 % band, including the uncertainty of the constant '
             'due to the Earth’s rate and the turn-on offset.',
-            '' if judged is None else f'Judged on these bags, {judged}.',
+            '' if judged is None else f'Verdict on these bags: {judged}.',
         )
 
 
@@ -273,9 +273,9 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         yield (
             'Does the correction hold in every position?',
             of_bags.draw_every_position,
-            'A row for each position: |f| − g after the correction, over the time since the '
-            'position began; all rows have the scale that is written above. Black and wide: '
-            'static regime; red and thin: dynamic regime. On the right: RMS of the position.',
+            'Each row is a position: |f| − g after the correction, over the time since the start '
+            'of the position; the scale of all rows is written above. Black, wide lines: static '
+            'regime; red, thin lines: dynamic regime. On the right: RMS of the position.',
         )
     if evidence.positions:
         yield (
@@ -283,15 +283,16 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             of_bags.draw_positions,
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
-            'of elevation. An outlier was moved, or is not of this unit.',
-            'The area of a red ring is proportional to the residual of this position in a fit to '
-            'the other positions alone, which is the error expected in a new attitude.'
+            'of elevation. In a position with a far larger residual the unit was moved, or the '
+            'bag is of another unit.',
+            'The area of a red ring is proportional to the RMS residual of its position in a fit '
+            'to the other positions, which is the error expected in a new attitude.'
             if evidence.left_out
-            else 'The area of a red ring is proportional to the residual of this position.'
+            else 'The area of a red ring is proportional to the RMS residual of its position.'
             if evidence.residuals
             else '',
-            'Red cross: the direction with the largest standard deviation of |f|, with its value; '
-            'a position in this direction would improve the calibration most.'
+            'Red cross: the direction with the largest standard deviation of |f|, which is its '
+            'label; a position in this direction would improve the calibration most.'
             if evidence.least_known
             else '',
         )

@@ -99,7 +99,7 @@ class CertificateInfo:
 
 
 def load_certificate_info(path: str | Path, serial: str | None = None) -> CertificateInfo:
-    """Read a laboratory's statements; ThermoCompError, with file and key, for a wrong value."""
+    """Read a laboratory's statements; ThermoCompError names file and key of a wrong value."""
     data = read_plain_yaml(path)
     try:
         info = build(CertificateInfo, {} if data is None else data)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the look of the figures: lines differ by their dashes, and by colours of Okabe and Ito."""
+"""Owns the look of the figures: lines differ in dashes, and in colours of Okabe and Ito."""
 
 import io
 import re
@@ -68,7 +68,7 @@ _WIDTH = 7.1
 
 
 def drawing() -> AbstractContextManager[None]:
-    """Return a context for drawing in the report's style, whatever the matplotlib settings."""
+    """Return a context in which matplotlib uses the report's style instead of its settings."""
     return style.context(_RC, after_reset=True)
 
 
@@ -126,7 +126,7 @@ def legend_above(axes: Axes, title: str | None = None) -> None:
 
 
 def shared_legend(figure: Figure, axes: Axes, n_columns: int) -> None:
-    """Put the common legend of panels above all of them."""
+    """Put the common legend of a figure's panels above the figure."""
     handles, labels = axes.get_legend_handles_labels()
     place: Any = 'outside upper left'
     figure.legend(handles, labels, loc=place, borderaxespad=0.5, ncols=n_columns)

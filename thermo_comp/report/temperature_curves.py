@@ -19,7 +19,7 @@ _MOST_TEMPERATURES = 8
 
 
 class Program(NamedTuple):
-    """A soak, or a ramp through the whole range of a set from a soak at an end of the range."""
+    """A soak, or a ramp from a soak at an end of a set's range to the other end of the range."""
 
     name: str  # soak, heating or cooling
     regime: RegimeSet
@@ -35,8 +35,8 @@ class Curve(NamedTuple):
     """
     Bias [micro-g] and scale [ppm] of x, y, z in one program, shape (n, 6), and their sd.
 
-    The values are differences from a soak at the reference temperature; the sd are those of bias
-    and scale themselves.
+    `value` is the difference from a soak at the reference temperature; `sd` is the sd of bias and
+    scale, not of the difference.
     """
 
     program: Program
@@ -46,7 +46,7 @@ class Curve(NamedTuple):
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """Return a soak and, if ramps differ from it, ramps at half the fastest calibrated rate."""
+    """Return a soak and, if bias or scale depend on the rate, ramps at half the largest rates."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:

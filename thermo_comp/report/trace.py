@@ -33,7 +33,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownBag:
-    """A bag over time [s] since `start_ns`: rates [K/s], NaN before they settle, and regimes."""
+    """Rates, second derivative (NaN until settled) and regimes of a bag over time [K, s]."""
 
     index: int
     bag: ReducedBag
@@ -60,7 +60,7 @@ def span_of(bag: ReducedBag) -> tuple[int, float]:
 
 
 def widest(bags: Sequence[ReducedBag]) -> int:
-    """Return the index of the bag with the widest range of T_board, then of the longest bag."""
+    """Return the index of the bag with the widest range of T_board; if several, the longest."""
     spans = [float(np.ptp(bag.board.value)) if len(bag.board.value) else 0.0 for bag in bags]
     # Spans within 5 % and lengths within a minute count as equal; of equal bags take the first.
     candidates = [i for i, span in enumerate(spans) if span >= 0.95 * max(spans)]
@@ -80,7 +80,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
         rows.append((b.rate, b.var_rate, c.rate, c.var_rate, *lead.acceleration))
         flags.append((tracker.detector.regime, tracker.detector.direction))
     time: Floats = np.array([stamp_ns - start_ns for _, stamp_ns, _ in readings]) * 1e-9
-    # If several regimes have the same time, the last applies; equal successive regimes are joined.
+    # Of several regimes at one time the last applies; equal successive regimes are joined.
     state_at = {
         0.0: (Regime.UNKNOWN, 0),
         **dict(zip(np.clip(time, 0.0, end).tolist(), flags, strict=True)),
@@ -99,7 +99,7 @@ def shown_bag(bag: ReducedBag, index: int, detector: DetectorSettings) -> ShownB
 
 
 def _settled(value: Floats, variance: Floats) -> Floats:
-    """Set an estimate to NaN until its sd has fallen to three times the usual sd."""
+    """Set an estimate to NaN until its sd has fallen to three times the median sd."""
     known = np.isfinite(value) & np.isfinite(variance)
     if not known.any():
         return np.full(len(value), np.nan)

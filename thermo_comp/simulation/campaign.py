@@ -26,7 +26,7 @@ _PROGRAMS = {
     # A program of 4 h 20 min for one bag of a thermal test: the whole temperature range, ramps in
     # both directions.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
-    # The shortest program from 5 to 35 degC: ramps in both directions and short soaks.
+    # A program of 3 h from 5 to 35 degC: ramps in both directions and short soaks.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',
     # A program of 9.5 h for the chamber test of 18 positions: ramps of 0.3 to 1 K/min in both
     # directions.
@@ -53,16 +53,16 @@ _CORNERS = [
     *[(1, 1, 1), (-1, -1, -1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1), (1, -1, 1)],
     *[(-1, -1, 1), (1, 1, -1)],
 ]
-# Sd of the random tilt of an attitude about each direction across [deg], as without levelling.
+# Sd of the random tilt of an attitude about each of two perpendicular axes [deg].
 _SPREAD_DEG = 3.0
-# Attitudes of the chamber part of 'tumble-3': each axis measures both signs of gravity.
+# Attitudes of 'tumble-3' in the chamber: gravity has both signs on each axis.
 _THREE = np.array([(1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 PLAN_NAMES = (
     *('chamber-18', 'chamber-9', 'tumble-3', 'tumble-1', 'tumble', 'held-out'),
     *('centrifuge', 'rate-table'),
 )
-# Times [s] of runs through several rotation rates: ends of the soaks; from the start of a run to
-# the end of the soak; duration of each rate; duration of a change of rate.
+# Times of runs through several rotation rates [s]: ends of the soaks; time from the start of a run
+# to the end of its soak; duration of each rate; duration of a change of the rate.
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
 # Radius [m] and rotation rates [rad/s] of the simulated machines. Centrifuge: 1 m, 2 to 10 g
 # horizontally; rate table: 0.25 m, up to 1000 deg/s.
@@ -161,7 +161,7 @@ def positions(n: int, seed: int = 0) -> Floats:
 class Position:
     """
     A position of a test: the chamber's program, the direction of the specific force at rest, and a
-    rotation that adds to this force.
+    rotation whose centripetal acceleration adds to the specific force.
     """
 
     program: Cyclogram
@@ -173,15 +173,15 @@ def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
     Return the positions of a test in the order of their recording: 'chamber-18' (of 9.5 h each),
     'chamber-9' (3 h each), 'tumble' (18 positions of 20 min at room temperature), 'tumble-3',
-    'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3 positions,
-    ramps and attitudes of no other plan), 'centrifuge' or 'rate-table' (12 mountings, each at 1 g
-    and at four rates in three soaks). `seed` determines the attitudes and the room temperature.
+    'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3 positions
+    with ramps and attitudes that no other plan has), 'centrifuge' or 'rate-table' (12 mountings,
+    each at rest and at four rates in three soaks). `seed` determines attitudes and temperatures.
     """
     if name not in PLAN_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(PLAN_NAMES)}, got {name!r}')
     rng = generator(seed, Stream.CYCLOGRAM, PLAN_NAMES.index(name))
     if name == 'held-out':
-        # In 'held-out' no axis is near the vertical or the horizontal, unlike in other plans.
+        # No axis is near the vertical or the horizontal: an attitude that no other plan has.
         ups = rng.uniform(0.3, 1.0, (3, 3)) * rng.choice((-1.0, 1.0), (3, 3))
         return _positions(parse_cyclogram('held-out'), ups)
     if name in ('centrifuge', 'rate-table'):

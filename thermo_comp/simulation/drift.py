@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the physics of the thermal errors: each effect belongs to parts of the unit, and is zero in
-the reference state, the steady state in which the board is at the reference temperature.
+Owns the physics of the thermal errors: each effect depends on temperatures of parts, and is 0 in
+the reference state, which is the steady state with the board at the reference temperature.
 """
 
 from abc import ABC, abstractmethod
@@ -70,7 +70,7 @@ class Effect(ABC):
 class PartEffect(Effect):
     """
     Tempco of a part, or stress or thermo-EMF between two parts. The first signal is the deviation
-    of `part` less that of `cold` [K], the second signal the difference of the squares.
+    of `part` less that of `cold`, if any [K], the second signal the difference of the squares.
     """
 
     part: str
@@ -116,7 +116,7 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Creep in a part: the signal follows a fast temperature change [K], then decays slowly."""
+    """Creep in a part: its temperature less the temperature lagged by `time_constant` [s]."""
 
     part: str
     time_constant: float

@@ -6,7 +6,7 @@ Owns the thermal network of a unit (lumped parts, heat paths, thermostat) and it
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
 parts, then the integral of the thermostat's controller; `u` is the air temperature; `p` is
 constant. Between the knots of the air temperature the solution is linear plus decaying modes. The
-nonlinear part of convection, beyond its conductance at 1 K, is held constant for a second.
+part of a convective heat flow that is nonlinear in the temperatures is held constant for 1 s.
 """
 
 from collections.abc import Mapping
@@ -24,9 +24,9 @@ _STEP_S = 1.0  # time step over which convection is held constant [s]
 @dataclass(frozen=True)
 class Link:
     """
-    Heat path between two parts, or a part and the chamber's air, `AIR`; conductance in W/K at a
-    temperature difference of 1 K. The flow is proportional to the temperature difference to the
-    power `exponent`, 1.25 for free convection.
+    Heat path between two parts, or between a part and the chamber's air, `AIR`. The heat flow [W]
+    is `conductance` times the temperature difference [K] to the power `exponent`, which is 1.25
+    for free convection.
     """
 
     a: str

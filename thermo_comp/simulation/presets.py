@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the ready-made simulated units: three instruments, and the unit of the sample bags."""
+"""Owns the ready-made simulated units: three kinds of instruments, and that of the sample bags."""
 
 import math
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ from .unit import GyroModel, Stream, UnitModel, generator, rounded
 
 
 class Specimen:
-    """Draws the constants of one simulated unit; `kind` numbers the stream of random numbers."""
+    """Draws the constants of a simulated unit; each `kind` has a separate random stream."""
 
     def __init__(self, name: str, seed: int, kind: int) -> None:
         self.name = name
@@ -181,8 +181,8 @@ def _mems(draw: Specimen) -> UnitModel:
 
 
 def _demo(draw: Specimen) -> UnitModel:
-    """Draw the sample unit: tempcos on the board, `loads`, and a sensor head that lags."""
-    # The thermal time constants are short: the unit must settle in the soaks of the sample bags.
+    """Draw the sample unit: tempcos on the board, `loads`, and a head that lags the board."""
+    # The thermal time constants are short, so that the unit settles in the soaks of the bags.
     board_tau, tau = 0.25 * draw.between(400.0, 900.0), draw.between(500.0, 1500.0)
     capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}
     links = [*draw.links((AIR, 'case', 4.0)), Link('case', 'board', 0.4)]
@@ -191,7 +191,7 @@ def _demo(draw: Specimen) -> UnitModel:
     links.append(Link('board', 'head', 0.02))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
     drift = PartEffect('board', **tempcos(draw))
-    # `stress` follows the head's lag behind the board, `load` the heat flow from case to board.
+    # `stress` is proportional to board less head, `load` depends on the heat flow case to board.
     stress = PartEffect('board', 'head', bias=draw.signed(0.5, 1.0), scale=draw.normal(1.0))
     load = FlowEffect('case', 'board', 2.0, 0.5, True, bias=draw.signed(60.0, 120.0))
     return draw.triad(network, (drift, *loads(draw), load, stress))
@@ -209,8 +209,8 @@ def tempcos(draw: Specimen) -> dict[str, Any]:
 
 def loads(draw: Specimen) -> list[Effect]:
     """
-    Draw the effect of Golovach's paper: while the ambient temperature changes, bias and scale have
-    another offset, slope and curvature than in a soak, as with a heat pump at its supply limit.
+    Draw the effect of Golovach's paper: while the ambient temperature changes, offset, slope and
+    curvature of bias and scale differ from those in a soak, as with a heat pump at its limit.
     """
     knee, exponent = draw.between(0.4, 0.9), draw.between(1.5, 2.5)
     sizes = ((10.0, 40.0, 20.0), (1.0, 4.0, 5.0), (0.03, 0.1, 0.1))
@@ -235,11 +235,11 @@ UNIT_NAMES = tuple(_KINDS)
 
 def unit_preset(name: str, seed: int = 0) -> UnitModel:
     """
-    Return a simulated unit of the kind `name`, with other constants for every seed (>= 0).
+    Return a simulated unit of the kind `name`, with different constants for each seed (>= 0).
 
-    'thermostatted' (quartz triad in an oven, the converter's board outside: the board's drift
-    dominates), 'bare-quartz' (no oven: the magnet's scale tempco dominates), 'mems', or 'demo'
-    (the unit of the sample bags: the physics of Golovach's paper, and a lag).
+    'thermostatted' (quartz triad in an oven; drift of the converter's board outside the oven
+    dominates), 'bare-quartz' (no oven: the scale tempco of the magnet dominates), 'mems', or
+    'demo' (the unit of the sample bags: the effect of Golovach's paper, and a lag).
     """
     if name not in UNIT_NAMES:
         raise ValueError(f'`name` must be one of {", ".join(UNIT_NAMES)}, got {name!r}')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulation of a unit in a chamber over a program, whole or in blocks, with truth."""
+"""Owns the simulation of a unit in a chamber program: raw data in blocks, and their truth."""
 
 import math
 import sys
@@ -32,9 +32,9 @@ class Truth:
     The true bias, scale and force of a run, on the thermal grid (m points) and in the n conversion
     cycles of the accelerometer.
 
-    Bias is in counts per cycle (`rate_bias`: rad/s), scale is relative; `bias_grid` is
-    `thermal_bias` plus a random walk. `cycle_s` are the middles of the cycles; `specific_force` is
-    constant, shape (3,), or in a rotation the force in each cycle, shape (n, 3).
+    Bias is in counts per cycle (`rate_bias`: in rad/s), scale is relative to K; `bias_grid` is
+    `thermal_bias` plus a random walk. `cycle_s` are the middles of the cycles [s].
+    `specific_force` is constant, (3,), or in a rotation the force in each cycle, (n, 3).
     """
 
     unit: UnitModel
@@ -94,7 +94,7 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
 def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
-    """Simulate all positions of a test in memory, each with another seed and stamps from 0."""
+    """Simulate all positions of a test in memory, with different seeds and stamps from 0."""
     return [
         simulate(
             unit,
@@ -126,8 +126,8 @@ def simulate_blocks(
     Run a unit through a program in bounded memory; the result does not depend on the block size.
 
     A temperature reading is in the block that spans its stamp, or else in the last block.
-    `up` is the direction of the specific force without `spin`; K [counts/cycle] does not depend on
-    `rate_hz`. `seed` determines all random numbers of the run.
+    `up` is the direction of the specific force without `spin`; the scale factor [counts/cycle per
+    m/s^2] does not depend on `rate_hz`. `seed` determines all random numbers of the run.
     """
     readings_hz = 1.0 if temperature_rate_hz is None else temperature_rate_hz
     positive = {'rate_hz': rate_hz, 'temperature_rate_hz': readings_hz, 'gravity': gravity}
@@ -243,7 +243,7 @@ def _thermal_truth(unit: UnitModel, cyclogram: Cyclogram, seed: int) -> Truth:
 
 
 def _switched(load: SwitchedLoad, knots: Floats, seed: int) -> tuple[Floats, Bools]:
-    """Return the knots with switching times of a load, and whether the load is on after each."""
+    """Return knots plus switching times of a load, and whether the load is on in each interval."""
     n = 2 + int(knots[-1] // load.spell[0])
     flips = np.cumsum(generator(seed, Stream.LOAD).uniform(*load.spell, size=n))
     fine = np.unique(np.concatenate([knots, flips[flips <= knots[-1]]]))

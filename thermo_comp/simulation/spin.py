@@ -34,8 +34,8 @@ class Bend:
 @dataclass(frozen=True, eq=False)
 class Spin:
     """
-    A rotation about a vertical axis: rotation rate [rad/s], linear between the times [s]; radius
-    [m]; horizontal direction from the unit to the axis, in the frame of the unit.
+    A rotation about a vertical axis: `rate` [rad/s], linear between the times [s]; `radius` [m];
+    `inward`: horizontal direction from the unit to the axis, in the frame of the unit.
     """
 
     time_s: tuple[float, ...]
@@ -64,7 +64,7 @@ class Spin:
 def steps(
     begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return times and rates of runs that begin at given times: constant rates, and ramps."""
+    """Return times and rates of runs that begin at `begins_s`: `rates`, with ramps in between."""
     time, rate = [0.0], [0.0]
     for begin in begins_s:
         now = begin

@@ -21,7 +21,7 @@ from .network import ThermalNetwork, ThermalResponse
 from .spin import Bend
 
 _NS = 1_000_000_000
-REFERENCE_C = 20.0  # board temperature in a soak for which K and bias are stated [degC]
+REFERENCE_C = 20.0  # board temperature, in a soak, at which K and bias are stated [degC]
 _RANGE = -(1 << 15), (1 << 15) - 1  # range of the converter's output [counts]
 _FRACTION_BITS = 40
 _ONE = 1 << _FRACTION_BITS
@@ -31,9 +31,9 @@ _ROWS = 1 << 20
 
 class Stream(IntEnum):
     """
-    Sources of random numbers, each with a separate stream: switching a source on or off, or
-    another block size, does not change the other streams. The numbers of the sources must never
-    change or be reused, because they determine the random numbers of a seed.
+    Sources of random numbers. Each source has a separate stream, so that a source does not change
+    the numbers of another source. The values of the sources must never change or be reused,
+    because they determine the random numbers of a seed.
     """
 
     ACCEL_NOISE = 0
@@ -99,8 +99,8 @@ def rounded(charge: Floats, remainder: Ints) -> tuple[NDArray[np.int32], Ints]:
 @dataclass(frozen=True)
 class ThermometerModel:
     """
-    A thermometer on a part: ``reading = quantum * round((T + noise) / quantum)``, all in K; a
-    quantum of 0 means no rounding; `phase` is the time of the first reading in intervals, 0..1.
+    A thermometer on a part: ``reading = quantum * round((T + noise) / quantum)``; a quantum of 0
+    means no rounding. `phase`: time of the first reading in reading intervals, 0..1.
     """
 
     node: str
@@ -127,8 +127,8 @@ class ThermometerModel:
 @dataclass(frozen=True)
 class GyroModel:
     """
-    The gyroscope of a unit, with a scale of 1. Its drift has the unit mdeg/s instead of ug;
-    `turn_on` is the standard deviation of the bias from run to run [mdeg/s].
+    The gyroscope of a unit, with a scale of 1. `drift` is in mdeg/s where an accelerometer's is in
+    ug; `turn_on` is the standard deviation of the bias from run to run [mdeg/s].
     """
 
     drift: tuple[Effect, ...]
@@ -203,6 +203,6 @@ class UnitModel:
         return self.network.equilibrium(air)
 
     def with_thermometers(self, **changes: Any) -> UnitModel:
-        """Return the unit with the same changes of its thermometers on board and case."""
+        """Return the unit with changed settings of its thermometers on board and case."""
         board, case = (replace(sensor, **changes) for sensor in (self.board, self.case))
         return replace(self, board=board, case=case)

@@ -3,14 +3,14 @@
 """
 Owns the detection of a change: whether the rate of a sensor has left the baseline of the soak.
 
-Two linear filters of temperature and rate, of different memory, integrate the second derivative.
+Two linear filters of temperature and rate, with different memory, integrate the second derivative.
 A rate has departed if it differs from the baseline by more than the swing plus a multiple of the
 filter's noise; the multiple follows from the permitted rate of false alarms (Rice's formula, see
-docs/regime.md). The swing is the larger of two rates: the declared ripple of the surroundings,
-reduced by the sensor's lag, and the observed swing.
+docs/regime.md). The swing is the amplitude of the oscillation of the rate in a soak: the declared
+ripple of the surroundings divided by the sensor's lag, or the observed amplitude if larger.
 
-If a sensor's quantum is so wide that noise cannot cross a cell, the filters are not used: two
-edges crossed in the same direction give the mean rate between them.
+The readings of a sensor with a quantum lie in cells of one quantum. If noise cannot cross a cell,
+the filters are not used: two edges of cells crossed in the same direction give the mean rate.
 
 References
 ----------
@@ -26,16 +26,15 @@ from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
 BEND_SHARES = (1.0, 10.0)  # tuned acceleration of a filter / smallest acceleration at an onset
-TUNING: Final = 1.45  # best memory of a filter / (noise sd / acceleration)^0.4, at 1 Hz
-# Noise variance of the rate / the filter's variance, for a sensor with mostly quantization noise.
+TUNING: Final = 1.45  # best memory of a filter / (noise sd / acceleration)^0.4, readings at 1 Hz
+# Noise variance of the rate / the filter's rate variance, if most noise is that of quantization.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary
 LONGEST_HALF_SWING_S: Final = 600.0  # longest half period of a temperature ripple [s]
 LARGEST_BASELINE_SHARE: Final = 0.25  # largest baseline rate of a soak / smallest ramp's rate
 SWING_MARGIN: Final = 1.25  # assumed swing / observed swing of the rate about its trend
 SWING_SIGMAS: Final = 3.0  # noise subtracted from an observed swing of the rate, in sd
-# Time constant with which the swing of the rate decays, in sensor lags.
-SWING_MEMORY_LAGS: Final = 10.0
+SWING_MEMORY_LAGS: Final = 10.0  # time constant of the decay of the swing / lag of the sensor
 
 
 class ChangeDetector:
@@ -95,13 +94,13 @@ class ChangeDetector:
         self._reading = nan
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
-        """Begin a soak: the rate is its baseline, of an error of at least `least_error` [K/s]."""
+        """Begin a soak: take the rate as baseline, with `least_error` [K/s] or a larger error."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # a cell edge crossed before the soak would give the ramp's rate
 
     def is_following(self, stamp_ns: int) -> bool:
-        """Whether the filter of `rate` has used the reading of a stamp."""
+        """Whether the filter of `rate` has used the reading with the stamp `stamp_ns`."""
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
@@ -130,7 +129,7 @@ class ChangeDetector:
         self._age_s += dt
         if not 0.95 * self._dt < dt < 1.05 * self._dt:
             self._tune(dt)
-        # A rate between the baseline and 0 does not count as a departure from the baseline.
+        # A rate between the baseline and 0 is not a departure.
         baseline, swing = self._baseline, self.swing + self._baseline_error
         high = baseline + swing if baseline > 0.0 else swing
         low = baseline - swing if baseline < 0.0 else -swing
@@ -230,7 +229,8 @@ class ChangeDetector:
 
     def _follow(self, rate: float, dt: float) -> None:
         """
-        Let the baseline follow a rate that lasts for `dt` [s]; swing and error limit the change.
+        Move the baseline towards a rate that has lasted for `dt` [s]. The difference counts as at
+        most the sum of swing and error of the baseline.
         """
         baseline, error = self._baseline, self._baseline_error
         limit = self.swing + error
@@ -261,8 +261,8 @@ class ChangeDetector:
             self._peak = max(self._peak, abs(apart))
             return
         if self._age_s - self._turned_s < LONGEST_HALF_SWING_S:
-            # Take the smaller of two half swings: the onset or end of a ramp is large on one side
-            # only.
+            # Take the smaller peak of two half periods: at the onset or end of a ramp the rate
+            # deviates far on one side of the trend only.
             noise = SWING_SIGMAS * sqrt(self._noise_share * self._filters[0][4])
             swing = SWING_MARGIN * min(self._peak, self._peak_before) - noise
             self.swing = max(self.swing, min(swing, self._largest_swing))

@@ -10,15 +10,15 @@ A part may exchange heat with another part that lags the board: the lag then has
 series, of time constants ``tau_1 > tau_2``. By partial fractions m is a weighted sum of the m of
 two first-order lags, ``m = (tau_1 m_1 - tau_2 m_2) / (tau_1 - tau_2)``.
 
-The temperature that a part lags may lead the board thermometer by a time theta: the thermometer
-itself lags the board, or the part also exchanges heat with a case that has no thermometer. With
+The temperature that a part lags may lead the board thermometer by a time theta, if the thermometer
+lags the board, or if the part also exchanges heat with a case that has no thermometer. With
 a lead theta the transfer function of the part is ``(1 + theta s) / (1 + tau s)``, so that
 ``m = (1 - theta / tau) m_tau``, and for two stages
 ``m = ((tau_1 - theta) m_1 - (tau_2 - theta) m_2) / (tau_1 - tau_2)``.
 
-A part may also exchange heat with both the board and another part, at a sensor s: it lags the
-temperature ``T + v G`` between them, with ``G = T_s - T``. The state is
-then ``m = T - L(T + v G)``: that of the board, ``T - L(T)``, less v times ``L(G)``.
+If a part exchanges heat both with the board and with the place of a sensor s, it lags the
+temperature ``T + v G`` between board and sensor, with ``G = T_s - T``. Then
+``m = T - L(T + v G)``, which is ``T - L(T)`` less v times ``L(G)``.
 """
 
 import math
@@ -75,7 +75,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def first_order_weights(self) -> dict[tuple[str, float], float]:
-        """Weight of each first-order lag in the sum, by input and tau [s]."""
+        """Weights of the first-order lags whose sum is this lag, by input and tau [s]."""
         stages = list(zip((self.tau_s, self.second_tau_s), self.shares, strict=True))
         return {
             (name, tau): factor * share
@@ -86,7 +86,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Weights of the first-order lags of `tau_s` and `second_tau_s` in the sum."""
+        """Weights of the first-order lags with time constants `tau_s` and `second_tau_s`."""
         tau, second, lead = self.tau_s, self.second_tau_s, self.lead_s
         return (tau - lead) / (tau - second), (lead - second) / (tau - second) if second else 0.0
 
@@ -116,16 +116,16 @@ class _Play(NamedTuple):
 
 class Play(_Play, Quantity):
     """
-    A play of half-width `width_k` less its input [K], which is the lagged board temperature, or
-    the board temperature if `tau_s` is 0.
-    A play less its input has no variance: an error of the input shifts the play equally.
+    Output of a play of half-width `width_k` less its input [K]. The input is the lagged board
+    temperature, or the board temperature if `tau_s` is 0. The difference has no variance, because
+    an error of the input shifts input and output equally.
     """
 
     input = BOARD_INPUT
 
     @property
     def lag(self) -> Lag | None:
-        """The lag that the play follows; None if the play follows the board."""
+        """The lag of the play's input behind the board; None if the input is not lagged."""
         return Lag(BOARD_INPUT, self.tau_s, *self[2:]) if self.tau_s else None
 
     @property
@@ -173,10 +173,10 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     Return a factor of the covariance of `start_covariance`, which is the factor times its
     transpose, shape (n, number of first-order lags) [K].
 
-    The covariance is singular if two sums of first-order lags are equal except for rounding. The
-    input before the start is modelled as a random walk up to the first reading, so that ``P_kl = D
-    tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0 for lags of different inputs.
-    After the first reading the covariance decays by ``exp(-dt / tau_k) exp(-dt / tau_l)``.
+    The factor exists even if the covariance is singular, because two lags are nearly equal. The
+    input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
+    [K^2/s], so that ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0
+    for lags of different inputs. Then P_kl decays as ``exp(-dt / tau_k) exp(-dt / tau_l)``.
     """
     all_lags = [Lag(*lag) for lag in lags]
     terms = first_order_lags(all_lags)

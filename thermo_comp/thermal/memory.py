@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the thermal memory: the states of lags and play operators, by readings or on a grid of times.
+Owns the thermal memory: the states of lags and play operators, updated with each reading, or
+computed on a uniform grid of times.
 
 The state m of a lag (see `lags`) with the input u obeys ``dm/dt = du/dt - m / tau``. With u linear
 between two readings (first-order hold) the exact step of m over dt is
@@ -18,8 +19,8 @@ import numpy as np
 from ..typing import Floats
 from .lags import BOARD_INPUT, MemorySpec, first_order_lags
 
-#: Interval between readings / time constant of a lag, beyond which the unknown time at which
-#: the input changed between the readings adds variance.
+#: Interval between readings / time constant of a lag, above which the unknown time at which the
+#: input changed between the readings adds variance.
 SPARSE_SHARE: Final = 0.1
 #: Smallest weight of an old input in `_recursion`: smaller weights are below double precision.
 _LEAST_WEIGHT: Final = 1e-18
@@ -39,7 +40,7 @@ class LagBank:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the input: the next value initialises the lags again."""
+        """Forget the input: at the next value all lags start at 0."""
         self.stamp_ns: int | None = None
         self.start_ns: int | None = None
         self.input = 0.0
@@ -50,7 +51,7 @@ class LagBank:
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """Update with the next input value [K], error `sd` [K]; input linear between values."""
+        """Use the next input value [K], of an error `sd` [K]; the input is linear in between."""
         seen_ns = self.stamp_ns
         if seen_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
@@ -75,7 +76,6 @@ class LagBank:
         for variance, e, tau in zip(self.extra, decays, self.taus, strict=True):
             grown = variance
             if dt > SPARSE_SHARE * tau:
-                # Between readings far apart, the unknown time of the input's change adds variance.
                 grown += (change * (1.0 - e)) ** 2
             if sd:
                 # The input has the same error in all steps, so the standard deviations of the
@@ -112,7 +112,7 @@ class LagBank:
 
 @lru_cache(maxsize=1024)
 def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], list[float]]:
-    """Return each lag's decay over a step [ns], and the factor of the input's change in it."""
+    """Return by lag the factors of its state and of the input's change, for a step [ns]."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
     return [1.0 - part for part in lost], [
@@ -122,7 +122,7 @@ def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], lis
 
 class ThermalMemory:
     """
-    The memory of a tracker: lags of the board and of each gradient, plays.
+    The memory of a tracker: lags of the board temperature and of each gradient, and plays.
 
     A play (Prandtl-Ishlinskii operator of rate-independent hysteresis) of half-width r [K] follows
     an input v only when v is farther than r from the output ``P = min(max(P, v - r), v + r)``.
@@ -146,7 +146,7 @@ class ThermalMemory:
             self._sums = []
         #: For each play: index of the lag that it follows, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
-        #: Index and weight of the first-order terms of each play's lag; none for the board.
+        #: Index and weight of the first-order terms of each play's lag; [] without a lag.
         self._followed = [
             [(terms.index(term), share) for term, share in play.lag.first_order_weights.items()]
             if play.lag
@@ -160,7 +160,7 @@ class ThermalMemory:
         self.start_rate = 0.0
 
     def forget(self) -> None:
-        """Forget all inputs; each play starts again in the middle of its width."""
+        """Forget all inputs; the next board temperature sets each play equal to its input."""
         for bank in self.banks.values():
             bank.forget()
         self._held = []
@@ -175,7 +175,7 @@ class ThermalMemory:
             self._held = [] if self._needs_sensors else self._held
 
     def board_step(self, stamp_ns: int, board: float, sd: float = 0.0) -> None:
-        """Update with the next board temperature [degC], error `sd` [K]."""
+        """Use the next board temperature [degC], of an error `sd` [K]."""
         self.board.step(stamp_ns, board, sd)
         values = self.board.lagging
         if self._needs_sensors:
@@ -261,7 +261,7 @@ def memory_on_grid(
     spec: MemorySpec, step_s: float, board: Floats, gradients: Sequence[Floats]
 ) -> Floats:
     """
-    Compute `ThermalMemory.at` for series on a uniform grid; the results differ by rounding only.
+    Compute `ThermalMemory.at` for series on a uniform grid, equal except for rounding.
 
     Returns (n, 2 * n_lags + n_plays): (lag [K], 0) per lag, then each play less its input [K].
     """

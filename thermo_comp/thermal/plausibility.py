@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the plausibility checks of temperature readings, applied before they reach an estimator.
+Owns the plausibility checks of temperature readings before an estimator uses the readings.
 
-A board has a heat capacity, so its temperature takes no step. A thermometer has noise, so its
-readings are not constant, least of all while the temperature of the other thermometer changes. The
-case is nearer to the surroundings than the board, so the case leads in a ramp. Implausible
-readings are left out, or their variance is increased by the square of their possible error.
+A board has a heat capacity, so its temperature cannot step. A thermometer has noise, so its
+readings are not constant, least of all while the temperature of the other thermometer (case or
+board) changes. The case is nearer to the surroundings than the board, so in a ramp the case
+temperature changes first. Implausible readings are left out, or their variance is increased by the
+square of their possible error.
 """
 
 from enum import Enum
@@ -20,8 +21,8 @@ from .thermometer import Thermometer
 #: second [K/s].
 LARGEST_STEP: Final = 3.0
 LARGEST_RATE: Final = 0.2
-#: Number of used readings after which steps of the temperature are checked: a sensor's first
-#: readings may be wrong.
+#: Number of used readings after which readings are checked for steps: a sensor's first readings
+#: may be wrong.
 SETTLED_READINGS: Final = 5
 
 #: A sensor's first reading is wrong if the step to the second reading is impossible and the next
@@ -36,19 +37,21 @@ STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
 #: Number of equal readings in a row from which the variance of the temperature is increased.
 DOUBTFUL_READINGS: Final = 4
-#: Change of the other sensor's temperature [K] from which a sensor with constant readings counts
-#: as frozen: for a sensor that shows its noise, and for a sensor whose quantum hides it.
+#: Change of the other sensor's temperature, beyond noise and quanta [K], from which a sensor with
+#: constant readings counts as frozen: for a sensor whose readings vary with the noise, and for a
+#: sensor whose quantum exceeds the noise.
 OTHER_MOVED: Final = 0.3
 OTHER_MOVED_BEYOND_CELL: Final = 0.7
-#: Largest assumed error of a sensor with frozen readings [K].
+#: Largest assumed error of a sensor with constant readings [K].
 LARGEST_ERROR: Final = 60.0
 
-#: Smallest temperature difference at which a sensor leads the other in a ramp: in K, and as a
-#: share of the temperature change.
+#: Smallest difference between the temperature changes of two sensors in a ramp at which the sensor
+#: with the larger change leads: in K, and relative to the larger change.
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
-#: A sensor leads after `LEAD_READINGS` readings in a row in which the slower sensor's rate exceeds
-#: `LEAD_RATE_SHARE` of the faster's; above `DOUBTFUL_RATE_SHARE` a board's lead adds variance.
+#: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
+#: faster rate exceeds `LEAD_RATE_SHARE`; above `DOUBTFUL_RATE_SHARE` a lead of the board adds
+#: variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
@@ -64,9 +67,9 @@ class Fault(Enum):
     NONE = 'none'
     #: Readings that have been equal for longer than noise explains: used with a growing variance.
     STILL = 'stands still'
-    #: Readings that stay equal while the other sensor's temperature changes: they are not used.
+    #: Readings, not used, that stay equal while the other sensor's temperature changes.
     FROZEN = 'frozen'
-    #: A reading that changed faster than any part of a unit can: it is not used.
+    #: A reading, not used, that has changed faster than the temperature of any part can.
     STEP = 'jumped'
     #: A board temperature that differs from the case's by more than ramp and self-heating explain,
     #: as with a loose thermometer: its readings are used, with a larger variance.
@@ -149,14 +152,12 @@ class SensorCheck:
         if self._n_same >= self._n_doubtful and not self._has_cells:
             change = celsius - sensor.reading
             if abs(change) > self._largest_noise:
-                # The equal readings before this reading were wrong, and the estimate has followed
-                # them.
+                # The equal readings before this reading were wrong, and so is the estimate.
                 self.note_jump(stamp_ns, change)
         self._n_same = 0
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
-        # The usual case is decided cheaply: the reading and the estimate differ by less than
-        # `LARGEST_STEP`.
+        # Accept at once a reading that differs from the estimate by less than `LARGEST_STEP`.
         if (
             fault is Fault.NONE
             and abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
@@ -254,13 +255,13 @@ def still_readings(settings: ThermometerSettings) -> int:
 
 class LeadCheck:
     """
-    Finds out whether case or board leads in a ramp.
+    Finds out whether the case or the board temperature changes first (leads) in a ramp.
 
     The temperature changes since the last constant temperature are compared while both sensors
     change in the same direction. Heat from outside changes the case temperature first. If the
-    board leads, the two topics are swapped or the heat comes from inside; in both cases the
-    gradient terms are wrong. `extra_variance` is the square of the board's possible lead in the
-    present ramp [K^2].
+    board leads, the topics of case and board are swapped or the heat comes from inside; either
+    way the gradient terms are wrong. `extra_variance` is the square of the difference by which the
+    board may lead in the present ramp [K^2].
     """
 
     def __init__(self, case: Thermometer, board: Thermometer, calm_k_min: float) -> None:

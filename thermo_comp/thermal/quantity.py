@@ -15,7 +15,7 @@ class Quantity:
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity belongs to one part of the unit, with the time constants of this part.
+    #: Whether the quantity is computed with the time constants of one part of the unit.
     is_of_part: ClassVar[bool] = True
 
     @property
@@ -25,5 +25,5 @@ class Quantity:
 
     @property
     def by_board(self) -> float:
-        """Derivative w.r.t. the board temperature, at constant lags and other temperatures."""
+        """Derivative w.r.t. the board temperature, with lags and other thermometers constant."""
         return float(self.input == 'board')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the readings that wait for the sample at which they take effect, in order of stamps."""
+"""Owns the queue of readings, ordered by stamps, that wait for the sample that they apply to."""
 
 import heapq
 from collections.abc import Callable, Iterator
@@ -36,7 +36,7 @@ class ReadingQueue:
         return self._entries[0][0] if self._entries else NEVER_NS
 
     def push(self, name: str, stamp_ns: int, celsius: float) -> int:
-        """Add a reading; return the number of readings refused: full queue, or another clock."""
+        """Add a reading; return how many were dropped: queue full, or stamps of another clock."""
         n_before = len(self._entries)
         last_ns, self._last_ns[name] = self._last_ns.get(name, -NEVER_NS), stamp_ns
         if stamp_ns < last_ns - DISORDER_NS:

@@ -4,12 +4,11 @@
 Owns the causal decision between static and dynamic regime; the only clock is the readings' stamps.
 
 The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
-(`change_detector`: the integral of the second derivative against ripple and noise), or when the
-rate of any sensor is clearly that of a ramp. The dynamic state is *held* while the rate of any
-sensor, at present or predicted half a lag ahead, may exceed the relaxed rate, thus in a ramp of
-constant rate, too, and until the board has relaxed. With `end_condition` = 'case' (the paper's
-rule) the dynamic state ends with the change of the case temperature, and the board is used only
-while the case is lost. The derivation of the detector is in docs/regime.md.
+(`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state is
+*held* while the rate of the case or of the board, at present or predicted half a lag ahead, may
+exceed the relaxed rate; so it continues in a ramp of constant rate. With `end_condition` = 'case'
+(the paper's rule) only the rate of the case is tested, and the board is used only while the case
+is lost. The derivation of the detector is in docs/regime.md.
 
 References
 ----------
@@ -26,11 +25,11 @@ from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
 HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state, in lags of the leading sensor
-# Margin for "the rate is below a limit", in sd of the rate; half a sd suffices, because in a soak
-# most of the rate's variance is an allowance for a ramp that may begin at any time.
+# Margin for "the rate is below a limit", in sd of the rate. Half a sd suffices, because in a soak
+# most of the variance of the rate is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
 OBVIOUS_SIGMAS: Final = 5.0  # margin for "the rate is above a limit", in sd of the rate
-FIRST_READINGS: Final = 20  # readings after which the noise estimate corrects a declared noise
+FIRST_READINGS: Final = 20  # number of readings from which the noise estimate is reliable
 
 
 class Regime(IntEnum):
@@ -65,7 +64,7 @@ class RegimeDetector:
 
     def update(self, stamp_ns: int, case: Thermometer | None, board: Thermometer | None) -> Regime:
         """
-        Decide the regime after a reading of the leading sensor: the case, or the board without it.
+        Decide the regime after a reading of the case or, if `case` is None, of the board.
         """
         if case is not None:
             lead, change = case, self._case.change
@@ -119,7 +118,7 @@ class RegimeDetector:
             >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
-            # In the first soak the swing of the rate has not been estimated yet.
+            # Before the first soak the swing is not estimated: allow a larger error.
             is_first = self.regime == Regime.UNKNOWN
             change.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
             self.regime = Regime.STATIC
@@ -127,7 +126,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Set the direction if it lasts half a dwell time: coarse quanta make the rate step."""
+        """Set a direction that has lasted half a dwell time: with coarse quanta the rate steps."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:
@@ -143,7 +142,7 @@ class RegimeDetector:
         self.direction = direction
         self._turning_ns = None
         self._is_grown = False
-        # The onset is detected long before the rate has grown: hold the dynamic state `hold_ns`.
+        # The onset is detected before the rate is large: hold the dynamic state for `hold_ns`.
         hold_ns = max(self._dwell_ns, round(HOLD_LAGS * 1e9 * lead.settings.lag_s))
         self._held_until_ns = stamp_ns + hold_ns
 
@@ -183,8 +182,8 @@ class _Watch:
             self._stamp_ns = None
             return False
         change = self.change
-        # When the temperature ripples, the rate of the detector's filters does not overshoot, but
-        # that of the third-order thermometer does.
+        # When the temperature ripples, the rate from the third-order filter of `Thermometer`
+        # overshoots, and that from the detector's filters does not.
         rate = change.rate if change.is_following(stamp_ns) else sensor.rate
         sd = sqrt(sensor.var_rate)
         relaxed = self._relaxed
@@ -210,7 +209,7 @@ class _Watch:
 
 
 def _obvious(sensor: Thermometer, rate: float) -> int:
-    """Sign of the sensor's rate if it exceeds `rate` by `OBVIOUS_SIGMAS` sd, otherwise 0."""
+    """Sign of the sensor's rate if above `rate` in magnitude by `OBVIOUS_SIGMAS` sd, else 0."""
     margin = abs(sensor.rate) - rate
     if margin > 0.0 and margin * margin > OBVIOUS_SIGMAS**2 * sensor.var_rate:
         return 1 if sensor.rate > 0.0 else -1

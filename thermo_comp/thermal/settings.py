@@ -15,7 +15,7 @@ CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading counts as a
 # Quantum / noise sd above which noise never moves a reading: 6 sd of the difference of two
 # readings.
 WIDE_CELL_SIGMAS: Final = 8.5
-# Hysteresis of the dynamic state: rate that begins the state / relaxed rate, which ends it.
+# Hysteresis of the dynamic state: rate that begins the state / rate below which the state ends.
 OBVIOUS_SHARE: Final = 1.5
 #: Advised span of the board temperature over all bags of a unit's thermal test [K].
 ADVISED_SPAN_K: Final = 25.0
@@ -37,13 +37,13 @@ class ThermometerSettings:
         float, QUANTITIES['quantum'], 'Step of the readings, K; 0 for a continuous sensor.'
     ] = 0.0
     fastest_ramp_k_min: Annotated[
-        float, QUANTITIES['ramp'], 'Rate of the fastest ramps that the sensor will see, K/min.'
+        float, QUANTITIES['ramp'], "Rate of the fastest ramps of the sensor's temperature, K/min."
     ] = 3.0
     lag_s: Annotated[
         float,
         QUANTITIES['time constant'],
-        'Thermal lag between the surroundings and the sensor, s. The onset of a ramp is a second '
-        'derivative of ``ramp / lag``.',
+        'Thermal lag between the surroundings and the sensor, s. At the onset of a ramp the '
+        'second derivative of the temperature is ``ramp / lag``.',
     ] = 600.0
 
     def __post_init__(self) -> None:
@@ -68,38 +68,39 @@ class DetectorSettings:
     """Settings of the regime detector; keys of the section `detector` of a calibration file."""
 
     smallest_ramp_k_min: Annotated[
-        float, QUANTITIES['ramp'], 'The slowest ramp that must never be missed, K/min.'
+        float, QUANTITIES['ramp'], 'Rate of the slowest ramp that must be detected, K/min.'
     ] = 0.2
     false_alarms_per_hour: Annotated[
         float,
         QUANTITIES['false alarms'],
-        "How often the sensor's noise alone may open the dynamic state, per hour of soak.",
+        'Number of times per hour of soak at which noise alone may begin the dynamic state.',
     ] = 0.02
     ripple_c: Annotated[
         float,
         QUANTITIES['ripple'],
-        "Amplitude of the surroundings' temperature in a soak (a chamber's control ripple), K. "
-        'A sensor with a lag shows the ripple as a rate up to ``ripple_c / lag_s``, not an onset.',
+        'Amplitude of temperature oscillations of the surroundings in a soak, such as the control '
+        'ripple of a chamber, K. The ripple causes rates of a sensor up to ``ripple_c / lag_s``.',
     ] = 0.1
     relaxed_rate_k_min: Annotated[
         float,
         QUANTITIES['ramp'],
-        "The unit has relaxed when every sensor's rate is surely below this limit, K/min.",
+        'Rate below which a sensor has relaxed, so that the dynamic state may end, K/min.',
     ] = 0.05
     dwell_s: Annotated[
         float,
         QUANTITIES['dwell'],
-        'Time for which every rate must be below the relaxed rate; shortest dynamic state, s.',
+        'Shortest time for which the rates must be below `relaxed_rate_k_min` before the dynamic '
+        'state ends, s.',
     ] = 60.0
     end_condition: Annotated[
         EndCondition,
         'Sensors that must settle before the dynamic state ends: the leading sensor alone '
         '(`case`, as in the paper), or leading sensor and board (`board`).',
     ] = 'board'
-    case: Annotated[ThermometerSettings, 'The case thermometer.'] = field(
+    case: Annotated[ThermometerSettings, 'Settings of the case thermometer.'] = field(
         default_factory=ThermometerSettings
     )
-    board: Annotated[ThermometerSettings, 'The board thermometer.'] = field(
+    board: Annotated[ThermometerSettings, 'Settings of the board thermometer.'] = field(
         default_factory=ThermometerSettings
     )
 
@@ -121,7 +122,7 @@ class ThermalConfig:
     """Times of the tracker that the user sets; ValueError if a value is out of its range."""
 
     #: Time over which the two sets of coefficients are blended after a change of regime [s],
-    #: longer if they differ much (`Correction.gentle_transition`); 0 = the paper's hard switch.
+    #: longer if the sets differ much (`Correction.gentle_transition`); 0 = step, as in the paper.
     transition_time_s: NotNegative = 30.0
     #: Age of the board temperature after which nothing is published [s]; also the time for which
     #: the readings after an impossible step of the board temperature are refused.

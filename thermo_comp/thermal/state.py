@@ -11,13 +11,13 @@ from .quantity import Quantity
 
 #: The thermal memory counts as settled if the sd of every lag is below this [K].
 MEMORY_SETTLED_SD: Final = 0.05
-#: Lag of a board behind its case if the bags do not determine it [s]: 15 min, typical of a housing
-#: of a few hundred grams in a chamber.
+#: Lag of a board behind its case if the bags do not determine the lag [s]: 15 min, typical of a
+#: housing of a few hundred grams in a chamber.
 USUAL_BOARD_LAG_S: Final = 900.0
 
-#: First numbers of a thermal state: board temperature and its variance, rate of the board, weight
-#: of the dynamic set, 1.0 while the regime is unknown, gradient of the first sensor and its
-#: variance.
+#: First numbers of a thermal state: board temperature and its variance, rate of the board
+#: temperature, weight of the dynamic set, flag (1.0 while the regime is unknown), gradient of the
+#: first sensor and its variance.
 (BOARD, VAR_BOARD, RATE, WEIGHT, UNKNOWN, GRADIENT, VAR_GRADIENT) = range(7)
 
 

@@ -7,8 +7,9 @@ Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, 
 acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
 acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
 the mixture of the quiet and the bending filter, with the variance of a mixture. If a sensor's
-quantum exceeds the noise, a changed reading is a precise measurement of the edge between two
-cells, and an unchanged reading only bounds the temperature by the cell [3]_.
+quantum exceeds the noise, all temperatures in a cell (an interval of one quantum) give the same
+reading. A changed reading is then a precise measurement of the edge between two cells, and an
+unchanged reading only bounds the temperature by the cell [3]_.
 
 References
 ----------
@@ -27,26 +28,26 @@ from .settings import ThermometerSettings
 
 OUTLIER_SIGMAS: Final = 6.0  # innovation in sd beyond which a reading is down-weighted
 OUTLIER_LIMITS: Final = 5.0  # innovation / outlier limit, beyond which a reading is rejected
-RESTART_READINGS: Final = 4  # consecutive outliers of equal sign that restart the estimate
+RESTART_READINGS: Final = 4  # number of consecutive outliers of equal sign for a restart
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
-QUIET_SHARE: Final = 5e-3  # sd of the noise of acceleration, quiet / bending; no wide cells
-CELL_SHARE: Final = 0.2  # sd of the noise of acceleration, quiet / bending, with wide cells
+# Sd of the noise of the acceleration, quiet / bending filter: without and with wide cells.
+QUIET_SHARE: Final = 5e-3
+CELL_SHARE: Final = 0.2
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)
 _DENSITY_AT_0: Final = 0.3989422804014327  # 1 / sqrt(2 pi)
 #: Range of readings accepted as temperatures [degC]; the lower end is absolute zero.
 COLDEST: Final = -273.15
 HOTTEST: Final = 1000.0
-# Horizon of linear extrapolation [reading intervals]; beyond it the temperature is held.
-HORIZON_INTERVALS: Final = 5.0
+HORIZON_INTERVALS: Final = 5.0  # longest linear extrapolation [reading intervals]
 LONGEST_STEP_SHARE: Final = 0.125  # longest step of a prediction / lag of the sensor
 NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor is averaged
 
-# The filters of the two modes are written out in floats: a matrix library costs more per call.
+# The filters of the two modes are written out in floats: matrix operations would be slower.
 State = tuple[float, float, float, float, float, float, float, float, float]
 """Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance."""
 
-_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # before a reading
+_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # before the first reading
 
 
 class Thermometer:
@@ -101,7 +102,8 @@ class Thermometer:
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
-        Take a reading [degC]; return False if impossible, not newer than the last, or an outlier.
+        Use a reading [degC]; return False if it is not a possible temperature, is not newer than
+        the last used reading, or is an outlier.
         """
         if not COLDEST <= reading_c <= HOTTEST:
             return False
@@ -126,8 +128,7 @@ class Thermometer:
         prior_quiet = 1.0 - prior_bending
         quiet = mix(self._quiet, self._bent, bending * to_quiet / prior_quiet)
         bent = mix(self._bent, self._quiet, (1.0 - bending) * to_bending / prior_bending)
-        # The transition of `predict` holds for times much shorter than the lag: a long interval is
-        # predicted in steps.
+        # `predict` is accurate for times much shorter than the lag: divide a long interval.
         n_steps = 1 + int(dt / (LONGEST_STEP_SHARE * lag))
         for _ in range(n_steps):
             quiet = predict(quiet, dt / n_steps, lag, self._quiet_power)
@@ -143,8 +144,8 @@ class Thermometer:
         is_turning = surprise * self._surprise < 0.0
         self._surprise = surprise
         if is_turning and not self._has_cells:
-            # Only innovations that change sign count as noise, because a change of the rate gives
-            # innovations of equal sign.
+            # Estimate the noise from innovations whose sign differs from that of the innovation
+            # before: a change of the rate gives innovations of equal sign.
             excess = min(surprise * surprise / spread - 1.0, 8.0)
             if self._n_turns < NOISE_MEMORY:
                 self._n_turns += 1.0
@@ -191,7 +192,6 @@ class Thermometer:
         self._quiet = quiet
         self._bent = bent
         self.bending = bending
-        # The estimate is the mixture of both modes; for its acceleration see `acceleration`.
         t, v, _, p00, p01, _, p11, _, _ = quiet
         apart, dv = bent[0] - t, bent[1] - v
         both = bending * (1.0 - bending)
@@ -214,7 +214,7 @@ class Thermometer:
         return True
 
     def at(self, stamp_ns: int) -> tuple[float, float, float]:
-        """Extrapolate temperature, rate and variance to a stamp, for at most a few intervals."""
+        """Return temperature, rate, and variance of the temperature extrapolated to a stamp."""
         if self.stamp_ns is None:
             return nan, nan, inf
         if not self.is_ready:
@@ -224,8 +224,8 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # Beyond the extrapolation horizon the rate may change, and a ramp may begin without a
-            # reading.
+            # Beyond the extrapolation horizon the temperature is held. Add the variance of the
+            # change since, at the present rate or in a ramp that has begun after the last reading.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -268,8 +268,8 @@ class Thermometer:
         half = 0.5 * self._quantum
         noise = self._noise
         if variance < 4.0 * noise:
-            # If the prior is narrower than the noise, match the moments of the prior truncated to
-            # the cell, so that readings that flicker about an edge of a cell locate the edge.
+            # The sd of the prediction is less than twice the noise: match the moments of the
+            # prediction truncated to the cell. Readings that flicker about an edge locate it.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd
@@ -294,7 +294,7 @@ class Thermometer:
         box = half * half / 3.0
         if variance > box:
             return reading, variance * box / (variance - box)
-        # If the estimate is outside the cell, the edge of the cell counts as one measurement per
+        # If the estimate is outside the cell, count the edge of the cell as one measurement in the
         # time in which the predicted temperature changes by one sd of the estimate.
         if abs(expected - reading) > half:
             edge = reading + (half if expected > reading else -half)
@@ -303,7 +303,7 @@ class Thermometer:
 
 
 def mix(state: State, other: State, share: float) -> State:
-    """Mix a state with a share of another; the covariance includes their squared difference."""
+    """Return mean and covariance of a mixture of `other`, with weight `share`, and `state`."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     u, w, b, r00, r01, r02, r11, r12, r22 = other
     dt, dv, da = u - t, w - v, b - a
@@ -323,7 +323,10 @@ def mix(state: State, other: State, share: float) -> State:
 
 
 def predict(state: State, dt: float, lag: float, power: float) -> State:
-    """Predict a state `dt` [s] later; acceleration: decay `lag` [s], noise `power` [K^2/s^5]."""
+    """
+    Predict a state `dt` [s] later. The acceleration decays with the time constant `lag` [s]; white
+    noise of the density `power` [K^2/s^5] drives the acceleration.
+    """
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     half = 0.5 * dt * dt
     decay = 1.0 / (1.0 + dt / lag)
@@ -347,7 +350,7 @@ def predict(state: State, dt: float, lag: float, power: float) -> State:
 
 
 def correct(state: State, measured: float, variance: float) -> tuple[State, float, float]:
-    """Update by a temperature and its variance; return state, innovation [K], its variance."""
+    """Update with a measured temperature; return state, innovation [K], innovation variance."""
     t, v, a, p00, p01, p02, p11, p12, p22 = state
     spread = p00 + variance
     innovation = measured - t

@@ -3,9 +3,9 @@
 """
 Owns the tracker of a unit's thermal state: thermometers, regime, memory, dynamic weight.
 
-The compensator, the fit and the report all run `ThermalTracker`, so a regressor means the same
-when it is fitted and when it is applied. `ThermalTracker` is causal and reads no clock: each
-reading has a stamp, and the thermal state is requested for a stamp.
+The compensator, the fit and the report all run `ThermalTracker`, so a regressor has the same value
+in the fit and in the correction. `ThermalTracker` is causal and reads no clock: each reading has a
+stamp, and the thermal state is requested for a stamp.
 """
 
 from copy import copy
@@ -22,10 +22,11 @@ from .thermometer import RESTART_READINGS, Thermometer
 
 #: Relative sd of the gradient that is estimated from the board's rate while a sensor is lost.
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
-#: Time without a reading after which the regime is unknown, as a share of the case's lag.
+#: Time without a regime decision after which the regime is unknown / lag of the case thermometer.
 UNWATCHED_SHARE: Final = 0.25
 #: Largest change of the self-heating gradient that does not count as an error of the board
-#: temperature, because the air flow may differ: in K, and as a share of the gradient in the fit.
+#: temperature, because the air flow may differ from that in the fit: in K, and relative to the
+#: gradient in the fit.
 SELF_HEATING_CHANGE_K: Final = 1.0
 SELF_HEATING_CHANGE: Final = 0.5
 ANY_RANGE: Final = (-inf, inf)
@@ -61,7 +62,7 @@ class ThermalTracker:
         self._weight = 0.0
         self._weight_ns = 0
         self._target = 0.0
-        #: Gradient of each sensor at rest, at its last reading in the static regime [K].
+        #: Gradient of each sensor less board lag times rate, at its last static reading [K].
         self._rest_gradients: dict[str, float] = {}
         self._begin_watch()
 
@@ -74,7 +75,7 @@ class ThermalTracker:
     ) -> None:
         self.config = config
         self._rest_gradient_range = rest_gradient_range_k
-        #: Lag of the board behind the case [s], for the gradient while the case is lost.
+        #: Lag of the board behind the case [s], for the gradient without readings of the case.
         self._board_lag_s = board_lag_s
         self._case_timeout_s = config.case_timeout_s
         #: Time without a decision after which the regime is unknown [s].
@@ -144,7 +145,7 @@ class ThermalTracker:
                 if sensor is board or not bank.taus or bank.stamp_ns is None:
                     continue
                 if not self.is_live(stamp_ns, sensor):
-                    # The lags of a gradient whose sensor is lost follow an estimated gradient.
+                    # Update the lags of a gradient whose sensor is lost with an estimate.
                     gradient, variance = self._lost_gradient(name, stamp_ns, board.rate)
                     bank.step(stamp_ns, gradient, sqrt(variance))
         for name in self.spec.sensors:
@@ -263,8 +264,8 @@ class ThermalTracker:
 
     def _board_error(self, gradient: float) -> float:
         """
-        Return the variance of an error of the board temperature [K^2] that shows in the gradient
-        of the leading sensor, as with a loose thermometer or with swapped topics.
+        Return the variance of the error of the board temperature [K^2] that an impossible gradient
+        of the leading sensor indicates, as with a loose thermometer or with swapped topics.
         """
         loose = self.loose_k(gradient)
         # If the board leads the case in a ramp, the topics of case and board may be swapped.
@@ -281,14 +282,14 @@ class ThermalTracker:
         excess = max(gradient - of_ramp - upper, lower - gradient + of_ramp)
         if excess > SELF_HEATING_CHANGE_K:
             usual = max(SELF_HEATING_CHANGE_K, SELF_HEATING_CHANGE * max(-lower, upper))
-            # In other surroundings the board may lag twice as much as in those of the fit.
+            # In surroundings other than those of the fit the board may lag twice as much.
             return max(excess - usual - abs(of_ramp), 0.0)
         return 0.0
 
     def _gradient(
         self, name: str, stamp_ns: int, board: float, rate: float
     ) -> tuple[float, float]:
-        """Return a sensor's gradient to the board's temperature, and the sensor's variance."""
+        """Return a sensor's temperature less the board's, and the sensor's variance."""
         sensor = self.thermometers[name]
         if self.is_live(stamp_ns, sensor):
             celsius, _, variance = sensor.at(stamp_ns)
@@ -298,14 +299,14 @@ class ThermalTracker:
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
         Estimate a gradient while its sensor is lost: the gradient of self-heating, from the last
-        rest or else from the fit, plus the board's lag times its rate.
+        static reading or else from the fit, plus the board's lag times the board's rate.
         """
         lag = self._board_lag_s
         lower, upper = self._rest_gradient_range
         is_known = name == self.spec.sensors[0] and upper < inf
         usual = 0.5 * (lower + upper) if is_known else 0.0
         gradient = self._rest_gradients.get(name, usual) + lag * rate
-        # Largest change of the case temperature since the last board reading [K].
+        # Largest change of the case temperature after the board's extrapolation horizon [K].
         unseen = self.settings.case.fastest_ramp_k_min / 60.0 * self.board.beyond(stamp_ns)
         variance = (
             (LOST_GRADIENT_RELATIVE_SD * gradient) ** 2

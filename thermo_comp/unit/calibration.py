@@ -1,13 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the Calibration value of one unit, validated as a whole.
-
-The immutable dataclasses mirror the file key by key; a node replaces a calibration by assignment.
+Owns the calibration of one unit: immutable dataclasses whose fields are the keys of its file.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
-(0..1), and phi_j the columns of the thermal response (`columns`), common to both sets (equations
-6 to 9 of the paper, which has no thermal response)::
+(0..1), and phi_j the columns of the thermal response (`columns`), common to the static and the
+dynamic set (equations 6 to 9 of the paper, which has no thermal response)::
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
@@ -123,7 +121,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Slow error of a regime's curves at a board temperature, in addition to the posterior."""
+    """Slowly varying error of a regime's curves at one board temperature, not in the posterior."""
 
     temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
     sd_m_s2: Annotated[
@@ -134,20 +132,20 @@ class LackOfFit:
 @dataclass(frozen=True)
 class RegimeSet:
     """
-    The set of curves of one regime. Outside `temperature_range_c` the curves continue along their
-    tangents for a quarter of the span and are constant beyond; the covariance increases.
+    The curves of one regime. Outside `temperature_range_c` the curves continue along their
+    tangents for a quarter of the range and are constant beyond; the covariance increases.
     """
 
-    temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated T_board [degC].']
-    rate_range_k_min: Annotated[tuple[_RateEdge, _RateEdge], 'Calibrated dT_board/dt [K/min].']
+    temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated range of T_board [degC].']
+    rate_range_k_min: Annotated[tuple[_RateEdge, _RateEdge], 'Calibrated range of dT_board/dt.']
     x: AxisSet
     y: AxisSet
     z: AxisSet
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
-        'Error on data left out of the fit, in excess of the posterior, and of scale factors '
-        'at temperatures without a position along gravity; its variance is linear '
-        'between the temperatures of the entries, and constant outside of them.',
+        'Error on data left out of the fit, in excess of the posterior; includes the error of '
+        'scale factors at temperatures at which no position had the axis along gravity. The '
+        'variance is linear between the entries, and constant outside their temperatures.',
     ] = ()
 
     def __post_init__(self) -> None:
@@ -165,7 +163,7 @@ class RegimeSet:
                 )
 
     def axes(self) -> tuple[AxisSet, AxisSet, AxisSet]:
-        """Return the three axes in order."""
+        """Return the curves of the axes x, y, z."""
         return self.x, self.y, self.z
 
 
@@ -187,18 +185,19 @@ class Calibration:
 
     format_version: Annotated[int, f'Version of the layout of this file: {FORMAT_VERSION}.']
     unit: Unit
-    reference_temperature_c: Annotated[Celsius, 'Reference temperature T_ref; the paper uses 20.']
+    reference_temperature_c: Annotated[Celsius, 'Reference temperature T_ref; paper: 20 degC.']
     gravity_m_s2: Annotated[float, QUANTITIES['gravity'], 'Local gravity used by the fit.']
     axes: Axes
-    static: Annotated[RegimeSet, 'Curves of the static regime, S = 0.']
-    dynamic: Annotated[RegimeSet, 'Curves of the dynamic regime, S = 1.']
+    static: Annotated[RegimeSet, 'Curves of the static regime (S = 0 in the paper).']
+    dynamic: Annotated[RegimeSet, 'Curves of the dynamic regime (S = 1 in the paper).']
     noise_density_m_s2_sqrt_hz: Annotated[
         tuple[_Density, _Density, _Density],
         'White noise of each axis; variance of a sample: density^2 / cycle_time_s + rounding.',
     ]
     slow_noise_m_s2_sqrt_h: Annotated[
         tuple[_Slow, _Slow, _Slow],
-        'Slow noise of each axis: random walk of the bias over short times, per root hour.',
+        'Slow noise of each axis: random walk of the bias, per root hour, over times shorter '
+        'than the correlation time of the slow noise.',
     ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
         tuple[Vector, Vector, Vector],
@@ -209,7 +208,7 @@ class Calibration:
         'Standard deviations of M[1][0], M[2][0], M[2][1], used if `posterior` is null.',
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
-        tuple[str, ...], 'Thermometers other than the board; the first leads in a ramp.'
+        tuple[str, ...], 'Thermometers other than that of the board; the first leads in a ramp.'
     ] = ('case',)
     response: Annotated[
         tuple[ResponseTerm, ...], QUANTITIES['columns'], 'Columns of the thermal response.'
@@ -217,13 +216,13 @@ class Calibration:
     board_lag_s: Annotated[
         float,
         QUANTITIES['time constant'],
-        'Lag of T_board behind T_case. While the case thermometer is lost, T_case - T_board is '
-        'estimated as its value at rest plus board_lag_s * dT_board/dt.',
+        'Lag of T_board behind T_case. Without readings of the case, T_case - T_board is '
+        'estimated as its last value in the static regime plus board_lag_s * dT_board/dt.',
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
         'Range of T_s - T_board - board_lag_s * dT_board/dt in the bags, s: first of `sensors`; '
-        'null: unknown. A value far outside (loose thermometer) adds to the sd of T_board.',
+        'null: unknown. A value far outside the range (loose sensor) adds to the sd of T_board.',
     ] = None
     soak_gradient_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
@@ -234,7 +233,7 @@ class Calibration:
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
     ] = field(default_factory=DetectorSettings)
     provenance: Provenance = field(default_factory=Provenance)
-    evidence: Annotated[tuple[GroupEvidence, ...], 'Contribution of each group of columns.'] = ()
+    evidence: Annotated[tuple[GroupEvidence, ...], 'Correction by each group of columns.'] = ()
     posterior: Annotated[Posterior | None, 'Covariance of all parameters; null: unknown.'] = None
     nonlinearity: Annotated[
         Nonlinearity | None,
@@ -269,7 +268,7 @@ class Calibration:
         names = self.sensors
         if not names or len(set(names)) != len(names) or not all(names) or 'board' in names:
             raise ValueError(
-                '`sensors` must be different names, at least one, none of them board, '
+                '`sensors` must be one or more different names, none of them board, '
                 f'got {list(names)}'
             )
         for k, term in enumerate(self.response):
@@ -343,7 +342,7 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
 
 
 def rate_triad(calibration: Calibration) -> Calibration:
-    """Return the gyroscope of a calibration as a triad of scale 1; ValueError if it has none."""
+    """Return a calibration's gyroscope as a triad of scale 1; ValueError without a gyroscope."""
     gyroscope = calibration.gyroscope
     if gyroscope is None:
         raise ValueError('`calibration` must have a gyroscope')

@@ -23,7 +23,7 @@ from .schema import SchemaError, build, fields_of, plain
 SIZE_LIMIT = 1 << 23
 
 #: First line of a written file. A file with this first line is complete only if its last line is
-#: the mark of the end: without the mark, a file that is cut between two keys would be valid.
+#: `_END`; otherwise a file that is cut between two keys would be read as valid.
 _HEADER = '# written by thermo_comp: the last line of a complete file is "..."'
 _END = '...'
 
@@ -43,8 +43,8 @@ def load_calibration(path: str | Path) -> Calibration:
     """
     Read and validate a calibration file.
 
-    Raises CalibrationError if the file cannot be read, is not YAML of the accepted kind, or holds
-    a value that is not acceptable; the message names file, key, value and the expected value.
+    Raises CalibrationError if the file cannot be read, is not YAML of the accepted kind, or has a
+    wrong value; the message names file, key, value and the expected value.
     """
     try:
         content = read_bounded(path, SIZE_LIMIT)
@@ -121,7 +121,7 @@ def dump_calibration(calibration: Calibration) -> str:
             f'the calibration takes {size} bytes, at most {SIZE_LIMIT} are accepted'
         )
     if parse_calibration(text.encode()) != calibration:
-        raise CalibrationError('reading the written calibration gives another value')
+        raise CalibrationError('the written text, read again, gives another calibration')
     return text
 
 

@@ -3,19 +3,19 @@
 """
 Owns the columns of the thermal response: the regressors of bias and scale.
 
-A column is ``phi = u t^power (1 | 1 - w | w)``, with u the value of its kind (`unit.terms`), t the
-board temperature less the reference, and w the weight of the dynamic regime. u is limited to the
-column's range, and t to the calibrated temperatures. Beyond the calibrated temperatures the curves
-continue along their tangents, but the powers of t are constant: no recording determines how a
-coefficient that changes with temperature continues there.
+A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
+is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
+dynamic regime. u is limited to the column's range, and t to the calibrated temperatures. Outside
+the calibrated temperatures the curves of the sets continue along their tangents, but powers of t
+are constant: no recording determines how a coefficient changes with temperature there.
 
-The function `bank` makes the columns in groups. A group has the columns of the kind with the same
-name, with these exceptions. Group *product* has the kind board, and group *gradient_x_temperature*
-the kinds gradient and gradient_lag, times a power of temperature, for coefficients that change
-with temperature. Group *square* also has the kind cube, and group *gradient_even* the kinds size
-and square. Group *part* has the kinds board, square and cube, whose sum with a curve over the
-board temperature is a curve over a part's temperature. Group *gradient_even_about_rest* has the
-columns of *gradient_even* as functions of the gradient less its value at rest.
+The function `bank` makes the columns in groups. A group has the columns of the kind with the
+group's name, except for the following groups. Group *product* has the kind board, and group
+*gradient_x_temperature* the kinds gradient and gradient_lag, times a power of temperature, for
+coefficients that change with temperature. Group *square* also has the kind cube, and group
+*gradient_even* the kinds size and square. Group *part* has the kinds board, square and cube, whose
+sum with a curve over the board temperature is a curve over a part's temperature. Group
+*gradient_even_about_rest* has *gradient_even* as functions of the gradient less its rest value.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,24 +36,24 @@ from .schema import check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
 UNBOUNDED: Final = (-1e9, 1e9)
-#: Time constants of the bank [s], in ratios of sqrt(2), from a few readings to the longest lag
-#: that bags determine. Linear lags use all time constants of the bank, so that sums of lags
-#: approximate any time constant in between; products and powers, whose effects are smaller, use
-#: every other time constant.
+#: Time constants of the bank [s], in steps of a factor sqrt(2), from a few reading intervals to
+#: the longest lag that bags determine. Columns linear in a lag have all time constants, so that
+#: sums of columns approximate any time constant in between. Products and powers of lags have
+#: smaller effects, and every second time constant.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
-#: Widths of the even columns [K], half-widths of the plays [K], and the lags that plays follow
-#: [s].
+#: Widths of the even columns [K], half-widths of the plays [K], and time constants of the lagged
+#: board temperatures that are inputs of plays [s]; 0 = board temperature.
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Lags of the bend columns [s]; smallest distance of the knees of bends [K]; largest number of
-#: knees for a bank of lags, and for given lags of the parts.
+#: Time constants of the bend columns [s]; smallest distance between the knees of bends [K];
+#: largest number of knees per lag of a bank, and per given lag of a part.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
-# Types of the names of groups and kinds: for type checkers, and for the file's schema.
+# Types of the names of groups and kinds: text for type checkers, a choice for the file's schema.
 if TYPE_CHECKING:
     _Group: TypeAlias = str
     _Kind: TypeAlias = str
@@ -64,7 +64,7 @@ _Value = Annotated[float, QUANTITIES['value of a column']]
 
 class Part(NamedTuple):
     """
-    The lag of a part of the unit behind the board, by the keys of a column.
+    The lag of a part of the unit behind the board, in the keys of a column.
 
     tau_s, second_tau_s: time constants of the two stages [s]; the second is 0 for a single stage
     sensor_share: the part lags the board temperature plus this share of the sensor's gradient
@@ -78,7 +78,7 @@ class Part(NamedTuple):
 
     @property
     def of_gradient(self) -> 'Part':
-        """The part with its time constants only, as the lag of a gradient has no other keys."""
+        """The time constants of the part: the lag of a gradient has no share and no lead."""
         return Part(self.tau_s, self.second_tau_s)
 
 
@@ -189,9 +189,9 @@ def bank(
     parts: Sequence[Part] | None = None,
 ) -> tuple[Column, ...]:
     """
-    Return all columns that a response may have, without limits of range; `at_rest` is the gradient
-    of each sensor at rest [K], `span_k` the range of temperatures in the data, from the reference
-    [K]. `parts` are the lags of the part of each axis; if given, no column has another lag.
+    Return all columns that a response may have, without limits of range. `at_rest`: gradient of
+    each sensor at rest [K]; `span_k`: lowest and highest board temperature in the data, less the
+    reference [K]; `parts`: lags of the part of each axis; if given, all lags are from `parts`.
     """
     fine, coarse, of_plays, of_bends = (
         list(map(Part, taus)) for taus in (FINE_TAUS, BANK_TAUS, PLAY_TAUS, BEND_TAUS)
@@ -242,7 +242,7 @@ def _family(
     lags: Sequence[Part] = (Part(0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
-    """Return the columns of a group with all combinations of the given keys' values."""
+    """Return one column of a group for each combination of the arguments' values."""
     return [
         Column(
             *(group, kind, sensor, *part, width),
@@ -254,7 +254,7 @@ def _family(
 
 
 def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> MemorySpec:
-    """Return the lags, plays and rates of columns; ValueError if `sensors` lacks a sensor."""
+    """Return the lags, plays and rates in columns; ValueError for a sensor not in `sensors`."""
     sources: set[Quantity] = set()
     for column in columns:
         sources.add(column.source)
@@ -281,7 +281,8 @@ def _root(order: int, x: float) -> float:
 
 class ColumnTable:
     """
-    Evaluates columns at thermal states (width, n), each state alone, with results (n_columns, n).
+    Evaluates columns at thermal states (width, n), with results (n_columns, n). The result of a
+    state does not depend on the other states.
     """
 
     def __init__(
@@ -307,9 +308,9 @@ class ColumnTable:
             (np.flatnonzero(orders == order), partial(_root, order))
             for order in set(orders.tolist()) - {1}
         ]
-        #: Whether any column applies in one regime alone.
+        #: Whether any column applies in only one regime.
         self.differs = bool(self._during.any())
-        # Columns that differ only in power, range or regime share one evaluation.
+        # The value u of columns that differ only in power, range or regime is evaluated once.
         of = [
             (layout.places[c.source], c.term, c.term.centre(c), c.term.width(c)) for c in columns
         ]
@@ -325,7 +326,7 @@ class ColumnTable:
             for term in dict.fromkeys(terms.tolist())
             if term.form is not LINE
         ]
-        # The temperature of a part is the board temperature less a lag: two numbers of a state.
+        # The temperature of a part is computed from two numbers of a state: board less lag.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 
@@ -374,8 +375,8 @@ class ColumnTable:
 
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
-        Differentiate u, without limits of range: w.r.t. the number that u is computed from, and
-        w.r.t. the board temperature at a given lag (None if no column depends on the temperature).
+        Differentiate u, without limits of range: w.r.t. the quantity that u is computed from, and
+        w.r.t. the board temperature at constant lag (None without a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

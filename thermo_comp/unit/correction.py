@@ -3,12 +3,12 @@
 """
 Owns the arithmetic of the correction: bias, scale and error variances from thermal states.
 
-Thermal states are columns, shape (width, n), of the numbers that `thermal.state` lays out; for a
-single state n = 1. Sums run in a fixed order and each state is evaluated alone, so a stream and a
-batch get the same bits. Results for three axes stand in rows: the bias of x, y, z, then the scale
-of x, y, z. The notation is that of `calibration`; x is the specific force of an axis before the
-misalignment, and the error variance of x is ``v(x) = a + b x + c x^2`` [m^2/s^4]. The covariance
-of errors of different axes, and of the misalignment, comes from `covariance`.
+n thermal states are the columns of an array of shape (width, n), whose rows are in the order of
+`thermal.state`. Sums run in a fixed order, and the result of a state does not depend on the other
+states, so a stream and a batch get the same bits. Results for three axes stand in rows: the bias
+of x, y, z, then the scale of x, y, z. The notation is that of `calibration`; x is the specific
+force of an axis before the misalignment, and its error variance is ``v(x) = a + b x + c x^2``
+[m^2/s^4]. `covariance` adds errors of the misalignment, and covariances between the axes.
 """
 
 from collections.abc import Sequence
@@ -32,12 +32,12 @@ from .nonlinearity import ForceCorrection, beyond_force
 #: second; largest factor by which the transition time is lengthened to keep this rate.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
-#: Number of board temperatures at which curves, and static - dynamic differences, are evaluated.
+#: Number of board temperatures at which slopes, and dynamic - static differences, are evaluated.
 _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
 ROUNDING_VARIANCE = 1.0 / 6.0
-#: Smallest noise variance of a message / largest variance of any axis: this minimum keeps the
+#: Smallest noise variance of a message / largest variance of any axis: the minimum keeps the
 #: covariance positive definite in spite of rounding, and is far below the noise of any instrument.
 _LEAST_SHARE = 1e-13
 #: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
@@ -48,7 +48,7 @@ VARIANCES = tuple(12 + place for place in CONSTANTS)
 #: Indices of the variances of the relative scale of the axes in a result of `Correction.line`: the
 #: coefficients of x^2 in xx, y^2 in yy, z^2 in zz.
 SCALE_VARIANCES = tuple(place + last for place, last in zip(VARIANCES, (2, 5, 9), strict=True))
-#: Number of thermal states from which one call per column costs less than a table of all sums.
+#: Number of thermal states above which a loop over the columns is faster than a sum over a table.
 _FEW = 64
 #: Largest number of thermal states evaluated at once, to bound the memory.
 _CHUNK = 2048
@@ -58,14 +58,14 @@ class Excess(NamedTuple):
     """How far a thermal state lies outside the calibrated ranges; 0 inside."""
 
     temperature: float  # board temperature beyond the range of the regime's set, signed [K]
-    rate: float  # rate of the board beyond the range, signed [K/s]
+    rate: float  # rate of the board temperature beyond its range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
     relative: float  # sum of all distances outside the ranges, each in half ranges
 
 
 class Correction:
     """
-    Static and dynamic set of a calibration, blended by the dynamic weight, and thermal response.
+    Bias, scale and error variances: the two sets blended by the dynamic weight, and the response.
 
     memory: lags, plays and rates of the states; by default those of `memory_of_unit`
     noise: noise variance of one message per axis, rounding included [m^2/s^4]
@@ -110,7 +110,7 @@ class Correction:
         self.of_force: ForceCorrection | None = None
         if calibration.nonlinearity is not None:
             self.of_force = ForceCorrection(calibration, calibration.nonlinearity, self._span)
-        #: Number of rows of the slowly varying error variance of `SlowUncertainty.at`.
+        #: Number of rows of the slowly varying error variance that `SlowUncertainty.at` returns.
         self.n_slow = N_ROWS if self.of_force is None else N_ROWS + 15
 
     def _find_columns_of_pairs(self) -> None:
@@ -149,7 +149,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Lengthen a transition time [s] towards GENTLE_RATE, at most by LONGEST_TRANSITION."""
+        """Lengthen a transition [s] to limit the force's rate of change to GENTLE_RATE."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         static, dynamic = self.curves.values(board)
         gap = dynamic - static
@@ -195,14 +195,13 @@ class Correction:
         noise_excess: npt.ArrayLike,
     ) -> Floats:
         """
-        Evaluate the correction of segments, linear in time between the thermal states at both
-        ends.
+        Evaluate the correction of segments, linear in time between two states 1 s apart.
 
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
         segment (1 s), scale and its change, then the coefficients of the covariance with the noise
-        of a message, see `covariance.covariance_at`. With a nonlinearity `slow` has 15 more rows
-        and the result 21 more, see `ForceCorrection.rows`.
+        of a message, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow` and 21
+        rows to the result, see `ForceCorrection.rows`.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -258,20 +257,20 @@ class Correction:
 
         The difference of dynamic and static set (`gap`) is added as an error while the sets are
         blended, outside the calibrated ranges, and while the regime is unknown. While the regime
-        is unknown, the variances of both sets are added.
+        is unknown, the variances of both sets are summed in full.
         """
         board, weight, unknown = states[BOARD], states[WEIGHT], states[UNKNOWN]
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Without lags the excess of a rate adds variance; with lags, the excess of the lags.
+            # If the columns have no lags, the excess of the rate adds variance, else that of lags.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         by_pair = self.by_pairs(by_source * factors[0])
-        # The response depends on the board temperature by t^power and by gradients and lags.
+        # Derivative w.r.t. the board temperature: the response has t^power, gradients and lags.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]
@@ -289,15 +288,15 @@ class Correction:
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0).max(
                 axis=1, initial=0.0
             )
-            # Outside the calibrated range the curves are extrapolated, while lagging parts are
-            # still inside. Add the change of the curves' slope as a separate error: for parts
-            # outside the range, and where the slopes of bias and scale cancel.
+            # Outside the calibrated range the curves are extrapolated. Add as errors the change of
+            # the curves since the edge of the range and, also for parts still outside the range,
+            # the distance outside times the sd of the slopes within the range.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
             v += self._spread(np.concatenate((bent, bent)), bends)
-            # The posterior holds within the calibrated ranges, so the variance grows with the
-            # distance outside.
+            # The posterior is valid within the calibrated ranges: outside, increase the variance
+            # with the distance from the ranges.
             growth = 1.0 + (outside + columns_out) ** 2
             v *= growth[:, np.newaxis]
         of_gap = unknown + weight * static_weight + outside * outside

@@ -12,9 +12,9 @@ elements of the misalignment M. To first order the error e of the corrected forc
     e_z = zx (u0 + x u1) + zy (u2 + y u3) + u4 + z u5 + x u7 + y u8
 
 Each element of the covariance of the force error e is a polynomial of second degree in the forces
-x, y, z, and the coefficients are sums over the elements of the covariance of the errors u. In an
-array, the covariance of the errors u has as rows a, b, c of each axis, with the axis' error
-variance ``a + b x + c x^2``, then one row for each pair of errors in `BETWEEN`.
+x, y, z, and the coefficients are sums over the elements of the covariance of the errors u. An
+array of the covariance of the errors u has the rows a, b, c of each axis, whose error variance is
+``a + b x + c x^2``, then one row for each pair of errors in `BETWEEN`.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ Real = TypeVar('Real', float, Floats)
 
 _OF_AXES: Final = [(u + i, u + j) for u in (0, 2, 4) for i, j in ((0, 0), (0, 1), (1, 1))]
 _PAIRS: Final = list(combinations_with_replacement(range(9), 2))
-#: Pairs of errors of different axes or of the misalignment, each pair once.
+#: Pairs of errors u of two axes, or of the misalignment and any error, each pair once.
 BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
 #: Number of rows of a covariance of the nine errors u.
 N_ROWS: Final = len(_PAIRS)
@@ -62,7 +62,7 @@ class CovarianceMap:
 
 @lru_cache(maxsize=16)
 def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
-    """Return which rows of the covariance of u a coefficient sums, and the factors of the rows."""
+    """Return, for each coefficient, the rows of the covariance of u that it sums, and factors."""
     # Derivative of the force w.r.t. the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
     J = np.zeros((3, 4, 9))
     J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0

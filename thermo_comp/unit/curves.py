@@ -3,7 +3,7 @@
 """
 Owns the curves of static and dynamic set over board temperature, within and beyond their ranges.
 
-Thermal states and rows of results are laid out as in `correction`; each state is evaluated alone.
+Thermal states and rows of results are laid out as in `correction`.
 """
 
 from functools import cached_property
@@ -22,9 +22,9 @@ class Curves:
     result.
 
     Where the range of only one set ends, the difference of the two sets is held constant. Beyond
-    both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` of the
-    span, and are constant from there on; a set whose range ends earlier than that of the other set
-    follows the tangent of the other set.
+    both ranges the curves continue along their tangent at the edge for `TANGENT_SPANS` times the
+    width of the range, and are constant from there on; the set with the narrower range on that
+    side follows the tangent of the other set.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -96,7 +96,7 @@ class Curves:
     @cached_property
     def _basis_slopes(self) -> list[list[list[Floats]]]:
         """
-        Derivatives of each function's slope, at both ends, w.r.t. its free coefficients.
+        Derivatives of each function's slope at both ends of its range w.r.t. free coefficients.
         """
         rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [
@@ -110,9 +110,7 @@ class Curves:
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """
-        Evaluate the variance of residual and lack of fit by set and axis [m^2/s^4], (2, 3, n).
-        """
+        """Evaluate ``residual_sd_m_s2 ** 2`` plus variance of the lack of fit, shape (2, 3, n)."""
         return self._residuals + self.lack_of_fit(board) if self._has_lacks else self._residuals
 
     def lack_of_fit(self, board: Floats) -> Floats:
@@ -169,7 +167,7 @@ class Curves:
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
         Differentiate values beyond the ranges w.r.t. a function's free coefficients, (n_free, n).
-        Beyond the range of a set, its values are a tangent plus the constant difference of sets.
+        A set beyond its range is a curve or tangent of the other set plus a constant difference.
         """
         function = self._functions.rows[regime][place]
         own_range, other_range = (

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a function of temperature: polynomial, cubic spline or exponential, normalised at t = 0.
+Owns functions of temperature (polynomial, cubic spline, exponential) that are 0 or 1 at t = 0.
 
 A single ``t = T_board - T_ref`` [K] gives the same bits as an array: the code uses only ``+ - *
 /`` in a fixed order, and `math.exp` number by number. Each function is linear in its free
@@ -28,20 +28,20 @@ from ..typing import Floats
 #: One temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
 
-#: Length of the tangent that continues a curve beyond its range, in spans of the range. A parabola
-#: deviates from the tangent at an edge in proportion to the square of the distance: at the end of
-#: the tangent, by 1/16 of the deviation at the opposite end of the range.
+#: Length of the tangent that continues a curve beyond its range / width of the range. A parabola
+#: deviates from a tangent in proportion to the square of the distance from the point of contact:
+#: at the outer end of the tangent by 1/16 of the deviation at the far end of the range.
 TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
-#: Smallest distance of a spline's knots, and largest distance of a knot from the reference
-#: temperature [K]; beyond these limits the spline would overflow.
+#: Smallest distance between a spline's knots, and largest distance of a knot from the reference
+#: temperature [K]; numbers beyond these limits would make the spline overflow.
 _KNOT_STEP = 1e-3
 _FARTHEST_KNOT = 2000.0
 
 
 def hold(value: Floats, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Floats:
-    """Limit values to a range in the same unit."""
+    """Limit values to the range from `lower` to `upper`."""
     return np.asarray(np.minimum(np.maximum(value, lower), upper))
 
 
@@ -94,7 +94,7 @@ class Polynomial(_Family):
         return self.coefficients[1:]
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Polynomial:
-        """Return the same family of polynomial with other coefficients."""
+        """Return a polynomial with the coefficients `at_reference` and `values`."""
         return replace(self, coefficients=(at_reference, *values))
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -139,13 +139,13 @@ class CubicSpline(_Family):
     @property
     def free_coefficients(self) -> tuple[float, ...]:
         """
-        The values of the spline at all knots except t = 0 (the reference), less that at t = 0.
+        Values of the spline at all knots except t = 0 (the reference), less the value at t = 0.
         """
         at = self.knots_k.index(0.0)
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> CubicSpline:
-        """Return a spline of the same knots with other values."""
+        """Return a spline with the same knots and other values."""
         at = self.knots_k.index(0.0)
         moved = (*values[:at], 0.0, *values[at:])
         return replace(self, values=tuple(at_reference + v for v in moved))
@@ -198,8 +198,7 @@ class Exponential(_Family):
                 f'got {len(self.e_fold_k)}'
             )
         if any(abs(e_fold) < 1.0 for e_fold in self.e_fold_k):
-            # With an e-fold below 1 K the exponential overflows within any useful temperature
-            # range.
+            # A shorter e-fold overflows within any useful temperature range.
             raise ValueError('`e_fold_k` must be at least 1 K in magnitude')
 
     @property
@@ -228,11 +227,7 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 class Functions:
-    """
-    A table of functions of temperature; each row of the table has a separate temperature.
-
-    For speed, all polynomials are evaluated together.
-    """
+    """A table of functions of temperature, whose rows are evaluated at different temperatures."""
 
     def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
         self.rows = rows
@@ -250,7 +245,7 @@ class Functions:
 
     def evaluate(self, t: Floats, name: str = 'value') -> Floats:
         """
-        Evaluate values or slopes at `t`, shape (n_rows, n) [K]: shape (n_rows, n_functions, n).
+        Evaluate values or slopes, (n_rows, n_functions, n), at `t` [K], shape (n_rows, n).
         """
         result = _horner(self._tables[name], t[:, np.newaxis])
         for row, place, function in self._others:
@@ -274,7 +269,7 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:
-    """Differentiate the functions of `basis` w.r.t. the temperature, at `t` [per K]."""
+    """Return the slope at `t` [K] of each function that `basis` evaluates [per K]."""
     units = np.eye(function.n_free).tolist()
     return [float(function.with_free(tuple(unit), 0.0).slope(t)) for unit in units]
 

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the limits of a calibration's bias and scale over its temperatures, relative to full scale.
+Owns the limits of a calibration's bias and scale over its temperatures.
 
-A bias is within the converter's range, so the sum of level and curve is at most twice the full
-scale. The largest value of a column, and the uncertainty, stay within a million times the limit of
-a bias, which is far beyond any instrument and does not overflow.
+The largest bias, level plus curve, is twice the full scale. The effect of a column on the bias,
+and of a parameter's sd on bias or scale, may be a million times the limit of bias or scale: far
+beyond any instrument, but without overflow.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from .posterior import ParameterLayout
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of the relative scale, also if the term of every column has its largest value.
+#: Limits of the relative scale, also if all columns together change the scale most.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
-#: Largest bias / full scale: samples in an offset code have a bias of half their range.
+#: Largest bias / full scale: the bias of samples in an offset code is half of their range.
 FULL_SCALES = 2.0
-#: Largest accepted effect of a column or of a parameter's uncertainty / largest bias.
+#: Largest accepted effect of a column or of a parameter's sd / limit of the bias or scale.
 WORST = 1e6
 #: Number of temperatures at which a function of temperature is checked.
 _GRID = 513
-#: Part of the error messages: the temperatures over which a function is checked.
-_AROUND = f'and along its tangents, {TANGENT_SPANS:g} of the range on each side'
+#: End of error messages: the temperatures over which a function is checked.
+_AROUND = f'range and, on each side, along the tangent for {TANGENT_SPANS:g} of the range'
 
 
 def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
@@ -56,7 +56,7 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
         effect = size * max(map(abs, term.bias))
         if not effect <= WORST * most:
             raise ValueError(
-                f'`response[{k}].bias` must keep the largest bias by the column within '
+                f'`response[{k}].bias` must keep the largest effect of the column within '
                 f'{WORST * most:g}, got {effect:g}'
             )
     for regime, part, ends in zip(('static', 'dynamic'), sets, edges, strict=True):
@@ -81,7 +81,7 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
             worst = np.max(sd * [*_regressors(functions, edges), *sizes])
             if not worst <= WORST * bound:
                 raise ValueError(
-                    '`posterior.factor` must keep the effect of every standard deviation below '
+                    "`posterior.factor` must keep the effect of each parameter's sd at most "
                     f'{WORST * bound:g}, got {worst:g}'
                 )
 
@@ -103,13 +103,13 @@ def _check_axes(calibration: Calibration, most: float) -> None:
 
 def _check_bias(key: str, level: float, reached: tuple[float, float], most: float) -> None:
     if abs(level) > most:
-        raise ValueError(f'`{key}.delta` must leave a bias within {most:g}, got {level:g}')
+        raise ValueError(f'`{key}.delta` must keep bias plus delta within {most:g}, got {level:g}')
     least, largest = reached
     if not math.isfinite(largest - least):
-        raise ValueError(f'`{key}.bias_function` must be finite over its range {_AROUND}')
+        raise ValueError(f'`{key}.bias_function` must be finite over its {_AROUND}')
     if max(-least, largest) > most:
         raise ValueError(
-            f'`{key}.bias_function` must stay within {most:g} over its range {_AROUND}, '
+            f'`{key}.bias_function` must stay within {most:g} over its {_AROUND}, '
             f'reaches {max(reached, key=abs):g}'
         )
 
@@ -124,8 +124,8 @@ def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
     ):
         if not is_kept(value, limit):
             raise ValueError(
-                f'`{key}.scale_function` must stay {word} {limit:g} over its ranges {_AROUND}, '
-                f'reaches {value:.4g}'
+                f'`{key}.scale_function` must stay {word} {limit:g} with all columns, over its '
+                f'{_AROUND}, reaches {value:.4g}'
             )
 
 
@@ -149,7 +149,7 @@ def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[fl
 def _regressors(
     functions: Sequence[TemperatureFunction], edges: Sequence[Sequence[float]]
 ) -> list[float]:
-    """Return each function's largest derivative w.r.t. its level and each free coefficient."""
+    """Return each function's largest derivatives w.r.t. its level and its free coefficients."""
     pairs = zip(functions, edges, strict=True)
     both = [function.basis(np.array(ends)) for function, ends in pairs]
     return [size for basis in both for size in (1.0, *(float(np.abs(v).max()) for v in basis))]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns statistics of residuals: corrected less true force, and ``|f| - g``, which needs no attitude.
+Owns statistics of residuals: of corrected less true force, or of ``|f| - g``.
 """
 
 from dataclasses import dataclass
@@ -31,13 +31,13 @@ def residual_statistics(residual: Floats) -> ResidualStatistics:
 
 
 def norm_residual(specific_force: Floats, gravity: float | Floats) -> Floats:
-    """Return ``|f| - g`` of forces (..., 3), which needs no attitude; `gravity`: the known |f|."""
+    """Return ``|f| - g`` of forces (..., 3), for any attitude; `gravity`: the known |f|."""
     square = np.einsum('...i,...i->...', specific_force, specific_force)
     return np.asarray(np.sqrt(square) - gravity)
 
 
 def means_by(labels: Ints, values: Floats, weight: Floats | None = None) -> Floats:
-    """Average the rows that have the same label, in the order of the labels."""
+    """Average the rows of each label; the results are in ascending order of the labels."""
     weight = np.ones(len(labels)) if weight is None else weight
     _, place = np.unique(labels, return_inverse=True)
     count = np.bincount(place, weight)

@@ -32,9 +32,10 @@ Kind = Literal['square', 'odd_square', 'cube']
 #: The nonlinear terms in the order of a calibration file, and the power of 1/g in the unit of each
 #: coefficient.
 POWERS: dict[Kind, int] = {'square': 1, 'odd_square': 1, 'cube': 2}
-#: Prior sd of K2 [g/g^2]; data sheets of quartz pendulums have lower limits, 20 to 60 ug/g^2.
+#: Prior sd of K2 [g/g^2]: above the limits of K2 in data sheets of quartz pendulum
+#: accelerometers, 20 to 60 ug/g^2.
 K2_SD = 1e-4
-#: Largest |f| / gravity of a rest that counts as at 1 g.
+#: Largest |f| / gravity of a rest whose |f| counts as gravity.
 AT_REST = 1.01
 #: Largest slope of the nonlinear terms within full scale, for which one step of Halley's method is
 #: sufficient.
@@ -63,12 +64,12 @@ class NonlinearTerm:
         float, QUANTITIES['number'], 'Effective number of coefficients determined by the data.'
     ] = 0.0
     log_evidence_change: Annotated[
-        float, QUANTITIES['log evidence'], 'Loss of log evidence without the term.'
+        float, QUANTITIES['log evidence'], 'Loss of log evidence if the term is removed.'
     ] = 0.0
     left_out_gain: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Log of the mean-square error on data left out, without / with the term.',
+        'Log of the ratio of mean-square errors on left-out data, without to with the term.',
     ] = 0.0
 
 
@@ -77,8 +78,8 @@ class Nonlinearity:
     """
     The nonlinearity of the three axes.
 
-    Beyond the forces of the fit the polynomials continue, and the covariance is increased by an
-    unknown square term that begins at the largest force, with the sd `beyond_sd_g_g2`.
+    Beyond the forces of the fit the polynomials continue, and the covariance includes an unknown
+    square term, with a coefficient of the sd `beyond_sd_g_g2`, from the largest force on.
     """
 
     force_range_m_s2: Annotated[
@@ -86,21 +87,24 @@ class Nonlinearity:
         'Smallest and largest norm of the specific force in the fit.',
     ]
     beyond_sd_g_g2: Annotated[
-        float, QUANTITIES['nonlinearity'], 'Sd of an unknown square term beyond the largest norm.'
+        float,
+        QUANTITIES['nonlinearity'],
+        'Sd of K2 of an unknown square term that begins at the largest norm in the fit.',
     ]
     terms: Annotated[
-        tuple[NonlinearTerm, ...], 'Square, odd square and cube in this order, at most one each.'
+        tuple[NonlinearTerm, ...], 'At most one square, odd square and cube term, in this order.'
     ] = ()
 
     def __post_init__(self) -> None:
         check_ranges(self, force_range_m_s2=QUANTITIES['error'])
         kinds = [term.kind for term in self.terms]
         if kinds != [kind for kind in POWERS if kind in kinds]:
-            raise ValueError(f'`terms` must be of {list(POWERS)}, each once, in this order')
+            raise ValueError(f'`terms` must be of {list(POWERS)}, at most one each, in this order')
 
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
         """
-        Raise ValueError if the terms' slope is too large up to a force [m/s^2] at some t [K].
+        Raise ValueError if the slope of the terms is too large at a |f| up to `force` [m/s^2], at
+        one of the temperatures less the reference [K].
         """
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
@@ -128,7 +132,7 @@ def unit_of(kind: Kind) -> float:
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of the result is (k2^2 + k3) times the cube of the correction: at 10 g it is 1e-14 g with
+    error of the result is (k2^2 + k3) times the cube of the correction: at 10 g, 1e-14 g with
     k2 = 100 ug/g^2, and 1e-11 g with k3 = 10 ug/g^3.
     """
     r = k3 * x * x
@@ -144,7 +148,7 @@ def corrected_nonlinear(
     bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
     k2x, kqx, k3x, k2y, kqy, k3y, k2z, kqz, k3z = line[_NONLINEAR : _NONLINEAR + 9]
     yx, zx, zy = misalignment
-    # Equation 7 of the paper is solved for the input of each axis, then the nonlinearity.
+    # Solve equation 7 of the paper for the input of each axis, then the nonlinearity for f.
     x = linearised((x - (bx + bx1 * dt)) / (sx + sx1 * dt), k2x, kqx, k3x)
     y = linearised((y - (by + by1 * dt)) / (sy + sy1 * dt), k2y, kqy, k3y)
     z = linearised((z - (bz + bz1 * dt)) / (sz + sz1 * dt), k2z, kqz, k3z)
@@ -176,8 +180,8 @@ def nonlinear_covariance(
 
 class BeyondForce(NamedTuple):
     """
-    The variance of an unknown square term that begins at the force `edge` [m/s^2]; `growth`:
-    variance / fourth power of twice the distance beyond `edge`.
+    The variance of an unknown square term that begins at the force `edge` [m/s^2]. `growth`:
+    variance / (2 d)^4, with d the distance of |x| beyond `edge`.
     """
 
     edge: float
@@ -193,15 +197,15 @@ class BeyondForce(NamedTuple):
 
     def _variance(self, x: Real) -> Real:
         over = abs(x) - self.edge
-        over = over + abs(over)  # twice the distance beyond the largest force, or 0
+        over = over + abs(over)  # twice the distance beyond `edge`, or 0
         over = over * over
         return self.growth * over * over
 
 
 def beyond_force(calibration: Calibration) -> BeyondForce:
     """
-    Return the variance of an unknown square term beyond the largest force of a calibration: |f| of
-    the fit, or, without a nonlinearity, 1 % above gravity.
+    Return the variance of an unknown square term beyond the largest |f| in the fit, or, if the
+    calibration has no nonlinearity, beyond a force of 1 % above gravity.
     """
     known = calibration.nonlinearity
     edge = known.force_range_m_s2[1] if known else AT_REST * calibration.gravity_m_s2
@@ -210,7 +214,7 @@ def beyond_force(calibration: Calibration) -> BeyondForce:
 
 
 class ForceCorrection:
-    """The nonlinearity of a calibration, prepared for the segments of a correction."""
+    """The nonlinearity of a calibration as a function of the board temperature [degC]."""
 
     def __init__(
         self, calibration: Calibration, nonlinearity: Nonlinearity, span: tuple[float, float]
@@ -250,13 +254,13 @@ class ForceCorrection:
         self, t: Floats, rows: Floats, rest: Floats, on_bias: Floats, on_scale: Floats
     ) -> Floats:
         """
-        Return the nonlinear terms' part of the coefficients of x^2 to x^6 in an axis' variance, at
-        temperatures (n,) from the reference, (5, n).
+        Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
+        error variance of an axis, (5, n), at temperatures less the reference, (n,).
 
         `rows`, `rest`: factor of the covariance of the coefficients (2 k, rank), and variances
         added to it; `on_bias`, `on_scale`: factors of bias and relative scale, (rank, n). The
-        covariances of the coefficient of |f| f with other parameters are omitted, which overstates
-        the variance.
+        covariances of the coefficient of |f| f with other parameters are omitted: most are
+        negative, so the result is too large.
         """
         kinds = [term.kind for term in self._of.terms]
         k = len(kinds)

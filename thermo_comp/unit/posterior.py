@@ -17,9 +17,9 @@ from ..quantities import QUANTITIES
 from ..typing import Floats
 from .functions import TemperatureFunction
 
-#: Share of a variance that is below the resolution of single precision.
+#: Part of a variance that is below the resolution of single precision.
 _NEGLIGIBLE = 1e-7
-#: Smallest (negative) eigenvalue of a correlation matrix that rounding explains.
+#: Smallest (negative) eigenvalue of a correlation matrix that is due to rounding.
 _MOST_NEGATIVE = -1e-6
 _FLOAT32 = np.dtype('<f4')
 
@@ -134,7 +134,7 @@ class ParameterLayout(NamedTuple):
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """Find the smallest factor of a matrix; raises ValueError if the matrix is no covariance."""
+    """Encode a covariance; the factor omits at most `tolerance` of each variance."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')

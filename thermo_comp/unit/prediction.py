@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns predictions for a thermal state: the slowly varying error covariance (due to the parameters,
-and to lags whose initial state is unknown), and hypothetical states: a soak and a ramp.
+Owns the slowly varying error covariance of thermal states, due to the parameters and the unknown
+initial lag states, and the thermal states of a soak and of a ramp.
 
-In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a lag
-of time constant tau is ``tau q (1 - exp(-s / tau))`` behind the board, and a play is at its end
-stop. In a soak (q = 0) gradients, lags and plays are 0, apart from self-heating: the gradient of
-the first sensor includes `soak_gradient_k`. The static set applies in a soak, the dynamic set
-in a ramp. Predicted variances do not include noise and the uncertainty of the thermometers.
+In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a part
+of time constant tau lags the board by ``tau q (1 - exp(-s / tau))``, and a play has its largest
+distance from its input. In a soak (q = 0) gradients, lags and plays are 0, except for the gradient
+of the first sensor due to self-heating, `soak_gradient_k`. The static set applies in a soak, the
+dynamic set in a ramp. Predicted variances include neither noise nor errors of the thermometers.
 """
 
 from collections.abc import Callable
@@ -43,10 +43,10 @@ class SlowUncertainty:
             sum(w * tau for (of, tau), w in lag.first_order_weights.items() if of == BOARD_INPUT)
             for lag in lags
         ])  # fmt: skip
-        #: For each axis, rows of the posterior's factor and added variances: of bias, scale and
-        #: nonlinear terms.
+        #: For each axis, for bias, scale and nonlinear terms: rows of `matrix` and `variances` of
+        #: the posterior.
         self._blocks: list[list[tuple[Floats, Floats]]] = []
-        #: Rows of the posterior's factor, and added variances, of the misalignment.
+        #: Rows of `matrix` and `variances` of the posterior for the misalignment.
         self._misalignment = np.zeros((3, 0)), np.square(calibration.misalignment_sd)
         posterior = calibration.posterior
         if posterior is None:
@@ -63,11 +63,11 @@ class SlowUncertainty:
     ) -> Floats:
         """
         Evaluate the rows of the error covariance (see `unit.covariance`) at thermal states, shape
-        (width, n), each state alone, with `start_shares`, the remaining shares of the lags'
-        initial states, (n_lags, n), and `start_rates`, `ThermalMemory.start_rate` of each state,
-        (n,), by default 0. Returns `Correction.n_slow` rows: a, b, c of each axis' error variance
-        ``v(x) = a + b x + c x^2`` [m^2/s^4], then the rows between axes and misalignment, then the
-        part of a nonlinearity in the coefficients of x^2 to x^6 of each axis' variance.
+        (width, n), one by one. `start_shares`, (n_lags, n): remaining shares of the lags' initial
+        states; `start_rates`, (n,): `ThermalMemory.start_rate` of each state, by default 0.
+        Returns `Correction.n_slow` rows: a, b, c of each axis' error variance ``v(x) = a + b x + c
+        x^2`` [m^2/s^4], then the rows between axes and misalignment, then the contribution of a
+        nonlinearity to the coefficients of x^2 to x^6 of each axis' variance.
         """
         cuts = range(_CHUNK, states.shape[1], _CHUNK)
         rates = np.abs(states[RATE])
@@ -87,8 +87,8 @@ class SlowUncertainty:
         factors, _ = table.factors(states[BOARD], states[WEIGHT])
         by_pair = self._correction.by_pairs(table.slopes(states)[0] * factors)
         moved = by_pair[self._correction.layout.lag_pairs] * start_shares[:, np.newaxis]
-        # If the unit was started in a ramp, a part's lag at the start was at most the lag in a
-        # long ramp at the largest rate since then, and at most the calibrated temperature span.
+        # The unit may have been started in a ramp: the assumed sd of a part's lag at the start is
+        # its lag in a long ramp at the largest rate since the start, at most the calibrated span.
         behind = hold(self._behind_s[:, np.newaxis] * rates, -self._span, self._span)
         in_ramp = in_order(moved * behind[:, np.newaxis], 0)
         by_root = in_order(self._root[:, :, np.newaxis, np.newaxis] * moved[:, np.newaxis], 0)
@@ -105,8 +105,8 @@ class SlowUncertainty:
         of_misalignment, var_misalignment = self._misalignment
         n_start, (n, rank) = len(of_start), (states.shape[1], of_misalignment.shape[1])
         errors = np.zeros((9, n_start + rank, n))
-        # A larger element of the misalignment increases the force; a larger bias or scale factor
-        # decreases the force.
+        # A larger element of the misalignment increases the corrected force; a larger bias or
+        # scale factor decreases the corrected force.
         errors[6:, n_start:] = -of_misalignment[:, :, np.newaxis]
         added = np.zeros((3, 3, n))
         beyond: list[Floats] = []
@@ -138,7 +138,7 @@ class SlowUncertainty:
     ) -> tuple[Floats, Floats]:
         """
         Return the variance of the bias due to the parameters at thermal states (n, width), and
-        of the difference of the bias from its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
+        the variance of the bias less its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)
@@ -210,8 +210,8 @@ def bias_and_scale(calibration: Calibration, states: Floats) -> tuple[Floats, Fl
 def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floats]:
     """
     Predict the sd of bias [m/s^2] and relative scale at thermal states, shapes (n, 3), including
-    the sd of the self-heating gradient in a soak. The lack of fit, an error of the axis under
-    gravity, may be one of the bias or of the scale: both include it.
+    the sd of the self-heating gradient in a soak. The lack of fit of an axis at 1 g may be an
+    error of the bias or of the scale, so it is included in both sd.
     """
     correction = Correction(calibration)
     slow = SlowUncertainty(calibration, correction)
@@ -243,7 +243,7 @@ def ramp_states(
 ) -> Floats:
     """
     Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s];
-    the gradient of self-heating is that of a soak.
+    the gradient due to self-heating is `soak_gradient_k`.
     """
     layout = Layout(memory_of_unit(calibration))
     states = np.zeros((len(temperature), layout.width))

@@ -15,7 +15,7 @@ _WeightSd = Annotated[float, QUANTITIES['deviation of a weight']]
 
 @dataclass(frozen=True)
 class GroupEvidence:
-    """Contribution of one group of columns to the correction of a fit."""
+    """Contribution of one group of columns to the correction in the fitted data."""
 
     group: Annotated[str, 'Name of the group, as in the key `response`.']
     part: Annotated[Literal['bias', 'scale'], 'Whether the group corrects bias or scale.']
@@ -26,7 +26,8 @@ class GroupEvidence:
     log_evidence_change: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Loss of log evidence without the group or, with a prior, with weights at its mean.',
+        'Loss of log evidence without the group; in a fit with a prior, with its weights at the '
+        'mean of the prior.',
     ]
     prior_sd: Annotated[tuple[_WeightSd, ...], "Prior sd of the group's weights."]
 
@@ -43,7 +44,7 @@ class Source:
 @dataclass(frozen=True)
 class ResidualSummary:
     """
-    Error of |f| against gravity over one section of the fitted data, before and after correction.
+    ``|f| - g`` over one section of the fitted data, before (raw) and after the correction.
     """
 
     section: str
@@ -72,7 +73,7 @@ class Provenance:
 
     @property
     def date(self) -> str:
-        """The date of the test if known, else that of the fit; '' without a date."""
+        """The date of the test if known, else the date of the fit, else ''."""
         return self.tested or self.created
 
     @property

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bias of a unit's gyroscope, over the same columns as the force; the scale is 1."""
+"""Owns the bias of a unit's gyroscope, a sum of a curve over temperature and of columns."""
 
 import math
 from dataclasses import dataclass, field
@@ -44,7 +44,7 @@ class RateSet:
     z: RateCurve
 
     def axes(self) -> tuple[RateCurve, RateCurve, RateCurve]:
-        """Return the three axes in order."""
+        """Return the curves of the axes x, y, z."""
         return self.x, self.y, self.z
 
 
@@ -60,9 +60,9 @@ class RateTerm(Column):
 @dataclass(frozen=True)
 class Gyroscope:
     """
-    Bias of the angular rate over temperature: ``w = measured - bias``.
+    Bias of the angular rate over temperature: ``w = measured - bias``. The scale factor is 1.
 
-    Order of the posterior, axis by axis: level and coefficients of each set, then the weights.
+    Order of the posterior, axis by axis: level and coefficients of each set, weights of columns.
     """
 
     bias_rad_s: Annotated[
@@ -75,7 +75,8 @@ class Gyroscope:
     ]
     slow_noise_rad_s_sqrt_h: Annotated[
         tuple[_Slow, _Slow, _Slow],
-        'Slow noise: random walk of the bias over short times, per root hour.',
+        'Slow noise: random walk of the bias, per root hour, over times shorter than its '
+        'correlation time.',
     ] = NIL
     residual_sd_rad_s: Annotated[
         tuple[_Deviation, _Deviation, _Deviation],

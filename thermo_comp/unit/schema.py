@@ -5,8 +5,8 @@ Owns the conversion of plain values to dataclasses and back: type hints are a fi
 
 Hints are float, int, bool, str, Literal, tuple, dataclass, any of them or None, and
 ``Annotated[hint, Bounds(...), 'what it means']``. The only conversions are integer to float and
-list to tuple. Rules between keys belong to the dataclass, which raises a ValueError that starts
-with the key in backticks.
+list to tuple. Rules between keys are checked by the dataclass, which raises a ValueError that
+starts with the key in backticks.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from ..quantities import Bounds
 
-#: Length at which names and values are cut in error messages; every key is shorter.
+#: Number of characters at which names and values are cut in error messages; keys are shorter.
 _LONGEST_NAME = 60
 _NAMED_FIRST = re.compile(r'`(?P<key>[\w.\[\]]+)` (?P<rest>.*)', re.DOTALL)
 _WORDS: dict[Any, str] = {str: 'text', int: 'integer', float: 'number', bool: 'true or false'}

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the kinds of regressors of the thermal response, one class each: a new kind is a new class.
+Owns the kinds of regressors of the thermal response; each kind is a class.
 
 The value of a column is ``u = form.value(x)``, ``x = (n - centre) / width``. The number n is a
-quantity of the thermal state, the `source`; with `is_temperature` it is ``t - source``, the
+quantity of the thermal state, the `source`; if `is_temperature`, n is ``t - source``, the
 temperature of a part that lags the board. Notation: ``t = T_board - T_ref``,
-``g_s = T_s - T_board`` of a sensor s, and ``q_s = g_s - rest``: rest is 0, or the gradient at
-rest, where self-heating makes the board warmer than the case. Even functions of the gradient q_s
-have the same value for heating and for cooling at the same rate.
+``g_s = T_s - T_board`` of a sensor s, and ``q_s = g_s - rest``. The constant `rest` is 0, or the
+gradient at rest if self-heating makes the board warmer than the case. Even functions of q_s have
+the same value for heating and for cooling at the same rate.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x and its derivative; each x is evaluated alone, bit for bit."""
+    """A function of x and its derivative; the bits of a value depend on its x only."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
@@ -47,13 +47,12 @@ class Term(ABC):
 
     kind: ClassVar[str]  # name of the kind in the calibration file
     formula: ClassVar[str]  # formula of the value, for the description of the file
-    #: Groups of columns that appear with this kind, each with its name in a certificate.
+    #: Groups of columns that are defined with this kind, each with its name in a certificate.
     groups: ClassVar[_Pairs] = ()
     form: ClassVar[Form] = LINE
     #: Power of temperature in the value of a column, without the column's factor t^power.
     order: ClassVar[int] = 1
-    #: Keys of a column that hold the centre and the width of x; without keys, centre 0 and width
-    #: 1.
+    #: Keys of a column that hold the centre and the width of x; '' for centre 0 and width 1.
     centre_key: ClassVar[str] = ''
     width_key: ClassVar[str] = ''
     #: Keys of a column that must be greater than 0.
@@ -111,10 +110,10 @@ class Gradient(Term):
 
 
 class Rate(Term):
-    """The rate of the board temperature: effect of a heat flow, for a single thermometer."""
+    """Rate of the board temperature: effect of a heat flow in a unit without case thermometer."""
 
     kind, formula = 'rate', 'dT_board/dt [K/s]'
-    groups = (('rate', 'rate of the board'),)
+    groups = (('rate', 'rate of the board temperature'),)
 
     def source(self, column: Column) -> Quantity:  # noqa: ARG002
         """Return dT_board/dt."""
@@ -156,7 +155,7 @@ class GradientLag(Term):
 
 
 class Square(Term):
-    """Curvature over a part's temperature; without a lag, losses quadratic in a heat flow."""
+    """Quadratic term over the temperature of a part or, without a lag, over a heat flow."""
 
     kind, formula = 'square', '(T_board - lagged T_board)^2, or q_s^2 without lag'
     groups = (('square', 'curves of parts that lag'),)
@@ -175,7 +174,7 @@ class Cube(Board):
 
 
 class Size(Gradient):
-    """Magnitude of a gradient: effect of a heat load, such as that of a heat pump."""
+    """Magnitude of a gradient: effect of a heat load, such as the load of a heat pump."""
 
     kind, formula, groups = 'size', 'abs(q_s)', ()
     form, centre_key = Form(np.abs, np.sign), 'rest_k'
