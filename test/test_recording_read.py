@@ -350,7 +350,8 @@ def test_two_thermometers_of_other_names_are_offered(tmp_path):
     with open_recording(path, require=('accel',)) as reader:
         assert 'board' not in reader.topics
         assert reader.info.chosen == (
-            'no temperature/board: is it /baro/air or /imu/die? name it with --topic board=TOPIC'
+            'no temperature/board: if the board thermometer is /baro/air or /imu/die, give '
+            '--topic board=TOPIC'
         )
     with open_recording(path, Topics(board='/imu/die'), require=('accel',)) as reader:
         assert reader.info.chosen is None

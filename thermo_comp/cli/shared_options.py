@@ -317,8 +317,8 @@ def fitting(
         min=1e-6,
     ),
     k3_sd: float | None = option(
-        'Data-sheet bound (1 sd) of the cubic nonlinearity, in ug/g^3; default: 10 with --k2-sd or '
-        'if some rests are not at 1 g, else no nonlinearity.',
+        'Data-sheet bound (1 sd) of the cubic nonlinearity, in ug/g^3; default: 10 with --k2-sd '
+        'or if some rests are not at 1 g, else no nonlinearity.',
         min=1e-6,
     ),
     allow: list[str] | None = option('Name of a refusal to override, stated in its message.'),

@@ -5,9 +5,9 @@ Owns column maps of tables: the content and unit of each column, and the message
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table without headings, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: times rise from row to row, and the norm of readings at rest is
-gravity, which gives their unit. An angular rate is taken to be in deg/s if its numbers, as rad/s,
-would be faster than a turn by hand.
+wz]`` as for imu_tk, is guessed: times rise from row to row, and the norm of samples at rest is
+gravity, from which the unit follows. An angular rate is taken to be in deg/s if its numbers, as
+rad/s, would be faster than a turn by hand.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ _FASTEST_K_S = 0.5
 # Largest share of rows in which a temperature in whole degrees changes. The numbers of boards or
 # sensors in a column alternate from row to row, so they change in a larger share of the rows.
 _FEW_CHANGES = 0.1
-_RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
+_RISING = 0.7  # smallest share of rows with a later time than the row before; the rest may repeat
 #: A step from the uppermost to the lowest tenth of a counter's range is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
@@ -356,7 +356,7 @@ def _stamp(
         # Shortest possible duration of the log [s], as boards change by at most `_FASTEST_K_S`.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
-        # Take the largest unit with a plausible interval between samples: 5 ms is, 5 s is not.
+        # Take the largest unit that gives a plausible interval between samples (5 ms, not 5 s).
         for unit, exponent in STAMP_EXPONENTS.items():
             size = 10.0 ** (exponent - 9)
             begin, step_s = first * size, step * size
@@ -384,7 +384,7 @@ def _no_time(column: Column | None, steps: Floats) -> str:
 
 
 def _turns_at_once(accel: Floats) -> bool:
-    """Whether the unit turns between still blocks, faster than possible with times in ms."""
+    """Whether the unit turns between still blocks faster than by hand, if times were in ms."""
     blocks = accel[: len(accel) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, 3)
     mean = blocks.mean(axis=1)
     size = np.linalg.norm(mean, axis=1, keepdims=True)

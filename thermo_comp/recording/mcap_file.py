@@ -46,8 +46,8 @@ _MAX_HELD_BYTES = 1 << 26  # largest memory for messages of overlapping chunks [
 _CUTS = {
     0: 'it is unreadable from byte {at} on',
     int(Opcode.CHUNK): 'it ends inside a chunk, of which the first {} messages are read',
-    int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk, which is read whole',
-    -1: 'it ends inside a record, and everything before this record is read',
+    int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk; the chunk is complete',
+    -1: 'it ends inside a record; all records before it are read',
 }
 #: Record types other than messages that are read.
 _KINDS: Mapping[int, Any] = {
@@ -188,7 +188,7 @@ class McapFile(BagFile):
     def _scan(self, at: int, end: int | None) -> None:
         """Read the file record by record; if `end` is None, up to the last complete message."""
         stop = self._size if end is None else end
-        words = 'it ends between two records, so more may have followed'
+        words = 'it ends between two records, so further records may be missing'
         spans = [Span(0, 0)]
         while at < stop:
             head = self._read_at(at, min(HEAD_BYTES, stop - at))
@@ -269,7 +269,7 @@ def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Me
         if sum(len(piece.data) for piece in held.values()) > _MAX_HELD_BYTES:
             raise DamagedError(
                 'too many of its chunks overlap in time to be read in bounded memory; '
-                'sort its messages by time with another tool'
+                'sort the messages of the file by time with another tool'
             )
         if ready:
             yield join_messages(ready).in_order()

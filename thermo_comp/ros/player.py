@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the player: publishes a bag on the node's input topics, with `/clock`, paced or as fast as the
-subscribers take it.
+Owns the player: publishes a bag on the node's input topics, with `/clock`, at a multiple of real
+time or as fast as the subscribers acknowledge messages.
 
 Topics have the node's relative names, messages are unchanged and in the bag's order; ROS 1
 messages are rewritten in CDR. After `WINDOW` messages of a topic the player waits until every
@@ -47,7 +47,7 @@ CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
 ACKNOWLEDGEMENT_NAP = 0.0005
 #: Time for subscribers to discover the player if the middleware does not report it [s].
 SETTLING = 0.3
-PATIENCE = 30.0  # how long a subscriber may leave messages unacknowledged [s]
+PATIENCE = 30.0  # longest time in which a subscriber may acknowledge no message [s]
 
 
 @dataclass(frozen=True, slots=True)

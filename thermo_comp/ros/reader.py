@@ -4,7 +4,7 @@
 Owns the reading of calibrations in a separate process, in parallel to the samples.
 
 A parser holds the interpreter lock for milliseconds at a time, so a thread would delay samples.
-If a file makes its reader crash or hang, the node only sees a process that ended or timed out.
+If a file makes the process crash or hang, the node continues and refuses the file.
 """
 
 import ctypes
@@ -71,7 +71,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
             raise
         raise CalibrationError(error.rule, name) from error
     except Exception as error:
-        # No error of a file may end the node; a home folder of an unknown user is a RuntimeError.
+        # No error of a file may end the node; `expanduser` raises RuntimeError for unknown users.
         has_reason = isinstance(error, OSError) or type(error) is ValueError
         reason = getattr(error, 'strerror', None) or (has_reason and str(error))
         raise CalibrationError(

@@ -3,8 +3,8 @@
 """
 Owns the loop around a node's wait sets, and all uses of rclpy beyond its documented API.
 
-rclpy's executor costs ten times the CPU time of the compensation. `WaitLoop` leaves messages
-serialized. While samples flow, the loop waits only for samples, and each wake-up empties their
+rclpy's executor takes ten times the CPU time of the compensation. `WaitLoop` leaves messages
+serialized. While samples arrive, the loop waits only for samples, and each wake-up empties their
 queue; services and ordinary subscriptions are polled. Timers, clients and middleware events are
 not served by this loop.
 
@@ -58,7 +58,7 @@ Serve = Callable[[Any, Callable[[Any], None]], None]
 
 class Sources:
     """
-    Decides whether a topic's messages are from one publisher while several publishers are known.
+    Decides whether a topic's messages are from one publisher if the middleware lists several.
 
     The middleware lists a killed publisher until its lease of 20 s ends. Messages do not
     identify their publisher, but each publisher numbers its messages, so consecutive numbers over
@@ -231,7 +231,7 @@ class WaitLoop:
         others |= {service: partial(self._take_request, service) for service in node.services}
         waking = next((subscription for subscription in self._raw if subscription.wakes), None)
         rest_ns = 0
-        # With reliable QoS a wake-up costs less than a short sleep: make no pause.
+        # Pause only with best-effort QoS: with reliable QoS a wake-up takes less than a sleep.
         if waking and waking.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             rest_ns = self._rest_ns
         crowd_ns = rest_ns * 3 // 4
