@@ -167,9 +167,7 @@ class Draft:
                 self.partial.mkdir()
 
     def publish(self) -> None:
-        """
-        Give the complete output its final name; OutputError if another process took the name.
-        """
+        """Give the complete output its final name; OutputError if another file has this name."""
         with _output_errors(self._path):
             if self.partial.is_dir():
                 _sync(self.partial)
@@ -216,9 +214,7 @@ class Draft:
 
 @contextmanager
 def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """
-    Yield a temporary path; the file or folder there becomes the output if no exception occurs.
-    """
+    """Yield a temporary path; its file or folder becomes the output if no exception occurs."""
     draft = Draft(path, kind, overwrite=overwrite)
     try:
         with _output_errors(path):

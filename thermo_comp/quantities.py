@@ -81,7 +81,7 @@ _PREPARED: dict[str, Bounds] = {
     'cycle time': _positive(1e-7, 1e5, 's', 'from 10 MHz to one sample a day'),
     'gravity': Bounds(above=9.0, below=10.5, unit='m/s^2', why='on Earth 9.76 to 9.84'),
     'angular rate': _between(-1e3, 1e3, 'rad/s', '1000 rad/s are 57000 deg/s'),
-    # Temperatures.
+    # Bounds of temperatures, rates and times.
     'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='from 0 K to red heat'),
     'temperature difference': _between(-1273.15, 1273.15, 'K', 'of two valid temperatures'),
     'temperature span': _positive(1e-2, 1273.15, 'K', 'a smaller span is thermometer noise'),

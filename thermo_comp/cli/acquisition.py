@@ -23,15 +23,14 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Minimum length of a cell (samples averaged together) [s]; number of samples needed to choose the
-# length.
+# Minimum length of a cell of averaged samples [s]; number of samples that decide the length.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
 # Sd of the mean force in a position due to hysteresis, mounting and drift, at any rest length [g].
 _FLOOR_SD = 2e-5
 # First: a position with more than this multiple of the positions' median noise is 'restless'.
-# Second: limit of the noise, as a multiple of that of the rests, of a further still interval.
+# Second: a still interval after the last rest is a rest below this multiple of the rests' noise.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -60,7 +59,6 @@ class Position:
 class Account:
     """
     State of a test, and the missing data.
-
     The last of `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in the
     attitude with the largest sd, `constants_sd` the sd of bias [g], relative scale and M [rad].
     `next_up` is the direction recommended for the next position, at an angle of `next_deg` to
@@ -108,7 +106,7 @@ class Acquisition:
     def _start(self) -> None:
         """Restart the search for rests; the stamps of the next samples may be of another clock."""
         self._accumulator = CellAccumulator(_CELL_S, None)
-        # The first samples, until `_SAMPLES_TO_BEGIN` samples have arrived; then None.
+        # Stamps and samples before `_SAMPLES_TO_BEGIN` samples have arrived; then None.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
         #: Earliest stamp at which the next position can begin [ns].
@@ -127,7 +125,6 @@ class Acquisition:
         begins: list[int] = []
         stamp_ns, samples = block.accel_stamp_ns, block.accel - self._offset
         if self._newest_ns - int(stamp_ns[0]) > _STEP_BACK_NS:
-            # The stamps step back by more than a second: the driver has restarted.
             self.begin()
             begins.append(int(stamp_ns[0]))
         self._newest_ns = int(stamp_ns[-1])
@@ -156,14 +153,12 @@ class Acquisition:
         self._start()
 
     def _cells(self) -> Cells:
-        """Return the cells of the present position."""
         cells = self._accumulator.cells()
         begin_s = (self._begin_ns - cells.start_ns) * 1e-9
         return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 
     def _next_position_ns(self, cells: Cells) -> int | None:
         """Return the stamp at which a rest in another direction begins [ns], or None."""
-        # Search only the new cells and the last `_LOOKED_BACK` earlier cells.
         n_looked, self._n_looked = self._n_looked, len(cells.count)
         cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
@@ -318,7 +313,6 @@ def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
 
 
 def _combined_surveys(surveys: Sequence[Surveys]) -> Surveys:
-    """Combine the surveys of each thermometer over several positions."""
     by_name: dict[str, list[ThermometerSurvey]] = {}
     for name, survey in (item for position in surveys for item in position.items()):
         by_name.setdefault(name, []).append(survey)

@@ -73,7 +73,7 @@ app.add_typer(_fleet)
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and end the process with the command's exit code."""
     hold_standard_streams()
-    # Use one BLAS thread: with several, small matrices take 16 times as long on busy cores.
+    # Use one BLAS thread: several threads make small matrices 16 times slower on busy cores.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))

@@ -179,7 +179,7 @@ def replay(
         '-o',
     ),
     keep_inputs: bool = option('Also copy the input messages.', False, '--keep-inputs'),
-    all_topics: bool = option('Also copy all other topics.', False, '--all-topics'),
+    all_topics: bool = option('Also copy inputs and all further topics.', False, '--all-topics'),
     serial: str | None = options.SERIAL,
     frame_id: str = option('frame_id of the output messages; default: that of the input.', ''),
     transition_time: float = option(

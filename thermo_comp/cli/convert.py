@@ -105,7 +105,6 @@ def convert(
 
 
 def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> None:
-    """Print the numbers of messages written, the findings, and the times of movement."""
     from ..convert.log import SLOW_HZ
 
     log = report.log

@@ -62,8 +62,8 @@ def fit(
         'from the bags.'
     ),
     ageing_scale: float = option(
-        'Assumed scale change (1 sd) since the prior calibration, in ppm; estimated from the '
-        'bags if it is 0 and --ageing-bias is not given.',
+        'Assumed scale change (1 sd) since the prior calibration, in ppm; if neither this option '
+        'nor --ageing-bias is given, the changes are estimated from the bags.',
         0.0,
         metavar='PPM',
         min=0.0,
@@ -373,7 +373,6 @@ def _wrapped(name: str) -> list[str]:
 
 
 def _model(trial: 'Trial') -> dict[str, Any]:
-    """Return the groups of a compared model, and its error on data left out [m/s^2]."""
     names = ('positions', 'sections', 'norms')
     left_out = {name: folds.rms for name, folds in zip(names, trial.score.kinds, strict=True)}
     return {'groups': trial.groups, 'is_chosen': trial.is_chosen, 'left_out_rms_m_s2': left_out}

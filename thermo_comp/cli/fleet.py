@@ -96,7 +96,6 @@ def fleet_fit(
 
 
 def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
-    """Print the tests, their problems, the units that stand out, and the files."""
     summary = result.summary
     out.table(
         ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),

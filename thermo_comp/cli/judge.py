@@ -136,7 +136,6 @@ def _print_levels(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
-    """Print the changes of the constants from each calibration to the next."""
     if drifts:
         out.table(
             ('from', 'to', 'constant', 'change', '+-', 'unit', 'significant'),
@@ -187,7 +186,7 @@ def report(
     output: Path = option('Page to write (HTML).', ..., '--output', '-o'),
     bags: list[Path] | None = options.JUDGED_BAGS,
     calibration: list[Path] | None = option(
-        'Calibration of the unit (YAML); several give its history.', None, '--calibration', '-c'
+        'Calibration of the unit (YAML); several show the changes.', None, '--calibration', '-c'
     ),
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,

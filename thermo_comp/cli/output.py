@@ -4,8 +4,8 @@
 Owns the output of the command line: tables, JSON, progress, and errors of a line each.
 
 Results go to stdout, all texts about the run (progress, notes, errors) to stderr, so that a pipe
-carries results only. `_print` escapes control characters and line breaks in all output, because
-serials, topics, metadata and file names may contain them, and what the terminal cannot encode.
+carries results only. Serials, topics, metadata and file names may contain control characters and
+line breaks: `_print` escapes these, and characters that the terminal cannot encode.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _shown(text: str, file: TextIO) -> str:
 
 
 def text(cell: Cell) -> str:
-    """Return a cell as text: floats with four digits (all from 1000), None and NaN as a dash."""
+    """Return a cell as text: floats with 4 digits, or as integers from 1000; None, NaN as dash."""
     if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
         return '-'
     if isinstance(cell, float):

@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks as they arrive; yield the test's state in each pause between blocks."""
+    """Write blocks until the test is complete; yield its state in each pause between blocks."""
     chosen: str | None = None
     for new in news:
         if new is not None:
@@ -149,7 +149,6 @@ def _end(
     offset: float | None,
     is_stopped: bool,
 ) -> None:
-    """Print the result of the test, and the command that fits a calibration to its bags."""
     rested = [position for position in account.positions if position.n_rests]
     out.table(_COLUMNS, _rows(rested))
     for line in _lines(account):
@@ -175,7 +174,6 @@ def _end(
 
 
 def _print_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
-    """Report unfinished bags in a folder, or finish them."""
     from ..recording import growing
 
     for path, number in growing.leftovers(folder).items():

@@ -144,7 +144,7 @@ def simulate(
 def _metadata(
     unit: 'UnitModel', station: 'Position', truth: dict[str, Any], gravity: float, is_known: bool
 ) -> dict[str, str]:
-    """Return a bag's metadata: serial, true parameters, and on a rotation the source of |f|."""
+    """Return a bag's metadata: serial, true parameters, for a rotating unit the source of |f|."""
     from .. import __version__
     from ..fitting import known_force
 

@@ -45,7 +45,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while thermal drift is corrected, its values by time, user advice."""
+    """A parameter that is 1 while thermal drift is corrected, its values by time, and advice."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -252,7 +252,6 @@ def _dataflash(path: Path) -> _Held:
                     title = label.decode('ascii', 'replace')
                     changes.setdefault(title, []).append((int(at) * 1000, float(value)))
                 continue
-            # In old logs the first IMU has the type IMU, the second IMU has the type IMU2.
             old = int(name[-1]) - 1 if name[-1].isdigit() else 0
             table |= {'timestamp': stamp_us, 'I': table.get('I', np.full(len(stamp_us), old))}
             for number in np.unique(table['I'][: len(stamp_us)]).tolist():

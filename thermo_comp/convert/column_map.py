@@ -35,7 +35,7 @@ _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
 #: A turn by over `_TURN` rad within two blocks of `_BLOCK` samples, between still blocks (sd below
-#: `_QUIET` g), excludes times in ms; intervals of up to `_SLOW_S` s are then plausible.
+#: `_QUIET` g), is too fast for times in ms; intervals of up to `_SLOW_S` s are then plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up
@@ -58,7 +58,6 @@ _GIVE_MAP = f'give {_A_MAP}'
 class Accel:
     """
     The accelerometer's three columns; `output` is the message written, counts or Imu (m/s^2).
-
     `clip`: lowest and highest reading, at which the sensor is saturated, in the table's unit;
     `offset`: reading at zero force, which is subtracted, such as 32768 in offset binary.
     """
@@ -368,7 +367,6 @@ def _stamp(
 
 
 def _no_time(column: Column | None, steps: Floats) -> str:
-    """Describe the fault of a column of times."""
     if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
         shown = f'{(steps == 0.0).mean():.0%}'
         return (

@@ -44,7 +44,6 @@ def export_calibration(
     """
     Write the constants and the static curves in the format of one of `TOOLS`: return `text`, and
     `notes` on the parts of the calibration that are lost.
-
     `number` is the number of the parameter set or IMU, if the file numbers them; PX4 matches the
     sensor by `device_id`. With `up`, the attitude as a unit vector, the error of scale times
     gravity is added to the offset of an autopilot.
@@ -117,7 +116,7 @@ def _thermal(
 ) -> Content:
     """Return each axis' offset over temperature as a cubic, for an autopilot."""
     d, notes = curves.temperature - reference_c, []
-    # The driver divides counts by K before the tool's correction; it leaves m/s^2 unchanged.
+    # Before the tool's correction the driver divides counts by K, but does not change m/s^2.
     gain = curves.K if calibration.unit.input == 'm/s^2' else np.ones(3)
     loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
     offset = (curves.level / curves.K)[:, None] + curves.bias + loads[:, None] * curves.scale

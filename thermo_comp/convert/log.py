@@ -81,7 +81,7 @@ class ForeignLog:
 
 @dataclass(frozen=True)
 class Stillness:
-    """Rests and movements of a log; `magnitude` and `noise` in its unit, NaN for few samples."""
+    """Rests and movements of a log; `magnitude`, `noise`: in the log's unit, NaN if unknown."""
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells
@@ -223,7 +223,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock [ns].
-    For readings of a thermometer, give the `shifts` of the samples, so that the readings get them.
+    For readings of a thermometer, give the samples' `shifts`, so that both get the same shifts.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():

@@ -318,7 +318,6 @@ def read_parquet(
 ) -> Table:
     """
     Read columns of a Parquet file as `read_text` does; timestamps of Parquet state their unit.
-
     If `columns` is None all columns are read, and columns without numbers become NaN.
     """
     pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file', path)

@@ -38,7 +38,7 @@ _MOST_JUMPS = 100
 # A thermometer uses another clock than the accelerometer if at least this number of its readings
 # has a median distance from the stamps of the samples around them above the second number [s].
 _FEWEST_READINGS, _APART_S = 10, 10.0
-#: Time after which `Readings.thinned` keeps an unchanged reading, because the sensor works [ns].
+#: Time between two equal readings that `Readings.thinned` keeps [ns].
 _REPEAT_NS = 10_000_000_000
 #: Duration of a recording above which the mean interval between messages is limited, and the
 #: largest mean interval [ns].
@@ -137,7 +137,7 @@ class Readings(NamedTuple):
         return Readings(self.stamp_ns[which], self.celsius[which])
 
     def thinned(self) -> Readings:
-        """Keep finite readings that differ from the last kept reading, and one every 10 s."""
+        """Keep finite readings that differ from the last kept one, and a reading every 10 s."""
         # A table repeats a reading in each row up to the next reading, as a stuck sensor does.
         kept: list[int] = []
         last_ns, last = 0, math.nan
@@ -307,8 +307,8 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
     A clock that is set during a recording leaves a gap of years, too long for a grid over time. A
-    gap of an hour suffices: after it the thermal state is unknown. RecordingError for stamps with
-    more than `_MOST_JUMPS` jumps, or for messages more sparse than `_SPARSEST_NS`.
+    gap of an hour suffices: after it the thermal state is unknown. RecordingError for more than
+    `_MOST_JUMPS` jumps, or, above `_SPARSE_NS`, messages at mean intervals over `_SPARSEST_NS`.
     """
     last_ns: int | None = None
     offset = 0

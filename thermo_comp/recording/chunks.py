@@ -43,7 +43,7 @@ MESSAGE = int(Opcode.MESSAGE)
 _ENDS_EARLY = 'a record ends too early'
 _ZERO_OPCODE = 'a record has the opcode 0'
 MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
-#: A file may expand to `_MAX_GROWTH` times its size plus `_FREE_GROWTH_BYTES` [bytes].
+#: A compressed file may expand to `_MAX_GROWTH` times its size plus `_FREE_GROWTH_BYTES` [bytes].
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
@@ -158,7 +158,7 @@ def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
 
 
 def _indexed(data: Bytes, index: memoryview) -> Messages | None:
-    """Find messages by a chunk's message index; None if they do not fill the chunk exactly."""
+    """Find messages by a chunk's index; None if the messages do not fill the chunk exactly."""
     columns: list[Ints] = []
     begin = 0
     while begin + _INDEX_HEAD.size <= len(index):

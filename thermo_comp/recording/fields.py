@@ -45,7 +45,7 @@ def typestore() -> Any:
 
 
 def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitions:
-    """Return the definition of `kind` from the bag, or else ROS 2 Jazzy, and those of Jazzy."""
+    """Return the message types of ROS 2 Jazzy; a definition of `kind` in the bag comes first."""
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
     defined: dict[str, Any] = {}

@@ -25,7 +25,7 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # content of a chunk, lost if the process is killed: 17 s of 100 Hz counts
+_CHUNK_BYTES = 1 << 17  # size of a chunk, 17 s of counts at 100 Hz; a killed process loses one
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.

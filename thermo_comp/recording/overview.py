@@ -99,7 +99,7 @@ def thermal_findings(
 
 
 def unused_thermometers(reader: RecordingReader) -> list[str]:
-    """List unused topics that may hold a temperature: of a barometer, the air, another IMU."""
+    """List unused topics that may hold a temperature, as of a barometer or another IMU."""
     candidates = []
     paths = {role: field.path for role, field in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}

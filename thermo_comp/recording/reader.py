@@ -54,7 +54,6 @@ _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
-
     The roles in `require` must be in the bag. `info` describes the bag; after all blocks are read,
     `info.truncated` names the missing messages. `topics` are the bag's topics by role, `fields`
     the fields that hold the reading of a thermometer, by role, `definitions` encoding and text by

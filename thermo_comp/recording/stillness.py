@@ -267,7 +267,6 @@ def _part_of(window_s: float, least: float) -> float:
 def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
     """
     Return the quantum of each axis from the changes between samples; 0 without a quantum.
-
     `few`: the changes of earlier samples of each axis, as long as these are fewer than three.
     """
     result = np.zeros(3)

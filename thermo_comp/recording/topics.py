@@ -291,7 +291,7 @@ def _text_of_corrected(name: str) -> str:
 
 
 def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
-    """Ask whether an unused temperature topic is the board's; '' without such topics."""
+    """Return advice on unused temperature topics, one of which may be the board's, or ''."""
     names = [
         shown(name)
         for name, (kind, count) in present.items()

@@ -31,7 +31,7 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # readings are used without a sample after this time [s]; Fast DDS may be 3 s late
+IDLE_S = 5.0  # time without samples until readings are used [s]; Fast DDS may deliver 3 s late
 #: Readings stamped later than the samples by more than this time use another clock [s].
 AHEAD_S = 5.0
 #: The samples have stopped if the next sample is late by more than both times [cycles], [s].
@@ -157,7 +157,6 @@ class Reporter:
             self._relay.traffic.n_lost += n_lost
 
     def _inputs(self) -> Iterator[Finding]:
-        """Yield the problems with publishers of inputs."""
         for name, source in self._relay.inputs.items():
             n_publishers, topic = source.count_publishers(), source.subscription.topic_name
             if n_publishers > 1 and source.sources.is_contested:
@@ -171,7 +170,6 @@ class Reporter:
                 yield level, f'no messages of a publisher on {topic}: {mismatch}'
 
     def _lost_rests(self) -> Iterator[Finding]:
-        """Yield a warning with the reason if rests could not be written to the rest log."""
         rests = self._relay.rests
         if rests is not None and rests.log.reason:
             lost = counted(rests.log.n_lost, 'rest')

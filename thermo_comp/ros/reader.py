@@ -28,7 +28,7 @@ from ..online.trial import tried
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 
-#: Time limit for reading a file [s]: a file that takes longer hangs, as on a lost network drive.
+#: Time limit for reading a file [s]; above it the file hangs, as on a lost network drive.
 LIMIT_S = 10.0
 _ENDING_S = 0.5  # time to wait for a killed process [s]
 _PR_SET_PDEATHSIG = 1  # option of Linux prctl: the signal sent when the parent ends

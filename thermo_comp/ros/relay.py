@@ -4,7 +4,8 @@
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
 Messages do not identify their publisher. While several publishers may send on a topic, its
-messages are dropped, as is the first batch after a publisher has left, which may be from it.
+messages are dropped. The first batch after a publisher has left is dropped, too, because messages
+of this publisher may be in it.
 """
 
 from bisect import bisect_left, bisect_right
@@ -196,7 +197,6 @@ class Relay:
         compensator = self.running.compensator
         last_ns = compensator.now_ns
         if last_ns is not None:
-            # Use readings stamped at most `silence_ns` after the last sample.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:

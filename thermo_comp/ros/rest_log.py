@@ -30,7 +30,7 @@ from .reader import LoadedCalibration
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
-#: Size up to which the file of a day is not thinned to bound the size of the folder [bytes].
+#: Smallest size of the files that are thinned if the folder is too large [bytes].
 _UNTHINNED_BYTES = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000

@@ -34,7 +34,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from ..errors import ThermoCompError
 from ..text import one_line
 
-#: Polling period of services and other subscriptions while samples flow [ns].
+#: Polling period of services and other subscriptions while samples arrive [ns].
 OTHERS_PERIOD_NS = 20_000_000
 #: Largest number of messages taken at a time, so that a flood does not block the rest of the node.
 DRAIN_LIMIT = 4096
@@ -161,7 +161,7 @@ class WaitLoop:
         self._rest_ns = int(rest_s * 1e9)
         self._guard = node.create_guard_condition(lambda: None)
         self._raw: list[RawSubscription] = []
-        #: Handlers of services that may answer later than their callback returns.
+        #: Handlers of services; a handler may return before the answer is sent.
         self.handlers: dict[Service, Serve] = {}
         self._soon: deque[Callable[[], None]] = deque()
         self.n_failures = 0  # callbacks that ended in an exception
@@ -176,8 +176,7 @@ class WaitLoop:
     ) -> RawSubscription:
         """
         Subscribe to a topic; its messages stay serialized.
-
-        While samples flow, only messages of the first subscription with `wakes` end a wait.
+        While samples arrive, only messages of the first subscription with `wakes` end a wait.
         """
         # rclpy needs a callback for each subscription, but without an executor never calls it.
         create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)
@@ -203,7 +202,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call a function every `period_s`, replacing an earlier call; cheaper than a timer."""
+        """Call a function every `period_s`, instead of that of an earlier call; needs no timer."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback
