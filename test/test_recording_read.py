@@ -264,7 +264,7 @@ def test_a_folder_of_bags_is_no_bag(tmp_path):
     # WHY: bags of different positions were once read as the files of one truncated bag.
     for name in ('01.mcap', '02.mcap'):
         (tmp_path / name).write_bytes(b'')
-    with pytest.raises(RecordingError, match=r'folder of several bags: give its 2 \*\.mcap'):
+    with pytest.raises(RecordingError, match=r'folder of several bags: name its 2 \*\.mcap'):
         read(tmp_path)
 
 

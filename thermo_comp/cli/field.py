@@ -27,7 +27,7 @@ def update(
     ahead: float = option(
         'Days of ageing after the last rest in the claimed sd.', 1.0, min=0.0, max=3650.0
     ),
-    allow: list[str] | None = option('Name of a conclusion to override, stated in its message.'),
+    allow: list[str] | None = option('Conclusion of the update to override: gravity or unit.'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -67,7 +67,7 @@ def update(
         save_calibration(result.calibration, output, overwrite=force)
         out.line(f'{output}: written')
     else:
-        out.line(f'the update gains nothing: {output} is not written, keep {calibration}')
+        out.line(f'the update is no improvement: {output} is not written, keep {calibration}')
         sds = [
             f'{row.axis} {micro_g(row.present_sd)} ug ({micro_g(row.claimed_sd)} ug in the file)'
             for row in result.axis_changes
@@ -99,7 +99,7 @@ def _show_axis_changes(result: 'Update', out: Output) -> None:
             for axis in result.axis_changes
         ],
         title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
-        'starts (at rest: bias plus scale at the mean force of the rests; sds: at rest / +-)',
+        'starts of the node (at rest: bias plus scale at the mean force; sds: at rest / +-)',
     )
 
 

@@ -146,7 +146,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
                 )
                 for diff in drifts
             ],
-            title='drift between the calibrations, in a soak at the reference temperature',
+            title='changes of the constants, in a soak at the reference temperature',
         )
 
 
@@ -156,8 +156,8 @@ def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
         _sections(judgements, micro_g),
-        title=f'|f| - g over {window_s:g} s at rest; outside: beyond the calibrated ranges of '
-        'temperature and rate',
+        title=f'|f| - g over {window_s:g} s at rest; outside: beyond the calibrated '
+        'temperatures or rates',
     )
 
 

@@ -341,6 +341,6 @@ def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> 
     if stated != 'counts':
         return None if inferred == stated else f'{reason}: that looks like {inferred}'
     if counts_per_g is not None and abs(magnitude / counts_per_g - 1.0) > _TOLERANCE:
-        text = f'|a| at rest is {magnitude:.4g} counts, {counts_per_g:g} per g are stated'
+        text = f'|a| at rest is {magnitude:.4g} counts, but {counts_per_g:g} counts/g are stated'
         return f'{text}: is there an `offset`?' if magnitude > 2.0 * counts_per_g else text
     return f'{reason}: that looks like {inferred}' if magnitude < 50.0 else None

@@ -282,7 +282,7 @@ def _restamp(messages: Messages, stamp_ns: Ints) -> None:
 
 def unstamped(stamp_ns: int) -> str:
     """Return the message for samples that all have the same stamp."""
-    return f'all its samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
+    return f'all samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
 
 
 def clocks_apart(block: Block) -> str:

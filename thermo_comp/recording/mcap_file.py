@@ -131,7 +131,7 @@ class McapFile(BagFile):
         if summary == 0:
             return at
         if not begin <= summary <= at:
-            raise DamagedError(f'the footer puts the summary at byte {summary}')
+            raise DamagedError(f'the summary cannot be at byte {summary}, as the footer states')
         if at - summary <= _MAX_SUMMARY_BYTES:
             self._read_summary(self._read_at(summary, self._size - summary))
         return summary
@@ -197,7 +197,7 @@ class McapFile(BagFile):
             is_next = at == last.position + last.length + last.index_length
             if len(head) < PREFIX.size or at + step > stop or opcode == 0:
                 if end is not None:
-                    raise DamagedError(f'the record at byte {at} is not whole')
+                    raise DamagedError(f'the record at byte {at} is not complete')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
                     # Let the span contain zeros, so that `scan_records` drops its last message.
@@ -220,7 +220,8 @@ class McapFile(BagFile):
             elif opcode in _KINDS and length <= _MAX_SMALL_RECORD:
                 self._on_record(opcode, self._read_at(at + PREFIX.size, length))
             elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                raise DamagedError(f'the record at byte {at} has {length} bytes')
+                limit = f'limit {_MAX_SMALL_RECORD} bytes'
+                raise DamagedError(f'the record at byte {at} has {length} bytes, {limit}')
             elif opcode in {Opcode.DATA_END, Opcode.FOOTER}:
                 words = 'its summary is missing, but all messages are there'
                 break

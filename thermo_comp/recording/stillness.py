@@ -361,11 +361,11 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     if full.any() and not (full & under).any():
         least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
-            f'its samples scatter by at least {1e3 * least:.3g} mg (sd), the limit at rest is '
+            f'the samples scatter by at least {1e3 * least:.3g} mg (sd), the limit at rest is '
             f'{1e3 * still_sd:.3g} mg (--still-sd): was the unit worn, driven or shaken?'
         )
     if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():
-        return 'its angular rate mostly varies more than at rest (is the rate in rad/s?)'
+        return 'the angular rate mostly varies more than at rest (is the rate in rad/s?)'
     edges = np.diff(np.r_[0, (full & under).astype(np.int8), 0])
     runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
     longest_s = float(np.max(runs, initial=0)) * cells.cell_s

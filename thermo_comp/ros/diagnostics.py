@@ -167,7 +167,7 @@ class Reporter:
                 yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
             elif not n_publishers and (mismatch := _mismatch(self._node, source.subscription)):
                 level = _ERROR if name in ('sample', 'board') else _WARN
-                yield level, f'no messages of a publisher on {topic}: {mismatch}'
+                yield level, f'messages of a publisher on {topic} are not received: {mismatch}'
 
     def _lost_rests(self) -> Iterator[Finding]:
         rests = self._relay.rests
