@@ -298,7 +298,7 @@ def fitting(
         'Temperature at which the constants are stated, in degC.', 20.0, metavar='DEGC'
     ),
     min_rest_s: float | None = option(
-        'Shortest rest that the fit uses, in s; default: 3, or less if this gives more data.',
+        'Shortest rest used, in s; default: 3, or less if shorter rests give more information.',
         None,
         '--min-rest',
         metavar='S',

@@ -38,14 +38,14 @@ _STEPS_S = (5e-5, 0.5)
 #: `_QUIET` g), is too fast for times in ms; intervals of up to `_SLOW_S` s are then plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
-#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up
-#: may be in this range, but its steps are larger than this interval.
+#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up,
+#: taken as seconds, may be in this range, but its steps are larger than this interval.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.
 _FASTEST_K_S = 0.5
 # Largest share of rows in which a temperature in whole degrees changes. The numbers of boards or
-# sensors in a column alternate from row to row, so they change in a larger share of the rows.
+# sensors in a column alternate from row to row, so these numbers change in more of the rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than the row before; the rest may repeat
 #: A step from the uppermost to the lowest tenth of a counter's range is an overflow.

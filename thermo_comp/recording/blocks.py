@@ -32,7 +32,7 @@ BLOCK_MESSAGES = 1 << 15
 #: Stands for the stamp of a message without a stamp: the earliest stamp that a header can hold.
 NO_STAMP_NS = -(2**31) * 10**9
 _JUMP_NS = 10**9  # a larger backward step of the stamps is a jump of time [ns]
-LONGEST_PAUSE_NS = 3600 * 10**9  # a longer jump of the stamps is shortened to this [ns]
+LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
 #: Largest number of jumps in a recording with a valid clock.
 _MOST_JUMPS = 100
 # A thermometer uses another clock than the accelerometer if at least this number of its readings

@@ -47,7 +47,7 @@ MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
-_STEP_BYTES = 1 << 16  # size of a decompressed piece; a damage loses one piece before it [bytes]
+_STEP_BYTES = 1 << 16  # size of a decompressed piece; at most one piece before a damage is lost
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,

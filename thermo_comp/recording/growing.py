@@ -4,9 +4,9 @@
 Owns live recording: new messages of a bag that another program writes, and numbered bags.
 
 Each pass reads the growing bag from its beginning; the pause after a pass is at least five times
-as long. New messages are written with the node's topic names to numbered bags, from `01.mcap` on.
-The end of a position is recognised with a delay, so the newest messages are held in memory until
-the position that they belong to is known.
+as long as the pass. New messages are written with the node's topic names to numbered bags, from
+`01.mcap` on. The end of a position is recognised with a delay, so the newest messages are held in
+memory until their position is known.
 """
 
 import re
@@ -25,7 +25,7 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # size of a chunk, 17 s of counts at 100 Hz; a killed process loses one
+_CHUNK_BYTES = 1 << 17  # size of a chunk, 17 s of counts at 100 Hz; a killed process loses a chunk
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.

@@ -34,7 +34,7 @@ from .waitloop import WaitLoop
 IDLE_S = 5.0  # time without samples until readings are used [s]; Fast DDS may deliver 3 s late
 #: Readings stamped later than the samples by more than this time use another clock [s].
 AHEAD_S = 5.0
-#: The samples have stopped if the next sample is late by more than both times [cycles], [s].
+#: Samples have stopped if the next sample is late by the larger of two times [cycles], [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0

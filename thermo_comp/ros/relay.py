@@ -4,8 +4,7 @@
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
 Messages do not identify their publisher. While several publishers may send on a topic, its
-messages are dropped. The first batch after a publisher has left is dropped, too, because messages
-of this publisher may be in it.
+messages are dropped, and also the first batch after a publisher has left, which may be from it.
 """
 
 from bisect import bisect_left, bisect_right
