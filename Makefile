@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 #
-# make demo   sets up .venv, plays the sample bag over DDS into the node, prints the table
+# make demo   sets up .venv, plays a sample bag over DDS into the node, prints the remaining drift
 # make test   sets up .venv, runs the test suite
-# make slow   the tests that `make test` leaves out: further units, long statistics (four minutes)
-# make lint   ruff, mypy --strict and the layering test
-# make nightly  `make slow`, and the properties of test_properties.py with ten thousand examples
-# make oldest  the suite with the oldest versions that setup.py allows, in .venv-oldest
-# make fuzz   the fuzz targets, FUZZ_SECONDS (60) each
+# make slow   runs the tests that `make test` leaves out: further units, long statistics (4 min)
+# make lint   runs ruff, mypy --strict and the layering test
+# make nightly  runs `make slow`, and test_properties.py with 10000 examples for each property
+# make oldest  runs the tests with the oldest libraries that setup.py allows, in .venv-oldest
+# make fuzz   runs each fuzz target for FUZZ_SECONDS (default: 60)
 # make bench  installs the package in .venv-bench and measures its speed (half an hour)
 # make docs   builds the documentation as a site, in site/
 # make clean  removes .venv, .venv-bench, .venv-oldest and all generated files
@@ -18,7 +18,7 @@ JOBS ?= 3
 FUZZ_SECONDS ?= 60
 PYTEST_ARGS ?=
 
-# The newest interpreter for which there are ROS wheels, unless PYTHON is 3.10 or newer.
+# Interpreters in the order of preference: PYTHON, then the newest interpreter with ROS wheels.
 CANDIDATES := $(PYTHON) python3.12 python3.11 python3.10 python3.13
 BIN := $(VENV)/bin
 
@@ -38,7 +38,7 @@ help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
 demo: $(VENV)/.installed
-	@echo "thermo_comp: fitting nine sample bags three ways, playing a tenth through the node: a minute"
+	@echo "thermo_comp: fits nine sample bags with three models, plays a tenth through the node (1 min)"
 	$(BIN)/python benchmarks/demo.py --out out
 
 test: $(VENV)/.installed-test
@@ -56,7 +56,7 @@ lint: $(VENV)/.installed-dev
 nightly: slow
 	$(BIN)/python -m pytest --hypothesis-profile=nightly -n $(JOBS) test/test_properties.py
 
-# Tests with the first release of the oldest series of each library that setup.py allows.
+# Tests with the oldest series of each library that setup.py allows, such as numpy 1.26.*.
 oldest:
 	grep -oE "'[A-Za-z0-9-]+(\[[a-z]+\])?>=[0-9.]+" setup.py \
 	  | sed -E "s/'([A-Za-z0-9-]+)(\[[a-z]+\])?>=([0-9.]+)/\1==\3.*/" | sort -u > oldest.txt
@@ -65,7 +65,7 @@ oldest:
 fuzz: $(VENV)/.installed-fuzz
 	$(BIN)/python fuzz/run.py all --seconds $(FUZZ_SECONDS)
 
-# The package is not installed in place: the figures are those of an installation by a user.
+# The package is not installed in place, so the figures are those of a user's installation.
 bench: | $(BIN)/python
 	$(BIN)/python -m venv $(VENV)-bench
 	$(VENV)-bench/bin/python -m pip install -qq --disable-pip-version-check '.[ros,test]'

@@ -11,7 +11,7 @@ VERSION = re.search(
     r"^__version__ = '([^']+)'$", (ROOT / NAME / '__init__.py').read_text(), re.MULTILINE
 ).group(1)
 
-# Libraries of the commands; the node only needs numpy and yaml, which package.xml names.
+# Libraries of the commands; the node needs only numpy and yaml, which package.xml names.
 INSTALL = [
     'numpy>=1.26',
     'PyYAML>=6.0',
@@ -40,7 +40,7 @@ EXTRAS = {
 
 
 def shared(folder, *patterns):
-    """Pair a folder of the source with its place under share/."""
+    """Return a folder under share/ and the files to install there from the source folder."""
     files = sorted(
         str(path.relative_to(ROOT))
         for pattern in patterns

@@ -167,7 +167,7 @@ def test_empty_arrays_give_empty_arrays():
         ({'board': ([0.0, 1.0], [20.0])}, r'`board` must have as many values as times, 2'),
         ({'board': ([1.0, 0.0], [20.0, 20.0])}, r'`board time_s` must rise, got 1.0 at index 0'),
         ({'board': (np.array(['2026-01-01'], 'M8[ns]'), [20.0])}, 'be seconds or datetime64, as'),
-        ({'lid': [20.0] * 3}, r'`lid` is not a thermometer of the calibration: it has board'),
+        ({'lid': [20.0] * 3}, r'`lid` is not a thermometer of the calibration, which has board'),
     ],
 )
 def test_wrong_arguments_are_named(change, text):

@@ -95,7 +95,7 @@ def test_counts_become_an_imu_with_a_sensitivity(tmp_path):
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
     # A stated sensitivity is compared with |a| at rest, as a stated unit is.
     wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
-    with pytest.raises(RecordingError, match=r'16384 per g are stated$'):
+    with pytest.raises(RecordingError, match=r'16384 counts/g are stated$'):
         write_log(wrong, tmp_path / 'other')
     assert not (tmp_path / 'other').exists()
 

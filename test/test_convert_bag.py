@@ -80,7 +80,7 @@ def test_topics_of_any_name_become_the_usual_topics(tmp_path, rng, ros):
 
 def test_the_stated_unit_is_checked_at_rest(tmp_path, rng):
     path = write_bag(tmp_path / 'g', rng, scale=1.0)
-    with pytest.raises(RecordingError, match=r'stated in m/s\^2, but .* looks like g'):
+    with pytest.raises(RecordingError, match=r'is m/s\^2, but .* looks like g'):
         write_log(bag_log(path), tmp_path / 'bag.mcap')
     write_log(bag_log(path, unit='g'), tmp_path / 'bag.mcap')
     force = read_recording(tmp_path / 'bag.mcap').columns.accel

@@ -296,9 +296,9 @@ def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermom
             for k, (x, y, z) in enumerate(accel)]  # fmt: skip
     (tmp_path / 'log.csv').write_text('\n'.join([f'time (s),ax,ay,az,{headings}', *rows]))
     printed = cli('convert', tmp_path / 'log.csv', '-o', tmp_path / 'bag').stdout
-    assert f'log.csv: not used: {not_used}\n' in printed
+    assert f'log.csv: columns not used: {not_used}\n' in printed
     head, *lines = printed.splitlines()
-    assert 'guessed column map; if it is wrong, edit it and give it as --columns' in head
+    assert 'guessed column map; if the map is wrong, edit it for --columns' in head
     own = yaml.safe_load('\n'.join(takewhile(lambda line: line.startswith('  '), lines)))
     assert own['stamp'] == {'column': 'time (s)', 'unit': 's'}
     assert own['accel'] == {'columns': ['ax', 'ay', 'az'], 'unit': 'g', 'output': 'imu'}
@@ -324,7 +324,7 @@ def test_equal_guessed_column_maps_are_printed_once(tmp_path, rng, cli):
         rows = np.c_[np.arange(4000) / 10.0, level + 0.002 * rng.normal(size=(4000, 3))]
         np.savetxt(table, rows, '%.5f', ',', header=f'{heading},ax,ay,az', comments='')
     printed = cli('fit', *tables, '-o', tmp_path / 'unit.yaml', '--gravity', '9.81').stdout
-    assert f'{tables[1]}: column map of {tables[0]}\n' in printed
+    assert f'{tables[1]}: same column map as {tables[0]}\n' in printed
     assert f'{tables[2]}: guessed column map' in printed
     assert printed.count('stamp: {column: ') == 2
 

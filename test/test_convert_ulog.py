@@ -246,7 +246,7 @@ def test_the_use_of_a_log_of_1_hz_is_reported(tmp_path, rng, cli):
     path = tmp_path / 'slow.ulg'
     path.write_bytes(log.body)
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
-    assert '1 Hz: sufficient for soaks of minutes' in printed
+    assert '1 Hz is sufficient for soaks of minutes' in printed
     assert 'sensor_accel at 10 Hz' in printed
 
 

@@ -29,12 +29,12 @@ def test_a_degenerate_input_ends_with_a_sentence_in_bounded_memory(name, command
 @pytest.mark.parametrize(
     ('name', 'text'),
     [
-        ('zeros in every second row', '50 % of its samples are exactly zero, between others'),
+        ('zeros in every second row', '50 % of the samples are exactly zero, between other'),
         ('no acceleration in the messages', '(linear_acceleration_covariance[0] = -1)'),
         ('gravity subtracted', 'gravity is subtracted (linear or free acceleration)'),
-        ('samples in g', 'its samples are in g, make them m/s^2 with thermo_comp convert'),
-        ('stamps all zero', 'all its samples are stamped 0 s: the driver does not stamp them'),
-        ('worn on a wrist', 'as if worn or driven: the unit must rest in each position'),
+        ('samples in g', 'the samples are in g, convert them to m/s^2'),
+        ('stamps all zero', 'all samples are stamped 0 s: the driver does not stamp them'),
+        ('worn on a wrist', 'as if worn or driven, but must rest in each position'),
         ('a drive in a car', 'worn, driven or shaken?'),
         ('axes not orthogonal', 'the angle between two of the axes is less than 60 degrees'),
     ],

@@ -175,7 +175,7 @@ def test_counts_are_divided_by_the_scale_factor(cubic):
         cubic, unit=Unit('7', 'counts', 32767.0, 0.005), axes=axes, static=regime, dynamic=regime
     )
     ours, expected = export_calibration(counts, 'px4'), export_calibration(cubic, 'px4')
-    assert any('counts divided by K' in note for note in ours.notes)
+    assert any('the driver must divide counts by K' in note for note in ours.notes)
     for name, value in numbers(expected.text, '\t').items():
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
 

@@ -374,7 +374,7 @@ def test_an_update_without_gain_writes_no_file(tmp_path, unit_file, cli):
     assert data['is_better'] is False
     assert all(axis['present_sd'] >= axis['claimed_sd'] > 0.0 for axis in data['moved'][:2])
     printed = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', code=3).stdout
-    assert 'sd of bias plus scale at rest, aged to the last rest: x ' in printed
+    assert 'sd of bias plus scale at the last rest, with ageing: x ' in printed
     assert not (tmp_path / 'new.yaml').exists()
     text = cli('evaluate', log, '-c', unit_file).stdout
     assert 'recalibration interval' in text
@@ -394,7 +394,7 @@ def test_mistakes_of_update_end_in_one_sentence(tmp_path, unit_file, cli):
     ):
         assert text in cli(*arguments, code=1).stderr
     bag = ROOT / 'bags' / 'held_out.mcap'
-    assert 'evaluated alone' in cli('evaluate', log, bag, '-c', unit_file, code=2).stderr
+    assert 'cannot be mixed with bags' in cli('evaluate', log, bag, '-c', unit_file, code=2).stderr
     broken = write_log(tmp_path / 'broken', rests(unit, upright, jump_of(3000.0, 2.0), days=4))
     printed = cli('update', unit_file, broken, *new, code=1).stderr
     assert 'on 2030-01-03 |f| differs from the gravity 9.80665 m/s^2 by 3 mg RMS' in printed

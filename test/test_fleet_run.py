@@ -193,7 +193,7 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
     printed = printed.splitlines()
     # Ctrl-C may arrive before or after the fit of the first unit has begun.
     assert printed in (
-        [f'thermo_comp: interrupted: {state}, kept in out; the same command continues']
+        [f'thermo_comp: interrupted: {state}; the same command continues the run in out']
         for state in ('no test has begun', '0 of 1 test done')
     )
 

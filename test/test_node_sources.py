@@ -200,10 +200,10 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
         unheard = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
         peer.node.create_publisher(Vector3Stamped, 'accel/counts', unheard)
         peer.node.create_publisher(Imu, 'temperature/case', DEEP)
-        status = status_with(peer, heard, 'no messages of a publisher on /accel/counts: ')
+        status = status_with(peer, heard, 'of a publisher on /accel/counts are not received: ')
         assert status.level == DiagnosticStatus.ERROR
         assert 'est effort publisher and reliable subscription' in status.message
-        text = 'no messages of a publisher on /temperature/case: its type is sensor_msgs/msg/Imu'
+        text = 'on /temperature/case are not received: its type is sensor_msgs/msg/Imu'
         status_with(peer, heard, text)
 
 

@@ -71,8 +71,8 @@ def test_one_topic_for_two_thermometers_ends_the_start(unit, capfd):
     words = [word for remap in remaps for word in ('-r', remap)]
     assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
     assert capfd.readouterr().err == (
-        'thermo_comp_node: /imu/temperature: one topic for both board and case: a single '
-        'thermometer is the board, leave the other input out\n'
+        'thermo_comp_node: /imu/temperature: one topic for both board and case: name '
+        'a single thermometer as the board, not as another input\n'
     )
 
 

@@ -196,7 +196,7 @@ def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path)
     assert leftovers(bags) == {left: 1}
     arguments = ('record', session, '--positions', '1', '--soak', '80s', '-o', bags)
     errors = cli(*arguments, code=None).stderr
-    assert f'{left} is bag 1 of a run that crashed; --finish' in errors
+    assert f'{left} is bag 1 of a crashed run; --finish' in errors
     assert left.exists()
     for bag in numbered_bags(bags):
         bag.unlink()

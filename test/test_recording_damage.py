@@ -232,10 +232,10 @@ HUGE = 1 << 60
         (chunk_record(bytes(10), '', (1 << 26) + 1), 'limit 67108864'),
         (struct.pack('<BQ', Opcode.CHUNK, 10) + bytes(10), 'damaged head'),
         (struct.pack('<BQ', Opcode.CHUNK, 40) + bytes(28) + b'\xff' * 12, 'damaged head'),
-        (struct.pack('<BQ', Opcode.CHUNK, HUGE) + bytes(10), 'not whole'),
+        (struct.pack('<BQ', Opcode.CHUNK, HUGE) + bytes(10), 'not complete'),
         (struct.pack('<BQ', Opcode.MESSAGE, 3) + bytes(3), 'message record has 3 bytes'),
         (struct.pack('<BQ', Opcode.SCHEMA, 3) + bytes(3), 'shorter than the lengths in it'),
-        (struct.pack('<BQ', 0, 3) + bytes(3), 'not whole'),
+        (struct.pack('<BQ', 0, 3) + bytes(3), 'not complete'),
     ],
 )  # fmt: skip
 def test_false_lengths_in_a_file_need_little_memory(tmp_path, record, reason):
@@ -275,7 +275,7 @@ def test_a_nonsensical_summary_is_ignored_or_refused(tmp_path):
     for claim in (1, HUGE):
         struct.pack_into('<Q', content, footer + 9, claim)
         path.write_bytes(content)
-        with pytest.raises(RecordingError, match=f'puts the summary at byte {claim}'):
+        with pytest.raises(RecordingError, match=f'the summary cannot be at byte {claim}'):
             read(path)
 
 

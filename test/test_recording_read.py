@@ -264,7 +264,7 @@ def test_a_folder_of_bags_is_no_bag(tmp_path):
     # WHY: bags of different positions were once read as the files of one truncated bag.
     for name in ('01.mcap', '02.mcap'):
         (tmp_path / name).write_bytes(b'')
-    with pytest.raises(RecordingError, match=r'folder of several bags: give its 2 \*\.mcap'):
+    with pytest.raises(RecordingError, match=r'folder of several bags: name its 2 \*\.mcap'):
         read(tmp_path)
 
 
@@ -350,7 +350,8 @@ def test_two_thermometers_of_other_names_are_offered(tmp_path):
     with open_recording(path, require=('accel',)) as reader:
         assert 'board' not in reader.topics
         assert reader.info.chosen == (
-            'no temperature/board: is it /baro/air or /imu/die? name it with --topic board=TOPIC'
+            'no temperature/board: if the board thermometer is /baro/air or /imu/die, give '
+            '--topic board=TOPIC'
         )
     with open_recording(path, Topics(board='/imu/die'), require=('accel',)) as reader:
         assert reader.info.chosen is None

@@ -286,7 +286,7 @@ def test_a_table_holds_what_the_bag_holds(tmp_path, imu):
 
 def test_a_table_holds_no_other_topics(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=1.0)
-    with pytest.raises(OutputError, match='the corrected samples alone'):
+    with pytest.raises(OutputError, match='can only contain the corrected'):
         replay(bag, rich_calibration(), tmp_path / 'out.csv', all_topics=True)
 
 

@@ -89,7 +89,9 @@ def test_samples_after_a_clock_was_set_back_are_counted(tmp_path, back_s, text):
 def test_a_missing_cooling_ramp_is_reported(tmp_path):
     heating = np.interp(np.arange(3600.0), [0, 600, 3000, 3600], [5.0, 5.0, 35.0, 35.0])
     findings = survey(tmp_path / 'bag', heating).findings
-    assert findings == ['no cooling ramp: record one, or cooling is corrected by extrapolation']
+    assert findings == [
+        'no cooling ramp: cooling will be corrected by extrapolation; record a ramp'
+    ]
 
 
 def test_a_quantum_is_no_ramp(tmp_path):

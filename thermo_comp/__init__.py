@@ -35,8 +35,8 @@ Frames
     unit diagonal).
 Time
     Stamps are integers, ``stamp_ns`` [ns]. A time difference in seconds is always computed from
-    an integer difference, so that no result depends on the origin of time, and a sample gives the
-    same bits alone as in an array.
+    an integer difference, so that no result depends on the origin of time. A sample that is
+    corrected alone gives the same bits as in an array.
 
 References
 ----------

@@ -44,7 +44,7 @@ class Columns:
         Time of each sample since `start_ns` [s]. `fit` needs times that rise strictly; remove a
         sample whose time does not exceed the time of the sample before.
     counts : ndarray, shape (n, 3)
-        The raw samples: counts per conversion cycle, or m/s^2 from a unit that reports these.
+        The raw samples: counts per conversion cycle, or m/s^2 from a unit that reports m/s^2.
     temperatures : dict of str to (ndarray, ndarray)
         Times since `start_ns` [s], which rise strictly, and readings [degC] of each thermometer,
         by its name.
@@ -118,9 +118,9 @@ def correct(
         (time_s, value) with separate times. A reading applies from the first sample with an equal
         or later time. A calibration without temperature functions needs no temperature.
     config : CompensatorConfig or None, optional
-        The node's settings.
+        Settings of the compensator, those of the node's parameters.
     **sensors : as `board`
-        The other thermometers that the calibration names, in most of them ``case``.
+        The other thermometers that the calibration names, in most calibrations ``case`` only.
 
     Returns
     -------
@@ -136,7 +136,8 @@ def correct(
     unknown = sorted(set(sensors) - set(calibration.sensors))
     if unknown:
         known = ', '.join(('board', *calibration.sensors))
-        raise ValueError(f'`{unknown[0]}` is not a thermometer of the calibration: it has {known}')
+        text = f'`{unknown[0]}` is not a thermometer of the calibration, which has {known}'
+        raise ValueError(text)
     given = _block(time_s, counts, {'board': board, **sensors}, 0)
     compensator = Compensator(calibration, config)
     block = process_block(compensator, given)
@@ -162,7 +163,7 @@ def read(path: str | Path, topics: Topics | None = None) -> Columns:
         A rosbag2 folder, ``*.mcap``, ``*.db3`` or a ROS 1 ``*.bag``; a table of numbers whose
         columns can be guessed; a PX4 ``*.ulg`` or ArduPilot ``*.bin``.
     topics : recording.topics.Topics or None, optional
-        Names of the topics that differ from the usual names.
+        Topics of the inputs, if their names differ from the node's default names.
 
     Returns
     -------
@@ -225,8 +226,8 @@ def fit(
     Returns
     -------
     Calibration
-        Calibration of the unit; `thermo_comp.save` writes the calibration to a file, its method
-        `correct` corrects samples.
+        Calibration of the unit; `thermo_comp.save` writes the calibration to a file, the method
+        `correct` of the calibration corrects samples.
 
     Raises
     ------
@@ -264,7 +265,7 @@ def fit(
 def _block(
     time_s: npt.ArrayLike, counts: npt.ArrayLike, given: Mapping[str, Temperature], start_ns: int
 ) -> Block:
-    """Check the caller's arrays; a reading goes before the first sample of equal or later time."""
+    """Check the caller's arrays; a reading precedes the first sample of equal or later time."""
     stamps = _stamps('time_s', time_s)
     samples = _numbers('counts', counts)
     if samples.shape != (len(stamps), 3):

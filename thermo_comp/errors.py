@@ -44,7 +44,7 @@ class OutputError(ThermoCompError):
 
 
 class FitError(ThermoCompError):
-    """Data that do not suffice for the fit; the text names missing data and their recording."""
+    """Data that do not suffice for a fit; the text says what to record."""
 
 
 class UndeterminedError(FitError):

@@ -67,7 +67,7 @@ BAG = Kind('rosbag2 directory', rb'\A(metadata\.yaml|.+\.(mcap|db3)(\.zstd)?)\Z'
 
 
 def bag_kind(path: str | Path, others: str = '') -> Kind:
-    """Return the kind of an output bag by its suffix; the error message also lists `others`."""
+    """Return the kind of an output bag by its suffix; errors also list the endings `others`."""
     suffix = Path(path).suffix
     if suffix == '.mcap':
         return MCAP
@@ -100,7 +100,7 @@ def open_regular(path: str | Path) -> BinaryIO:
 def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> bytes:
     """
     Read a regular file of limited size. ValueError if the file is larger than `limit` bytes,
-    PermissionError if it lies outside of the folder `within`, OSError as in `open_regular`.
+    PermissionError if the file lies outside `within`, OSError as in `open_regular`.
     """
     with open_regular(path) as file:
         # Check the path of the opened file: a link could be exchanged between a check and the
@@ -167,9 +167,7 @@ class Draft:
                 self.partial.mkdir()
 
     def publish(self) -> None:
-        """
-        Give the complete output its final name; OutputError if another process took the name.
-        """
+        """Give the complete output its final name; OutputError if another file has this name."""
         with _output_errors(self._path):
             if self.partial.is_dir():
                 _sync(self.partial)
@@ -216,9 +214,7 @@ class Draft:
 
 @contextmanager
 def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """
-    Yield a temporary path; the file or folder there becomes the output if no exception occurs.
-    """
+    """Yield a temporary path; its file or folder becomes the output if no exception occurs."""
     draft = Draft(path, kind, overwrite=overwrite)
     try:
         with _output_errors(path):
@@ -231,7 +227,7 @@ def drafted(path: str | Path, kind: Kind, *, overwrite: bool = False) -> Iterato
 
 
 def write_atomically(path: str | Path, data: bytes, kind: Kind, *, overwrite: bool = True) -> None:
-    """Write a file so that its readers see the old or the new content, never a part of it."""
+    """Write a file so that its readers get the complete old or the complete new content."""
     with drafted(path, kind, overwrite=overwrite) as partial:
         partial.write_bytes(data)
 
@@ -263,7 +259,7 @@ def _hidden_sibling(path: Path) -> Path:
 
 
 def _overlaps(target: Path, other: Path) -> bool:
-    """Whether two paths are the same, or either contains the other, also through links."""
+    """Whether two paths are equal, or one path contains the other path, also through links."""
     is_within = other in (target, *target.parents) or target in other.parents
     return is_within or not _identities(target).isdisjoint(_identities(other))
 

@@ -3,10 +3,10 @@
 """
 Owns the reading of YAML as plain values: mappings, lists, texts, numbers, true, false and null.
 
-Scalars are those of YAML 1.2, so 1e-05 is a number and `no` is a text. Aliases are refused, so
-small files cannot expand; tags are refused, so no objects are built; a repeated key is refused.
-The parser's events are read in one pass, so that a too deep or too large file is refused before
-it is built.
+Scalars are those of YAML 1.2, so 1e-05 is a number and `no` is a text. Repeated keys are refused,
+as are aliases, which could expand a small file to large data, and tags, which could build Python
+objects. The parser's events are read in one pass, so that a file with too many levels or values
+is refused before its values take memory.
 """
 
 import re
@@ -20,7 +20,7 @@ import yaml
 from .errors import ThermoCompError
 from .files import read_bounded
 
-DEPTH_LIMIT = 12
+DEPTH_LIMIT = 12  # largest number of nested lists and mappings
 #: Largest number of keys, values, lists and mappings of a file: three times that of a calibration
 #: with all columns of `unit.columns.bank` for two thermometers, except the kind `bend`.
 NODE_LIMIT = 20_000
@@ -89,7 +89,7 @@ def _load(text: str | bytes, node_limit: int) -> Any:
         if isinstance(event, yaml.ScalarEvent):
             return _scalar(event.value, line) if event.implicit[0] else event.value
         if depth == DEPTH_LIMIT:
-            raise PlainYamlError(f'nested deeper than {DEPTH_LIMIT}', line)
+            raise PlainYamlError(f'nested deeper than {DEPTH_LIMIT} levels', line)
         inner = takewhile(lambda inside: not isinstance(inside, yaml.CollectionEndEvent), events)
         if isinstance(event, yaml.SequenceStartEvent):
             return [value(part, depth + 1) for part in inner]

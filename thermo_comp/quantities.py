@@ -77,14 +77,14 @@ _PREPARED: dict[str, Bounds] = {
     # Bounds of the constants of the unit.
     'full scale': _positive(1e-6, 1e16, 'input units', 'float64 holds integers to 9e15'),
     'full-scale force': _positive(1e-3, 1e7, 'm/s^2', 'from a gravimeter to a gun launch'),
-    'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'bounds of the magnitude'),
+    'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'far beyond any converter'),
     'cycle time': _positive(1e-7, 1e5, 's', 'from 10 MHz to one sample a day'),
     'gravity': Bounds(above=9.0, below=10.5, unit='m/s^2', why='on Earth 9.76 to 9.84'),
     'angular rate': _between(-1e3, 1e3, 'rad/s', '1000 rad/s are 57000 deg/s'),
-    # Temperatures.
+    # Bounds of temperatures, rates and times.
     'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='from 0 K to red heat'),
     'temperature difference': _between(-1273.15, 1273.15, 'K', 'of two valid temperatures'),
-    'temperature span': _positive(1e-2, 1273.15, 'K', 'narrower is thermometer noise'),
+    'temperature span': _positive(1e-2, 1273.15, 'K', 'a smaller span is thermometer noise'),
     'temperature rate': _between(-1e5, 1e5, 'K/min', '100 times a thermal shock of 1000 K/min'),
     'rate span': _positive(1e-6, 2e5, 'K/min', 'no ramp is slower than 1 K in two years'),
     'time constant': _positive(1e-3, 1e8, 's', 'from a bare thermocouple to three years'),

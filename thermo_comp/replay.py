@@ -4,8 +4,9 @@
 Owns the offline run of the node: the correction of a whole bag into another bag or a table.
 
 The correction is the node's code, applied to blocks of samples instead of single samples. A
-temperature reading applies from the first sample that follows in the bag and has no earlier stamp.
-The output equals, bit for bit, that of a node that receives the messages in the bag's order.
+temperature reading applies from the first sample that follows the reading in the bag and whose
+stamp is equal or later. The output equals, bit for bit, that of a node that receives the messages
+in the bag's order.
 Only one block of the bag is in memory at a time.
 """
 
@@ -113,8 +114,8 @@ def replay(
     """
     Correct a recording and write the output of the node, as a bag or (by suffix) a table.
 
-    `keep_inputs` also copies the input messages, with their stamps as log times. `all_topics`
-    copies in addition all other topics with their log times, except topics named like an output.
+    `keep_inputs` also copies the input messages, with their stamps as log times. `all_topics` also
+    copies the inputs and all further topics with their log times, except topics of the outputs.
     """
     compensator = Compensator(calibration, config)
     wanted = topics_for(calibration, topics)
@@ -131,7 +132,7 @@ def replay(
         is_raw = keep_inputs or all_topics
         if Path(output).suffix in TABLES:
             if is_raw:
-                raise OutputError('a table holds the corrected samples alone', output)
+                raise OutputError('a table can only contain the corrected samples', output)
             sink = _rows_of(table_writer(output, metadata, overwrite=overwrite))
         else:
             bag = BagWriter(output, metadata=metadata, overwrite=overwrite)
@@ -248,7 +249,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Return the Imu fields but the force; an angular rate with covariance -1 is not corrected."""
+    """Return the Imu fields except force; an angular rate with covariance -1 is not corrected."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

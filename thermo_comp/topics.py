@@ -3,7 +3,7 @@
 """
 Owns the table of the node's ROS topics: name, type, QoS, serialization of the regime flags.
 
-Node, replay, recorders, player, bag writer and docs/ros_interface.md read this table. A message is
+Node, replay, recorders, player, bag writer and docs/ros_interface.md use this table. A message is
 packed in little-endian CDR: 4 bytes of encapsulation, then the fields.
 """
 
@@ -29,7 +29,7 @@ PackFlag = Callable[[int, bool, str], bytes]
 
 @dataclass(frozen=True, slots=True)
 class NodeTopic:
-    """A topic of the node, with the QoS that the node asks for or offers."""
+    """A topic of the node, with the QoS that the node requests or offers."""
 
     name: str
     type: str
@@ -52,7 +52,7 @@ def _bool_flag(_stamp_ns: int, is_dynamic: bool, _serial: str) -> bytes:
 
 
 def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
-    """Serialize the regime as a DiagnosticArray with the stamp of the reading that decides it."""
+    """Serialize the regime as a DiagnosticArray with the stamp of the deciding reading."""
     status = b''
     for text in ('regime', 'dynamic' if is_dynamic else 'static', serial):
         # In CDR the level of a status is one byte, and the length of a text is aligned to four
@@ -68,7 +68,7 @@ def _stamped_flag(stamp_ns: int, is_dynamic: bool, serial: str) -> bytes:
 
 
 def thermometer(name: str) -> str:
-    """Return the usual topic of a thermometer."""
+    """Return the default topic of a thermometer."""
     return f'temperature/{name}'
 
 

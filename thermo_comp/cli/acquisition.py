@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the state of a test during recording: its positions, resulting accuracy, missing data.
+Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
-Blocks of samples are added as they arrive. A rest in another direction than the present position
-begins the next position; knocks and handling in between belong to the previous position.
+Blocks of samples are added as they arrive. A rest in another direction than that of the present
+position begins the next position; knocks and handling between two positions belong to the first.
 """
 
 import math
@@ -23,15 +23,14 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Minimum length of a cell (samples averaged together) [s]; number of samples needed to choose the
-# length.
+# Minimum length of a cell of averaged samples [s]; number of samples that decide the length.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
-# Number of cells, already searched, that are searched again for the start of a rest.
+# Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
-# Sd of the mean force in a position due to hysteresis, mounting, drift, however long the rest [g].
+# Sd of the mean force in a position due to hysteresis, mounting and drift, at any rest length [g].
 _FLOOR_SD = 2e-5
-# A rest is 'restless' if its noise exceeds this multiple of the median over all rests. A unit
-# is held by hand if a still interval has more noise than the second multiple of earlier rests.
+# First: a position with more than this multiple of the positions' median noise is 'restless'.
+# Second: a still interval after the last rest is a rest below this multiple of the rests' noise.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -45,7 +44,7 @@ Surveys = Mapping[str, ThermometerSurvey]
 class Position:
     """
     A position: direction of the force (NaN before a rest), duration and number of rests, sd of the
-    mean force, temperatures, and the reason why the position does not count ('' if it counts).
+    mean force [g], temperatures, and the reason why the position is not good ('' if it is good).
     """
 
     up: Floats
@@ -60,9 +59,8 @@ class Position:
 class Account:
     """
     State of a test, and the missing data.
-
-    The last of `positions` is unfinished. `worst_sd_g` is the sd of the force in the worst
-    attitude, `constants_sd` the sd of bias [g], relative scale and M [rad], as in `coverage`.
+    The last of `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in the
+    attitude with the largest sd, `constants_sd` the sd of bias [g], relative scale and M [rad].
     `next_up` is the direction recommended for the next position, at an angle of `next_deg` to
     `now`, the direction of the newest sample (NaN without samples); `farthest_up` is the direction
     farthest from all positions. `findings` are texts about missing data.
@@ -85,7 +83,7 @@ class Account:
 
 @dataclass(frozen=True)
 class _Rest:
-    """Statistics of the still cells of a position, in input units, and of its thermometers."""
+    """Statistics of a position: of its still cells, in input units, and of its thermometers."""
 
     surveys: Surveys
     mean: Floats = field(default_factory=lambda: np.full(3, np.nan))
@@ -96,7 +94,7 @@ class _Rest:
 
 
 class Acquisition:
-    """A test that is running; `soak_s` is the wanted rest [s], `offset` the reading at 0 g."""
+    """A running test; `soak_s`: rest wanted in each position [s], `offset`: reading at 0 g."""
 
     def __init__(self, n_positions: int, soak_s: float, offset: float = 0.0) -> None:
         self._n_wanted, self._soak_s, self._offset = n_positions, soak_s, offset
@@ -106,16 +104,16 @@ class Acquisition:
         self._start()
 
     def _start(self) -> None:
-        """Restart the search; the next samples may have another clock."""
+        """Restart the search for rests; the stamps of the next samples may be of another clock."""
         self._accumulator = CellAccumulator(_CELL_S, None)
-        # Samples held until they suffice to choose the length of a cell; then None.
+        # Stamps and samples before `_SAMPLES_TO_BEGIN` samples have arrived; then None.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
         #: Earliest stamp at which the next position can begin [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
-        # Mean sample of the first rest of a position, kept because a later search, with the noise
-        # of a quieter rest, misses the first rest.
+        # Mean sample of the first rest of a position. A later search may miss the first rest,
+        # because the limit of the variance at rest follows from the quietest tenth of the cells.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
@@ -127,7 +125,6 @@ class Acquisition:
         begins: list[int] = []
         stamp_ns, samples = block.accel_stamp_ns, block.accel - self._offset
         if self._newest_ns - int(stamp_ns[0]) > _STEP_BACK_NS:
-            # The stamps go back: the driver has restarted.
             self.begin()
             begins.append(int(stamp_ns[0]))
         self._newest_ns = int(stamp_ns[-1])
@@ -151,25 +148,23 @@ class Acquisition:
         return begins
 
     def begin(self) -> None:
-        """End the position; later blocks may have another clock."""
+        """End the position; the stamps of later blocks may be of another clock."""
         self._close(-_FIRST_NS)
         self._start()
 
     def _cells(self) -> Cells:
-        """Return the cells of the present position."""
         cells = self._accumulator.cells()
         begin_s = (self._begin_ns - cells.start_ns) * 1e-9
         return cells.part(slice(int(np.searchsorted(cells.time, begin_s)), None))
 
     def _next_position_ns(self, cells: Cells) -> int | None:
         """Return the stamp at which a rest in another direction begins [ns], or None."""
-        # Search only the new cells and the last `_LOOKED_BACK` earlier cells.
         n_looked, self._n_looked = self._n_looked, len(cells.count)
         cells = cells.part(slice(max(n_looked - _LOOKED_BACK, 0), None))
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest once more, relative to the noise of these cells.
+        # Search the cells after the last rest once more, with a limit from their own noise.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [
@@ -189,7 +184,7 @@ class Acquisition:
         return cells.start_ns + round(float(cells.index[lower]) * cells.cell_s * 1e9)
 
     def _close(self, end_ns: int) -> None:
-        """End the position at a stamp; later samples belong to the next position."""
+        """End the position at a stamp [ns]; later samples belong to the next position."""
         self._rests.append(self._rest(self._cells(), end_ns))
         self._readings = {
             name: [
@@ -273,7 +268,7 @@ class Acquisition:
         )
 
     def _reason(self, rest: _Rest, up: Floats, noise: float, before: Sequence[Position]) -> str:
-        """Return why a position does not count; '' if it counts."""
+        """Return the reason why a position is not good; '' if the position is good."""
         if not rest.n_rests:
             return 'not at rest yet'
         if np.isnan(up).any():
@@ -297,7 +292,7 @@ class Acquisition:
             return np.full(3, np.nan), False
         cells = cells.part(slice(-_LOOKED_BACK, None))
         ranges = still_intervals(cells, 0.0)
-        # The last cell is incomplete, so the previous cell decides rest and direction.
+        # The last cell may have few samples, so rest and direction are those of the cell before.
         is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
         last = cells.mean[-2:-1] if len(cells.count) > 1 else cells.mean
         return self._directions(last)[0], is_still
@@ -318,7 +313,6 @@ def _part(readings: Readings, begin_ns: int, end_ns: int) -> Readings:
 
 
 def _combined_surveys(surveys: Sequence[Surveys]) -> Surveys:
-    """Combine the surveys of each thermometer over several positions."""
     by_name: dict[str, list[ThermometerSurvey]] = {}
     for name, survey in (item for position in surveys for item in position.items()):
         by_name.setdefault(name, []).append(survey)

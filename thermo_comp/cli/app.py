@@ -3,9 +3,9 @@
 """
 Owns the entry point of the command line: its commands and exit codes.
 
-Exit code 0: done; 1: the data or the result is bad; 2: the command line is wrong; 3: an update
-gains nothing; 70: a bug of thermo_comp, whose traceback is saved in a file. An error is printed as
-a line on stderr.
+Exit code 0: done; 1: the data or the result is bad; 2: the command line is wrong; 3: `update` does
+not improve the calibration; 70: a bug of thermo_comp, whose traceback is saved in a file. An error
+is printed as a line on stderr.
 
 Heavy libraries are imported by the commands when they run, so that ``--help`` is fast.
 """
@@ -28,10 +28,10 @@ from .shared_options import expanded, option
 # Base class of all errors of a command line; typer does not export this class.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]
 
-#: Matches typer's message for a value that is not a number: option names, kind of number.
+#: Matches typer's message for a value that is not a number; groups: two option names, the kind.
 _NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
 
-# Print the bounds of a number on a separate line: otherwise `--help` cuts long option names.
+# Print the bounds of an option's number on a separate line, or `--help` cuts long option names.
 rich_utils.RANGE_STRING = '\n[{}]'
 
 app = typer.Typer(
@@ -71,9 +71,9 @@ app.add_typer(_fleet)
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run one command and leave the process with its exit code."""
+    """Run one command and end the process with the command's exit code."""
     hold_standard_streams()
-    # Use one BLAS thread: with several threads on busy cores small matrices take 16 times longer.
+    # Use one BLAS thread: several threads make small matrices 16 times slower on busy cores.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
@@ -110,13 +110,13 @@ def run(arguments: list[str]) -> int:
         where = f'{failure.filename}: ' if failure.filename else ''
         output.error(f'{where}{failure.strerror or failure}')
         return 1
-    except Exception as failure:  # noqa: BLE001 - the last line of defence
+    except Exception as failure:  # noqa: BLE001 - any other error is a bug of thermo_comp
         return _unexpected(failure)
     return code if isinstance(code, int) else 0
 
 
 def _plain(message: str, arguments: list[str]) -> str:
-    """Rewrite a message of typer in plain words; for a number, add the value that was given."""
+    """Rewrite a message of typer in plain words; name the value that is not a number."""
     message = message.replace('Value error, ', '').replace('Input should be', 'must be')
     message = message.removeprefix('Invalid value: ')  # the rest of the message names the option
     option = _NO_NUMBER.search(message)
@@ -148,7 +148,7 @@ def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _unexpected(failure: Exception) -> int:
-    """Save the traceback of an unexpected error, print its file, return the exit code."""
+    """Save the traceback of an unexpected error, print the file's name, return the exit code."""
     import tempfile
     import traceback
 

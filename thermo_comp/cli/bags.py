@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from ..unit.calibration import Calibration
 
 _BAG = argument('Recording: rosbag2 directory, .mcap, .db3 or ROS 1 .bag.', metavar='BAG')
-#: Texts for the counters of the compensator: why samples are left out.
+#: Texts for the compensator's counters of samples that are left out of the output.
 _LEFT_OUT = {
     'n_not_finite': 'samples that are not finite',
     'n_saturated': 'samples at the full scale of the calibration',
     'n_out_of_order': 'samples with a stamp not later than the sample before',
     'n_no_temperature': 'samples before the first board temperature',
     'n_stale': 'samples with a board temperature older than --temperature-timeout',
-    'n_stuck': 'samples that repeat one reading, or are 0 on all axes',
-    'n_too_fast': 'samples faster than the conversion cycle of the calibration',
+    'n_stuck': 'samples that repeat earlier values for too long, or are 0 on all axes',
+    'n_too_fast': 'samples at shorter intervals than the conversion cycle of the calibration',
     'n_refuted': 'samples while |f| at rest differs too much from gravity',
     'n_unsound': 'samples whose correction is not finite',
 }
@@ -42,9 +42,9 @@ def info(
     """
     Describe a bag or a calibration.
 
-    Prints topics, rate, temperature span, ramps and gaps of a bag, and whether
-    a fit can use the bag; unit, ranges, sets, residuals and nonlinear terms of
-    a calibration.
+    For a bag, prints topics, rate, range of temperatures, ramps and gaps, and
+    whether a fit can use the bag; for a calibration, the unit, the ranges, the
+    sets of coefficients, the residuals and the nonlinear terms.
 
     Example:
       thermo_comp info chamber.mcap
@@ -105,7 +105,7 @@ def _calibration(out: Output, path: Path) -> None:
     data = counted(len(provenance.sources) - n_logs, 'bag')
     if n_logs:
         data += f' and {counted(n_logs, "rest log")}'
-    out.line(f'{path}: unit {unit.serial}, {unit.input} up to {unit.full_scale:g}')
+    out.line(f'{path}: unit {unit.serial}, input {unit.input}, full scale {unit.full_scale:g}')
     out.line(
         f'  fitted {provenance.created or "at an unknown time"} by thermo_comp '
         f'{provenance.tool_version or "?"} from {data}, '
@@ -113,7 +113,7 @@ def _calibration(out: Output, path: Path) -> None:
     )
     out.line(
         f'  local gravity {calibration.gravity_m_s2:.6g} m/s^2, '
-        f'reference {calibration.reference_temperature_c:g} degC'
+        f'reference temperature {calibration.reference_temperature_c:g} degC'
     )
     out.table(
         ('axis', 'scale factor', 'bias', 'bias ug'),
@@ -148,7 +148,7 @@ def _calibration(out: Output, path: Path) -> None:
 
 
 def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
-    """Print the nonlinear terms of a fit to rests of which some were not at 1 g."""
+    """Print the nonlinear terms of a calibration, if the fit had rests at other |f| than 1 g."""
     from ..unit.prediction import nonlinear_coefficients
 
     if calibration.nonlinearity is None:
@@ -164,7 +164,8 @@ def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
     out.table(
         ('coefficient', 'unit', 'x', 'y', 'z'),
         rows,
-        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; log evidence: {loss}',
+        title=f'nonlinearity, |f| of {low:.4g} .. {high:.4g} m/s^2; loss of log evidence '
+        f'without a term: {loss}',
     )
 
 
@@ -178,23 +179,23 @@ def replay(
         '-o',
     ),
     keep_inputs: bool = option('Also copy the input messages.', False, '--keep-inputs'),
-    all_topics: bool = option('Also copy all other topics.', False, '--all-topics'),
+    all_topics: bool = option('Also copy inputs and all further topics.', False, '--all-topics'),
     serial: str | None = options.SERIAL,
-    frame_id: str = option("Frame of the output; empty keeps the input's.", ''),
+    frame_id: str = option('frame_id of the output messages; default: that of the input.', ''),
     transition_time: float = option(
-        'Time in s over which the two sets are blended after a switch of the regime, as the '
-        "node's parameter; 0 switches at once.",
+        'Time in s over which the two sets are blended after a switch of the regime, like the '
+        "node's parameter; 0: no blending.",
         CompensatorConfig.transition_time_s,
         min=0.0,
     ),
     temperature_timeout: float = option(
-        "Age of the board temperature, in s, from which no sample is corrected, as the node's "
-        'parameter.',
+        'Largest age of the board temperature, in s, at which samples are corrected, like the '
+        "node's parameter.",
         CompensatorConfig.temperature_timeout_s,
     ),
     case_timeout: float = option(
-        'Age of the case temperature, in s, from which the board temperature decides the regime, '
-        "as the node's parameter.",
+        'Age of the case temperature, in s, above which the regime follows from the board '
+        "temperature alone, like the node's parameter.",
         CompensatorConfig.case_timeout_s,
     ),
     topics: Any = options.reading,
@@ -205,8 +206,8 @@ def replay(
     Correct a whole bag offline; the output equals that of the live node.
 
     Writes imu/data_raw (sensor_msgs/Imu), regime/dynamic (std_msgs/Bool)
-    and regime/stamped (the same with its stamp); the log time of each
-    message is its stamp. A table holds the corrected samples only.
+    and regime/stamped (the regime with its stamp); the log time of each
+    message is its stamp. A table contains the corrected samples only.
 
     Example:
       thermo_comp replay flight.mcap -c unit42.yaml -o corrected.mcap
@@ -246,7 +247,8 @@ def replay(
     for name, count in counts.items():
         if name in DROPPED and count:
             out.line(f'  left out, {_LEFT_OUT[name]}: {count}')
-    out.line(f'  regime flags: {result.n_flags}, switches: {max(len(result.switches) - 1, 0)}')
+    n_switches = max(len(result.switches) - 1, 0)
+    out.line(f'  regime flags: {result.n_flags}, switches of the regime: {n_switches}')
     for at, flag in result.switches:
         regime = 'dynamic' if flag else 'static'
         out.line(f'    {(at - info.start_ns) * 1e-9:10.1f} s  {regime}')
@@ -267,9 +269,9 @@ def play(
     context: typer.Context,
     bag: Path = _BAG,
     rate: float = option(
-        'Speed relative to real time; 0: as fast as subscribers read.', 1.0, min=0.0
+        'Speed relative to real time; 0: as fast as the subscribers read.', 1.0, min=0.0
     ),
-    wait: float = option('Longest wait for a subscriber on every topic, in s.', 10.0, min=0.0),
+    wait: float = option('Longest wait until every topic has a subscriber, in s.', 10.0, min=0.0),
     topics: Any = options.reading,
     out: Output = options.out,
 ) -> None:
@@ -278,15 +280,16 @@ def play(
 
     The topics are published as accel/counts (or imu/uncompensated),
     temperature/board and temperature/case, whatever their names in the bag;
-    remap them after --ros-args. The playback ends when every reliable subscriber has
-    received everything. For other topics, pauses and loops use ros2 bag play.
+    remap the topics after --ros-args. The playback ends when every reliable
+    subscriber has received all messages. For topics that the node does not
+    read, and for pauses and loops, use ros2 bag play.
 
     Example:
       thermo_comp play chamber.mcap --rate 20
       thermo_comp play chamber.mcap --ros-args -r __ns:=/imu0
     """
     if not rate < float('inf'):
-        raise options.usage('--rate must be finite; 0 is as fast as subscribers read')
+        raise options.usage('--rate must be finite; 0 plays as fast as the subscribers read')
     options.require_ros()
     from ..ros.player import play as run
 

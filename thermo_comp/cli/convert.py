@@ -20,12 +20,12 @@ Tool = Literal['px4', 'ardupilot', 'imu_tk', 'imu_calib', 'kalibr']
 
 #: Texts of the findings of a conversion, before the number of rows.
 _FINDINGS = {
-    'short_rows': 'rows left out, fewer cells than columns needed',
-    'non_numeric': 'rows left out, a time or a sample is not a finite number',
-    'out_of_range': 'rows left out, stamp before 1970 or after 2038',
+    'short_rows': 'rows left out, with fewer cells than the column map needs',
+    'non_numeric': 'rows left out, with a time or a sample that is not a finite number',
+    'out_of_range': 'rows left out, with a stamp before 1970 or after 2038',
     'clipped': 'rows with an axis at or beyond the limits `clip` of the column map, kept',
     'impossible': 'temperatures left out, below -90 or above 200 degC',
-    'continued': 'rows at which a 32-bit time overflowed to 0, times continued',
+    'continued': 'rows at which a 32-bit time overflowed to 0, kept with increasing times',
     'backwards': 'rows with an earlier time than the row before, kept',
     'repeated': 'rows with the same time as the row before, kept',
 }
@@ -41,26 +41,30 @@ def convert(
     output: Path = option('Bag to write: a file *.mcap, or a folder.', ..., '--output', '-o'),
     columns: Path | None = option('Column map of a table (YAML): columns and their units.'),
     rate_hz: float | None = options.TABLE_RATE,
-    imu: int | None = option('IMU of a log, counted from 0.'),
-    baro: int | None = option('Barometer of a log, for the case temperature.'),
+    imu: int | None = option('Number of the IMU in an autopilot log, counted from 0.'),
+    baro: int | None = option(
+        'Number of the barometer in an autopilot log that gives the case temperature.'
+    ),
     allow_compensated: bool = option(
-        'Accept samples that INS_TCAL or TC_A has corrected.', False, '--allow-compensated'
+        'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.',
+        False,
+        '--allow-compensated',
     ),
     names: dict[str, str] = options.named_topics,
-    unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of the Imu topic of a bag.', 'm/s^2'),
+    unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of acceleration in the bag.', 'm/s^2'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
     """
     Convert a table of numbers, an autopilot's log or a bag.
 
-    A column map names the columns and their units; the readings at rest must
-    be gravity in the stated unit. config/columns has examples. Without a map,
-    convert guesses a map from the headings and prints it; a table with the
-    columns t ax ay az wx wy wz, in this order, or without t or wx wy wz,
-    needs no headings. The board temperature is the IMU's in a PX4 or
-    ArduPilot log, and the reading of the thermometer in the Imu topic's
-    namespace in a bag; the case temperature is that of the barometer.
+    A column map names the columns and their units; the magnitude of the samples
+    at rest must be gravity in the stated unit. config/columns has examples.
+    Without a map, convert guesses a map from the headings and prints the map; a
+    table with the columns t ax ay az wx wy wz, in this order, or without t or
+    wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
+    is that of the IMU, and the case temperature that of the barometer; in a bag
+    the board thermometer has the namespace of the Imu topic.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -101,7 +105,6 @@ def convert(
 
 
 def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> None:
-    """Print the numbers of messages written, the findings, and the times of movement."""
     from ..convert.log import SLOW_HZ
 
     log = report.log
@@ -115,8 +118,8 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
     out.line(f'unit: {log.unit}; {report.inferred_unit}')
     if report.rate_hz < SLOW_HZ:
         out.line(
-            f'{report.rate_hz:.3g} Hz: sufficient for soaks of minutes, too slow for short rests '
-            'by hand, and to detect vibration or a knock between two samples'
+            f'{report.rate_hz:.3g} Hz is sufficient for soaks of minutes; the rate is too low for '
+            'short rests by hand, and to detect vibration or a knock between two samples'
         )
     if log.hint:
         out.line(log.hint)
@@ -126,7 +129,7 @@ def _print_conversion(out: Output, report: 'ConversionReport', output: Path) -> 
             where = f' (line {", ".join(map(str, finding.lines))}{more})' if finding.lines else ''
             out.line(f'{_FINDINGS[name]}: {finding.count}{where}')
     if report.stillness.moving_ns:
-        out.line('moved or shaken, not at rest:')
+        out.line('times at which the unit was moved or shaken, from the first sample:')
         for stretch in report.stillness.moving_ns:
             begin, end = ((stamp_ns - int(log.stamp_ns[0])) * 1e-9 for stamp_ns in stretch)
             out.line(f'  {begin:9.1f} .. {end:.1f} s')
@@ -139,7 +142,7 @@ def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     map or list of columns from another table.
     """
     _print_map(out, log, shown)
-    not_used = f'not used: {", ".join(log.not_used)}'
+    not_used = f'columns not used: {", ".join(log.not_used)}'
     if log.not_used and shown.setdefault(not_used, log.path) == log.path:
         out.line(f'{log.path}: {not_used}')
 
@@ -154,30 +157,31 @@ def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
         lines = map_lines(log.guessed)
         first = shown.setdefault('\n'.join(lines), log.path)
         if first != log.path:
-            out.line(f'{log.path}: column map of {first}')
+            out.line(f'{log.path}: same column map as {first}')
             return
-        out.line(
-            f'{log.path}: guessed column map; if it is wrong, edit it and give it as --columns'
-        )
+        out.line(f'{log.path}: guessed column map; if the map is wrong, edit it for --columns')
         for line in lines:
             out.line(f'  {line}')
     else:
-        out.line(f'{log.path}: guessed {column_map_text(log.guessed)}; else give --columns')
+        text = column_map_text(log.guessed)
+        out.line(f'{log.path}: guessed {text}; if this is wrong, give --columns')
 
 
 def export(
     path: Path = argument('Calibration of the unit.', metavar='YAML'),
-    to: Tool = option('Tool whose file to write.', ...),
+    to: Tool = option('Tool for which the file is written.', ...),
     output: Path = option('File to write.', ..., '--output', '-o'),
     number: int | None = option(
         'Number of the set of parameters: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot '
         '(1), imu0.. of Kalibr (0).',
         min=0,
     ),
-    device_id: int = option("PX4's id of the sensor (TC_An_ID), used to match it.", 0),
+    device_id: int = option(
+        'Device id of the sensor (TC_An_ID), by which PX4 assigns the parameters.', 0
+    ),
     up: tuple[float, float, float] | None = option(
-        'Direction of +g in the sensor frame, for which the drift of the scale is added to the '
-        'offset.',
+        'Unit vector of the specific force at rest in the sensor frame; the error of the scale in '
+        'this attitude is added to the offset.',
         metavar='X Y Z',
     ),
     force: bool = options.FORCE,
@@ -188,7 +192,7 @@ def export(
 
     PX4 and ArduPilot keep the offset of each axis as a cubic of temperature; imu_tk (.calib),
     imu_calib and Kalibr (YAML) keep bias, scale and misalignment at the reference temperature.
-    Parts of the calibration that the file cannot hold are listed with the resulting error.
+    Parts of the calibration that the file does not contain are listed with the resulting error.
 
     Example:
       thermo_comp export unit42.yaml --to px4 -o unit42.params
@@ -199,9 +203,9 @@ def export(
     from ..unit.calibration_file import load_calibration
 
     if device_id and to != 'px4':
-        raise options.usage('--device-id is for PX4')
+        raise options.usage('--device-id needs --to px4')
     if up is not None and to not in ('px4', 'ardupilot'):
-        raise options.usage('--up is for PX4 and ArduPilot')
+        raise options.usage('--up needs --to px4 or --to ardupilot')
     check_output(output, PARAMETERS, overwrite=force, others=[path])
     calibration = load_calibration(path)
     with options.usage_of():
@@ -224,7 +228,7 @@ def import_(
     rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
     full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),
     noise_ug: float = option(
-        'Noise density in ug/sqrt(Hz); it sets the covariance.', 200.0, min=0.01
+        'Noise density in ug/sqrt(Hz), from which the covariance follows.', 200.0, min=0.01
     ),
     force: bool = options.FORCE,
     out: Output = options.out,
@@ -234,8 +238,8 @@ def import_(
 
     Thermal parameters of PX4 and ArduPilot give the bias over temperature; the files of imu_tk,
     imu_calib and Kalibr give bias, scale and misalignment. The static and the dynamic regime get
-    the same set. The calibration's input unit is that of the file: m/s^2 (node: input:=imu), or
-    counts. Parameters that the file lacks need a fit to bags of a thermal test.
+    the same coefficients. The calibration corrects samples in the unit of the file: m/s^2 (node:
+    input:=imu), or counts. Parameters that the file lacks need a fit to bags of a thermal test.
 
     Example:
       thermo_comp import autopilot.params --serial 42 -o unit42.yaml

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..field.ageing import Ageing
     from ..field.update import Update
 
-#: Exit code of an update that gains no more than one standard error on days left out.
+#: Exit code of an update whose gain on days left out of the update is at most its standard error.
 NOTHING_GAINED = 3
 
 
@@ -25,9 +25,9 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days until the next update; the uncertainty grows with them.', 1.0, min=0.0, max=3650.0
+        'Days of ageing after the last rest in the claimed sd.', 1.0, min=0.0, max=3650.0
     ),
-    allow: list[str] | None = option('Name of a conclusion to override, as in its message.'),
+    allow: list[str] | None = option('Conclusion of the update to override: gravity or unit.'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -37,8 +37,8 @@ def update(
     The calibration is the prior; the ageing since the fit is estimated from
     the rests, which may be in any attitude. Old and new calibration are
     compared on days left out of the update. The new calibration is written only
-    if its gain is above one standard error; otherwise the exit code is 3, and
-    the present uncertainty of each axis is printed.
+    if its mean gain is larger than the standard error of the gain; otherwise
+    the exit code is 3, and the present uncertainty of each axis is printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -67,12 +67,12 @@ def update(
         save_calibration(result.calibration, output, overwrite=force)
         out.line(f'{output}: written')
     else:
-        out.line(f'the update gains nothing: {output} is not written, keep {calibration}')
+        out.line(f'the update is no improvement: {output} is not written, keep {calibration}')
         sds = [
             f'{row.axis} {micro_g(row.present_sd)} ug ({micro_g(row.claimed_sd)} ug in the file)'
             for row in result.axis_changes
         ]
-        out.line(f'sd of bias plus scale at rest, aged to the last rest: {", ".join(sds)}')
+        out.line(f'sd of bias plus scale at the last rest, with ageing: {", ".join(sds)}')
     out.end(
         0 if is_better else NOTHING_GAINED,
         output=output if is_better else None,
@@ -86,7 +86,7 @@ def update(
 
 def _show_axis_changes(result: 'Update', out: Output) -> None:
     out.table(
-        ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sd'),
+        ('axis', 'bias ug', '+-', 'scale ppm', '+-', 'curve ug', '+-', 'at rest ug', '+-', 'sds'),
         [
             (
                 axis.axis,
@@ -99,7 +99,7 @@ def _show_axis_changes(result: 'Update', out: Output) -> None:
             for axis in result.axis_changes
         ],
         title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
-        'starts (at rest: bias plus scale at the mean force of the rests)',
+        'starts of the node (at rest: bias plus scale at the mean force; sds: at rest / +-)',
     )
 
 
@@ -124,7 +124,7 @@ def evaluate_rests(
     tolerance: float | None,
     out: Output,
 ) -> None:
-    """Print the drift over a rest log; exit code 1 if the drift exceeds the claimed sd."""
+    """Print |f| - g over a rest log; exit with 1 if the unit's error exceeds its limit."""
     from ..field.series import read_rests, series_of
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration

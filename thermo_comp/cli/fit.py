@@ -39,15 +39,19 @@ def fit(
     output: Path = options.NEW_CALIBRATION,
     settings: dict[str, Any] = options.fitting,
     static_curve: Curve | None = option(
-        'Curve of bias and scale over temperature: linear, quadratic, cubic, spline or '
-        "exponential; default: the model's.",
+        'Curve of bias and scale over temperature in the static set: linear, quadratic, cubic, '
+        'spline or exponential; default: cubic, or linear for --model golovach.',
         metavar='CURVE',
     ),
     dynamic_curve: Curve | None = option(
-        'Curve of the dynamic set alone; choices as for --static-curve.', metavar='CURVE'
+        'Curve of the dynamic set, as for --static-curve; default: the static curve plus a '
+        'quadratic, or quadratic for --model golovach.',
+        metavar='CURVE',
     ),
-    groups: str | None = option('Groups of columns allowed in the fit.', metavar='A,B'),
-    force_groups: str = option('Groups kept regardless of the evidence.', '', metavar='A,B'),
+    groups: str | None = option(
+        'Groups of columns from which the fit selects; default: all.', metavar='A,B'
+    ),
+    force_groups: str = option('Groups kept without a selection.', '', metavar='A,B'),
     prior: Path | None = option(
         'Prior: the output of thermo_comp prior for this type of unit, or an old calibration of '
         'this unit.',
@@ -58,8 +62,8 @@ def fit(
         'from the bags.'
     ),
     ageing_scale: float = option(
-        'Assumed scale change (1 sd) since the prior calibration, in ppm; estimated from the '
-        'bags if it is 0 and --ageing-bias is not given.',
+        'Assumed scale change (1 sd) since the prior calibration, in ppm; if neither this option '
+        'nor --ageing-bias is given, the changes are estimated from the bags.',
         0.0,
         metavar='PPM',
         min=0.0,
@@ -75,16 +79,16 @@ def fit(
     rate_hz: float | None = options.TABLE_RATE,
     topics: Any = options.reading_part,
     force: bool = options.FORCE,
-    verbose: bool = option('Also list the positions.', False, '--verbose', '-v'),
+    verbose: bool = option('Also print the table of positions.', False, '--verbose', '-v'),
     out: Output = options.out,
 ) -> None:
     """
     Fit a calibration to bags of a thermal test.
 
     The unit rests in unknown positions while the chamber runs its program:
-    six faces give bias and scale, nine or more well spread positions also the
-    misalignment. Parameters that the bags do not determine keep their prior
-    and its uncertainty. Local gravity must be given.
+    six faces determine bias and scale, nine or more well spread positions also
+    the misalignment. Parameters that the bags do not determine keep the value
+    and the uncertainty of the prior. Local gravity must be given.
 
     Groups: curve, set, part, gradient, board, gradient_lag, product,
     gradient_x_temperature, square, gradient_even, gradient_even_about_rest,
@@ -115,7 +119,7 @@ def fit(
         out.sources([(log.path, log.chosen, None)])
 
     with options.usage_of():
-        # The temporary bags exist until the command ends.
+        # `as_bags` converts tables to temporary bags, which exist until the command ends.
         bags = context.with_resource(as_bags(bags, print_log, columns=columns, rate_hz=rate_hz))
     sources, kind = fit_sources(bags, topics, known_force)
     info = None
@@ -214,7 +218,7 @@ def _print_fit(
     if len(result.positions) > n_positions:
         headline += f' ({counted(len(result.positions), "rest")})'
     if left_out.n:
-        headline += f', {ug_text(left_out.rms)} RMS on data left out'
+        headline += f', error {ug_text(left_out.rms)} RMS on data left out'
     out.line(f'{output}: unit {calibration.unit.serial}, {model}, {headline}')
     if page is not None:
         out.line(f'{page}: certificate')
@@ -236,12 +240,12 @@ def _print_fit(
 
 
 def _behind_s(parts: Sequence['Part']) -> list[float]:
-    """Return how far each part is behind the board in a steady ramp [s]."""
+    """Return the delay of each part behind the temperature that it lags, in a steady ramp [s]."""
     return [part.tau_s + part.second_tau_s for part in parts]
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Describe the lags of the axes' parts, and of which temperature the parts lag."""
+    """Describe the lags of the parts of the axes, and the temperature that the parts lag."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):
@@ -252,7 +256,7 @@ def _text_of(parts: Sequence['Part']) -> str:
         leads = ', '.join(f'{part.lead_s:.0f}' for part in parts)
         source = f'a temperature that leads the board thermometer by {leads} s'
         text = f'lags by {lags} s (x, y, z) {source}'
-    return f'each axis is a curve of the temperature of its part, which {text}'
+    return f'bias and scale of an axis are curves over the temperature of its part, which {text}'
 
 
 def _print_positions(out: Output, result: 'FitResult') -> None:
@@ -300,13 +304,13 @@ def _print_residuals(out: Output, result: 'FitResult', n_positions: int) -> None
         title='|f| - g at rest, RMS in ug',
     )
     if not result.residuals[-1].left_out.n:
-        out.line('left out: no error is known, as the fit needs all of the data')
+        out.line('left out: not computed, because the fit needs all of the data')
     elif n_positions == 1:
         out.line('left out: drift of an axis in parts of the program that took no part in the fit')
     else:
         out.line(
-            'left out: on data that took no part in the fit; drift of an axis where the other '
-            'positions do not determine |f|'
+            'left out: error of fits without the corrected data; RMS drift of the axes where the '
+            'other positions do not determine |f|'
         )
 
 
@@ -326,7 +330,7 @@ def _print_rates(out: Output, result: 'FitResult', gyroscope: 'Gyroscope') -> No
 
 
 def _print_models(out: Output, trials: Sequence['Trial']) -> None:
-    """Print the error of each model on data left out of the fit, and explain the columns."""
+    """Print a table of the error of each model on data left out of the fit, and its legend."""
     columns = {
         'positions': 'drift of an axis in a position left out',
         'sections': 'drift of an axis in a part of the program left out',
@@ -348,18 +352,18 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')
-    out.line('*: chosen model, ~: as good within the noise; +: groups beside the curve')
+    out.line('*: chosen model; ~: as good as * within the noise; +: groups besides the curve')
 
 
 def _named(groups: tuple[str, ...]) -> str:
-    """Name a model by its groups without the curve, which all models but the smallest have."""
+    """Name a model by its groups without `curve`, which all models but the smallest have."""
     if len(groups) < 2 or groups[0] != 'curve':
         return '+'.join(groups) or 'constants'
     return ''.join(f'+{group}' for group in groups[1:])
 
 
 def _wrapped(name: str) -> list[str]:
-    """Break the name of a model before a group, so that the table fits 80 columns."""
+    """Break a long name of a model before a group, so that the table fits 80 columns."""
     lines = ['']
     for part in re.split(r'(?=\+)', name):
         if len(lines[-1]) + len(part) > _MODEL_WIDTH:
@@ -369,7 +373,6 @@ def _wrapped(name: str) -> list[str]:
 
 
 def _model(trial: 'Trial') -> dict[str, Any]:
-    """Return the groups of a compared model, and its error on data left out [m/s^2]."""
     names = ('positions', 'sections', 'norms')
     left_out = {name: folds.rms for name, folds in zip(names, trial.score.kinds, strict=True)}
     return {'groups': trial.groups, 'is_chosen': trial.is_chosen, 'left_out_rms_m_s2': left_out}
@@ -382,7 +385,7 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Return the residuals of each section after each step of the model, and on left-out data."""
+    """Return a table row for each section: number of windows, RMS residual of each step."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows

@@ -15,18 +15,20 @@ if TYPE_CHECKING:
 
 
 def fleet_fit(
-    folder: str = argument('DIR/[LOT/]UNIT/BAG; a path or a URL.', metavar='DIR'),
+    folder: str = argument(
+        'Folder of the bags DIR/[LOT/]UNIT/BAG, as a path or a URL.', metavar='DIR'
+    ),
     output: Path = option(
         'Folder of the results; an earlier run is continued.', ..., '--output', '-o'
     ),
     settings: dict[str, Any] = options.fitting,
     scheduler: str | None = option(
-        'Address of a running Dask scheduler, as tcp://host:8786; default: this machine alone.',
+        'Address of a running Dask scheduler, as tcp://host:8786; default: fit on this machine.',
         metavar='URL',
     ),
     workers: int | None = option('Processes on this machine; default: all processors.', min=1),
     no_certificates: bool = option(
-        'Write no certificates, which halves the work.', False, '--no-certificates'
+        'Write no certificates, which halves the computing time.', False, '--no-certificates'
     ),
     with_prior: bool = option(
         'Fit units with incomplete data again, with the prior of the other units.',
@@ -43,11 +45,12 @@ def fleet_fit(
     Fit every unit below a folder.
 
     Each folder of bags is a thermal test of a unit; bags directly in DIR are
-    sorted by the serial in them. Results go to OUT/units, the table to
-    OUT/fleet.parquet and .csv, its statistics to OUT/fleet.html, the prior of
-    the valid units (as `thermo_comp prior` does) to OUT/prior.yaml. A second
-    run fits only tests that are missing or have changed. Exit code 1 if a unit
-    has no valid calibration from all of its bags.
+    grouped by the serial in their metadata. Calibrations go to OUT/units, the
+    table of the tests to OUT/fleet.parquet and .csv, its statistics to
+    OUT/fleet.html, the prior from the valid units (see `thermo_comp prior`) to
+    OUT/prior.yaml. A second run fits only tests that are missing or have
+    changed. Exit code 1 unless every unit has a valid calibration from all of
+    its bags.
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
@@ -82,7 +85,7 @@ def fleet_fit(
                 progress=progress,
             )
         except KeyboardInterrupt:
-            out.note(f'interrupted: {state}, kept in {output}; the same command continues')
+            out.note(f'interrupted: {state}; the same command continues the run in {output}')
             raise
     _print_result(out, result, with_prior)
     out.end(
@@ -93,7 +96,6 @@ def fleet_fit(
 
 
 def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
-    """Print the tests, their problems, the units that stand out, and the files."""
     summary = result.summary
     out.table(
         ('test', 'serial', 'verdict', 'static ug', 'dynamic ug', 'bags'),
@@ -109,15 +111,15 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     )
     out.sources((row['name'], str(row['chosen']), None) for row in result.rows)
     for row in result.rows:
-        # The reservations already name the bags that were left out.
+        # Reservations, if any, include the bags that were left out.
         text = (row['problem'], row['reservations'] or row['left_out'])
         out.points(f'{row["name"]}: {problem}' for problem in text if problem)
     out.points(
-        f'{name}: tables, but no bag: thermo_comp convert makes bags' for name in result.skipped
+        f'{name}: has tables but no bag; thermo_comp convert makes bags' for name in result.skipped
     )
     out.points(
-        f'{outlier.name}: {outlier.label} {outlier.value:.4g} {outlier.unit}, '
-        f'median {outlier.middle:.4g}: {outlier.z:+.1f} sd'
+        f'{outlier.name}: {outlier.label} {outlier.value:.4g} {outlier.unit}, {outlier.z:+.1f} sd '
+        f'from the median {outlier.middle:.4g} of the units'
         for outlier in summary.outliers
     )
     out.points(
@@ -144,6 +146,6 @@ def _micro(value: object) -> str | None:
 
 
 def _short(name: object) -> str:
-    """Shorten a long name to its end, which differs most, so that the table fits 80 columns."""
+    """Shorten a long name to its last 21 characters, so that the table fits 80 columns."""
     clean = one_line(str(name))
     return clean if len(clean) <= 22 else f'~{clean[-21:]}'

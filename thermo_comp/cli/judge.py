@@ -21,10 +21,13 @@ if TYPE_CHECKING:
 
 def evaluate(
     bags: list[Path] = argument(
-        'Bags of one unit, any positions, or its rest logs.', metavar='BAG...'
+        'Bags of one unit in any positions, or rest logs of the unit.', metavar='BAG...'
     ),
     calibration: list[Path] = option(
-        'Calibration; further ones are compared with the first.', ..., '--calibration', '-c'
+        'Calibration (YAML); further calibrations are compared with the first.',
+        ...,
+        '--calibration',
+        '-c',
     ),
     judging: dict[str, Any] = options.judging,
     known_force: Any = options.force,
@@ -41,9 +44,9 @@ def evaluate(
     The verdict compares the RMS residual with --tolerance or, without
     --tolerance, with the uncertainty that the calibration claims for the same
     windows; six positions or more show which axis has shifted. Exit code 0
-    only if the calibration is shown to be valid. Rest logs of the node
-    instead of bags show the drift over the days, and the day from which it
-    exceeds the claimed uncertainty.
+    only if the bags show that the calibration is valid. Rest logs of the node
+    instead of bags show the drift over the days, and the day from which the
+    drift exceeds the claimed uncertainty.
 
     Example:
       thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug
@@ -59,7 +62,7 @@ def evaluate(
     if logs:
         if len(logs) < len(bags) or len(calibration) > 1 or csv is not None:
             raise options.usage(
-                'rest logs are evaluated alone, with one calibration, without --csv'
+                'rest logs need one calibration and no --csv, and cannot be mixed with bags'
             )
         evaluate_rests(logs, calibration[0], judging['gravity'], judging['tolerance'], out)
         return
@@ -103,7 +106,7 @@ def evaluate(
 
 
 def _print_axes(out: Output, judged: 'Judgement') -> None:
-    """Print the thermal drift of each axis and, if determined, the axis's shift since the fit."""
+    """Print the thermal drift of each axis and, if determined, its shift since the fit."""
     columns = ['axis', 'static ug', 'dynamic ug']
     title = 'thermal drift of each axis at rest (RMS of its windows)'
     if judged.shifts:
@@ -133,10 +136,9 @@ def _print_levels(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
-    """Print the changes of the constants from each calibration to the next."""
     if drifts:
         out.table(
-            ('from', 'to', 'constant', 'change', '+-', 'unit', 'sure'),
+            ('from', 'to', 'constant', 'change', '+-', 'unit', 'significant'),
             [
                 (
                     *(diff.earlier[:10], diff.later[:10], diff.constant, f'{diff.change:+.3g}'),
@@ -144,7 +146,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
                 )
                 for diff in drifts
             ],
-            title='drift between the calibrations, in a soak at the reference temperature',
+            title='changes of the constants, in a soak at the reference temperature',
         )
 
 
@@ -154,7 +156,8 @@ def print_sections(out: Output, judgements: Mapping[str, Any]) -> None:
     out.table(
         ('section', 'model', 'windows', 'RMS ug', 'max ug', 'claimed ug', 'ratio'),
         _sections(judgements, micro_g),
-        title=f'|f| - g over {window_s:g} s at rest; outside: beyond the calibrated ranges',
+        title=f'|f| - g over {window_s:g} s at rest; outside: beyond the calibrated '
+        'temperatures or rates',
     )
 
 
@@ -183,7 +186,7 @@ def report(
     output: Path = option('Page to write (HTML).', ..., '--output', '-o'),
     bags: list[Path] | None = options.JUDGED_BAGS,
     calibration: list[Path] | None = option(
-        'Calibration of the unit (YAML); several give its history.', None, '--calibration', '-c'
+        'Calibration of the unit (YAML); several show the changes.', None, '--calibration', '-c'
     ),
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,
@@ -194,11 +197,11 @@ def report(
     out: Output = options.out,
 ) -> None:
     """
-    Write the certificate of a unit: one HTML page, no network needed.
+    Write the certificate of a unit: one HTML page without network access.
 
     Shows temperatures, regime, |f| before and after the correction, the
     functions of temperature with their uncertainty, and the verdict of
-    evaluate, with the same exit code. `fit --report` reports the fit itself.
+    `evaluate`, with its exit code. `fit --report` writes the page of a fit.
 
     Example:
       thermo_comp report held_out.mcap -c unit42.yaml -o unit42.html

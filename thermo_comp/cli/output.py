@@ -3,9 +3,9 @@
 """
 Owns the output of the command line: tables, JSON, progress, and errors of a line each.
 
-Results go to stdout, everything about the run (progress, notes, errors) to stderr, so that a pipe
-carries results only. All output goes through `_print`: text from outside (serials, topics,
-metadata, file names) can neither forge a line nor move the cursor, and any terminal can show it.
+Results go to stdout, all texts about the run (progress, notes, errors) to stderr, so that a pipe
+carries results only. Serials, topics, metadata and file names may contain control characters and
+line breaks: `_print` escapes these, and characters that the terminal cannot encode.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..fitting.reduction import ReducedBag
 
 Cell = str | int | float | None
-# A number, or a dash for none.
+# Matches a cell with a number, or with a dash for None.
 _NUMBER = re.compile(r'-|[-+]?\d+\.?\d*(e[-+]\d+)?')
 
 
@@ -50,13 +50,13 @@ class Output:
             _print(f'thermo_comp: {text}', sys.stderr)
 
     def sources(self, bags: Iterable[tuple[object, str | None, str | None]]) -> None:
-        """Print which topics were chosen (equal notes once), and which parts are missing."""
+        """Print the notes on chosen topics (equal notes once), and the missing parts of bags."""
         alike: dict[str, list[object]] = {}
         for bag, chosen, missing in bags:
             if chosen:
                 alike.setdefault(chosen, []).append(bag)
             if missing:
-                # A missing part sets the exit code, so it is printed even with --quiet.
+                # A missing part sets the exit code, so the reason is printed with --quiet, too.
                 _print(f'thermo_comp: {bag}: {missing}', sys.stderr)
                 self._is_torn = True
         for chosen, names in alike.items():
@@ -64,7 +64,7 @@ class Output:
             self.note(f'{names[0]}{more}: {chosen}')
 
     def recordings(self, bags: Sequence[ReducedBag]) -> None:
-        """Print which topics were chosen, which parts are missing, and which bags were joined."""
+        """Print the notes on chosen topics, the missing parts of bags, and the joined bags."""
         self.sources((bag.info.path, bag.info.chosen, bag.info.truncated) for bag in bags)
         for bag in bags:
             if bag.parts:
@@ -144,7 +144,7 @@ def _shown(text: str, file: TextIO) -> str:
 
 
 def text(cell: Cell) -> str:
-    """Return a table cell as text: at most four significant digits, a dash for None."""
+    """Return a cell as text: floats with 4 digits, or as integers from 1000; None, NaN as dash."""
     if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
         return '-'
     if isinstance(cell, float):

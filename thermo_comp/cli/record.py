@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the command ``record``: records a test position by position, and shows missing data."""
+"""Owns the command ``record``: records a test, a bag per position, and shows missing data."""
 
 import re
 import shlex
@@ -32,26 +32,26 @@ _COLUMNS = ('no', 'up x', 'y', 'z', 'min', 'degC', 'K/min', 'state')
 def record(
     context: typer.Context,
     output: Path = option(
-        'Folder of the bags; existing bags belong to the test.', ..., '--output', '-o'
+        'Folder of the bags; bags already in it belong to the test.', ..., '--output', '-o'
     ),
     bag: Path | None = argument(
-        'Bag that another recorder writes, instead of topics.', None, metavar='[BAG]'
+        'Bag to read instead of live topics, also while it is written.', None, metavar='[BAG]'
     ),
-    positions: int = option('Positions wanted.', 18, min=1, max=999),
-    soak: str = option('Rest wanted in each position: 45min, 1.5h, 30s.', '45min'),
+    positions: int = option('Number of positions wanted.', 18, min=1, max=999),
+    soak: str = option('Time at rest wanted in each position: 45min, 1.5h, 30s.', '45min'),
     serial: str | None = option(
-        'Serial of the unit, for the bags.', callback=options.check_serial
+        'Serial of the unit, written to the bags.', callback=options.check_serial
     ),
-    finish: bool = option('First finish the bags that a crashed run has left.', False),
+    finish: bool = option('First complete the bags that a crashed run has left.', False),
     offset: float | None = options.OFFSET,
     topics: Any = options.reading,
     out: Output = options.out,
 ) -> None:
     """
-    Record a test, a bag per position, and show what is still missing.
+    Record a test, a bag per position, and show the missing data.
 
-    Listens to the driver (or follows a growing bag). Shows rests, their
-    temperatures and ramps, the expected accuracy of bias, scale and
+    Reads the topics of the driver, or a growing bag. Shows the positions with
+    their temperatures and ramps, the expected accuracy of bias, scale and
     misalignment, and the direction for the next position. Ends when the test
     is complete, or with Ctrl-C; the same command continues the test.
 
@@ -99,7 +99,7 @@ def record(
 def _read_earlier(
     out: Output, known: Sequence[Path], serial: str | None, test: 'Acquisition'
 ) -> str | None:
-    """Add the bags of earlier runs, each of a position, to the test; return the unit's serial."""
+    """Add the bags of earlier runs, one per position, to the test; return the unit's serial."""
     from ..recording.reader import open_recording
 
     with out.progress('reading the existing bags', total=len(known)) as done:
@@ -108,8 +108,8 @@ def _read_earlier(
                 of_bag = reader.info.metadata.get('serial')
                 if serial is not None and of_bag not in (serial, None):
                     raise ThermoCompError(
-                        f'{path} is of unit {of_bag}, not {serial}: record each unit into another '
-                        'folder'
+                        f'{path} is of unit {of_bag}, not {serial}: record each unit into a '
+                        'separate folder'
                     )
                 serial = serial or of_bag
                 for block in reader.blocks():
@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks as they arrive; yield the state of the test in each pause, until complete."""
+    """Write blocks until the test is complete; yield its state in each pause between blocks."""
     chosen: str | None = None
     for new in news:
         if new is not None:
@@ -149,7 +149,6 @@ def _end(
     offset: float | None,
     is_stopped: bool,
 ) -> None:
-    """Print the result of the test, and the command that fits a calibration to its bags."""
     rested = [position for position in account.positions if position.n_rests]
     out.table(_COLUMNS, _rows(rested))
     for line in _lines(account):
@@ -175,23 +174,22 @@ def _end(
 
 
 def _print_leftovers(out: Output, folder: Path, is_finishing: bool) -> None:
-    """Report unfinished bags in a folder, or finish them."""
     from ..recording import growing
 
     for path, number in growing.leftovers(folder).items():
         if not is_finishing:
-            out.note(f'{path} is bag {number} of a run that crashed; --finish completes the bag')
+            out.note(f'{path} is bag {number} of a crashed run; --finish completes the bag')
             continue
         try:
             made = growing.finish(path, number)
         except RecordingError as error:
             out.note(f'{error}: the bag cannot be completed')
         else:
-            out.note(f'{path.name}: {f"completed as {made}" if made else "no messages in it"}')
+            out.note(f'{path.name}: {f"completed as {made}" if made else "contains no messages"}')
 
 
 def _duration(text: str) -> float:
-    """Read a duration with its unit, like ``45min``, ``1.5h`` or ``30s`` [s]."""
+    """Return the seconds of a duration like ``45min``, ``1.5h`` or ``30s``."""
     match = re.fullmatch(r'\s*(\d+\.?\d*|\.\d+)\s*(h|min|s)\s*', text)
     if match is None or not float(match[1]):
         raise options.usage(f'--soak: expected a duration like 45min, 1.5h or 30s, got {text!r}')
@@ -201,14 +199,14 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print each change of the account since the last call on a line."""
+    """Print each change of the account since the last call on a line; `last`: printed texts."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)
     for number, position in enumerate(account.positions, 1):
         if position.n_rests:
             news[f'position {number}'] = f'{position.reason or "good"}; {_reading(position.up)}'
-    # The direction after the semicolon changes with the noise: it is not compared.
+    # The direction, after the semicolon, changes with the noise, so the direction is not compared.
     new = {name: text for name, text in news.items() if last.get(name) != text.partition(';')[0]}
     for name, text in new.items():
         last[name] = text.partition(';')[0]
@@ -248,7 +246,7 @@ def _now(account: 'Account') -> str:
 def _next(account: 'Account') -> str:
     from ..fitting.coverage import direction_text
 
-    by = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from here'
+    by = '' if isnan(account.next_deg) else f', {account.next_deg:.0f} deg from the present one'
     return f'next position: {direction_text(account.next_up)}{by}'
 
 

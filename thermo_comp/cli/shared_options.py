@@ -26,8 +26,8 @@ from ..text import valid_serial
 from ..unit.gravity import parse_acceleration
 from .output import Output
 
-# Placeholder of an option's value in `--help`, by the type of the value: short, so that a terminal
-# of 80 columns has room for the longest name.
+# Placeholder of an option's value in `--help`, by the value's type: short, so that the longest
+# name of an option fits a terminal of 80 columns.
 _VALUES: dict[Any, str] = {
     bool: ' ',
     **dict.fromkeys((int, int | None), 'N'),
@@ -36,7 +36,7 @@ _VALUES: dict[Any, str] = {
     **dict.fromkeys((Path, Path | None, list[Path], list[Path] | None), 'PATH'),
 }
 
-#: Options whose name differs from the name of the library's argument, by argument.
+#: Options whose names differ from the names of the library's arguments, by argument.
 _FLAGS = {
     'case_timeout_s': '--case-timeout',
     'forced': '--force-groups',
@@ -47,21 +47,21 @@ _FLAGS = {
     'transition_time_s': '--transition-time',
 }
 
-usage = typer.BadParameter  # error in the command line, with exit code 2
+usage = typer.BadParameter  # error in the command line, exit code 2
 
 
 def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:
-    """Return a typer option with its help text, default, flags (default: from its name), rules."""
+    """Return a typer option: help text, default, flags (default: from the parameter), rules."""
     return typer.Option(default, *flags, help=text, **rules)
 
 
 def argument(text: str, default: Any = ..., **rules: Any) -> Any:
-    """Return a typer argument, which has no flag, with its help text, default and rules."""
+    """Return a typer argument, which has no flag: help text, default and rules."""
     return typer.Argument(default, help=text, **rules)
 
 
 def expanded(command: Callable[..., Any]) -> Any:
-    """Turn a command, whose parameters are built from options, into a function of the options."""
+    """Turn a command into a function of all options from which its parameters are built."""
     makers: dict[str, Callable[..., Any]] = {}
     options: list[inspect.Parameter] = []
     for name, parameter in inspect.signature(command).parameters.items():
@@ -90,8 +90,8 @@ def expanded(command: Callable[..., Any]) -> Any:
 @contextmanager
 def usage_of(what: str = '', **flags: str) -> Iterator[None]:
     """
-    Turn a ValueError of a `with` block into a usage error. Its text begins with `what`, or else
-    names options instead of the library's arguments; `flags` gives the options of some arguments.
+    Turn a ValueError of a `with` block into a usage error. The error's text begins with `what`;
+    without `what`, names of options (`flags`, `_FLAGS`) replace the names of arguments in it.
     """
     try:
         yield
@@ -129,7 +129,8 @@ CERTIFICATE_INFO = option(
 )
 TABLE_RATE = option('Samples per second of a table without times.', min=0.01, callback=check_rate)
 SERIAL = option(
-    "Serial of the unit, instead of the bag's; '' accepts any calibration.", callback=check_serial
+    "Serial of the unit, instead of the bag's; '': accept a calibration of any unit.",
+    callback=check_serial,
 )
 OFFSET = option(
     'Reading of raw samples at zero force, in counts, e.g. 32768; default: detected.',
@@ -158,7 +159,7 @@ def named_topics(
     topic: list[str] | None = option(
         'Topic of an input: counts, imu, board, case, temperature/NAME.', metavar='INPUT=TOPIC'
     ),
-    topics: Path | None = option('File of topics, a line INPUT: TOPIC for each.', metavar='YAML'),
+    topics: Path | None = option('File of topics, with lines INPUT: TOPIC.', metavar='YAML'),
 ) -> dict[str, str]:
     """Return topics by input, from `--topic` and else from the file of `--topics`."""
     from ..recording.topics import parse_name, read_names
@@ -180,7 +181,7 @@ def _reading(
         metavar='S',
     ),
     end: float | None = option(
-        'End of the part to read, in the form of --from.', None, '--to', metavar='S'
+        'End of the part to read: seconds or a stamp, as for --from.', None, '--to', metavar='S'
     ),
 ) -> Any:
     from ..recording.topics import Part, Topics
@@ -245,7 +246,7 @@ def judging(
     window_s: float = option(
         'Length of a window at rest, in s.', 60.0, '--window', metavar='S', min=1e-3, max=86400.0
     ),
-    tolerance: str | None = option('Largest RMS of |f| - g you accept: 100ug, 0.5mg, 1e-3m/s^2.'),
+    tolerance: str | None = option('Largest accepted RMS of |f| - g: 100ug, 0.5mg, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
     """Return the keywords of `evaluation.evaluate`, which judges a calibration."""
@@ -272,10 +273,10 @@ def force(
         'Distance of the unit from the axis of rotation, in m.', min=1e-3
     ),
     radius_sd: float | None = option(
-        'Standard deviation of --radius, in m: the radius is then estimated.', min=0.0
+        'Standard deviation of --radius, in m, with which the radius is estimated.', min=0.0
     ),
 ) -> Any:
-    """Build what the user states about |f| in rests that are not at 1 g."""
+    """Build `ForceOptions`: the user's statements about |f| in rests that are not at 1 g."""
     from ..fitting.known_force import ForceOptions
 
     with usage_of():
@@ -297,28 +298,30 @@ def fitting(
         'Temperature at which the constants are stated, in degC.', 20.0, metavar='DEGC'
     ),
     min_rest_s: float | None = option(
-        'Shortest rest used, in s; default: 3, or less if short rests give more information.',
+        'Shortest rest used, in s; default: 3, or less if shorter rests give more information.',
         None,
         '--min-rest',
         metavar='S',
         show_default=False,
     ),
     still_sd: str = option(
-        "Largest sd of samples at rest: a few times the sensor's noise.", '50mg'
+        "Largest sd of samples at rest; state a few times the sensor's noise.", '50mg'
     ),
     mounting_sd: str | None = option(
         'Repeatability of mounting and turn-on (sd of the bias), e.g. 30ug; default: estimated '
         'from the bags.'
     ),
     k2_sd: float | None = option(
-        'Data-sheet bound (1 sd) of the quadratic nonlinearity, in ug/g^2; default: 100 if rests '
-        'are not all at 1 g, else none.',
+        'Data-sheet bound (1 sd) of the quadratic nonlinearity, in ug/g^2; default: 100 with '
+        '--k3-sd or if some rests are not at 1 g, else no nonlinearity.',
         min=1e-6,
     ),
     k3_sd: float | None = option(
-        'Data-sheet bound (1 sd) of the cubic nonlinearity, in ug/g^3; default: 10.', min=1e-6
+        'Data-sheet bound (1 sd) of the cubic nonlinearity, in ug/g^3; default: 10 with --k2-sd '
+        'or if some rests are not at 1 g, else no nonlinearity.',
+        min=1e-6,
     ),
-    allow: list[str] | None = option('Name of a refusal to override, as in its message.'),
+    allow: list[str] | None = option('Name of a refusal to override, stated in its message.'),
 ) -> dict[str, Any]:
     """Return keywords of `FitOptions`."""
     given = locals()

@@ -22,29 +22,29 @@ if TYPE_CHECKING:
     from ..simulation.spin import Spin
     from ..simulation.unit import UnitModel
 
-#: Topic of a rate table's rotation rate, interval between its messages [s], sd of the radius [m].
+#: Topic of a table's rotation rate, interval between two messages [s], sd of the radius [m].
 _RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
 
 def simulate(
     output: Path = option(
-        'Bag to write; with several positions a directory of them.', ..., '--output', '-o'
+        'Bag to write; with several positions, folder of the bags.', ..., '--output', '-o'
     ),
     unit: str = option(
-        'Kind of unit: thermostatted, bare-quartz, mems, or demo (that of the sample bags).',
+        'Kind of unit: thermostatted, bare-quartz, mems, or demo (the unit of the sample bags).',
         'thermostatted',
     ),
-    unit_seed: int = option('Seed of the specimen of the chosen kind of unit.', 1, min=0),
+    unit_seed: int = option('Seed of the random parameters of the unit.', 1, min=0),
     plan: str | None = option(
-        'A whole test, instead of --profile and --positions: chamber-18, chamber-9, '
-        'tumble, tumble-3, tumble-1, held-out; on a rotation: centrifuge or rate-table.'
+        'Plan of a whole test, instead of --profile and --positions: chamber-18, chamber-9, '
+        'tumble, tumble-3, tumble-1, held-out, or with rotation: centrifuge, rate-table.'
     ),
     profile: str | None = option(
         'Chamber program: a name (default: chamber), or steps of a temperature in degC, @ a rate '
         "in K/min, and a soak, as '20 30min, 35@0.5 1h, 5@1 1h'."
     ),
     positions: int | None = option('Number of positions, a bag each; default: 1.', min=1, max=999),
-    position_seed: int = option('Seed of the set of positions.', 0, min=0),
+    position_seed: int = option('Seed of the random positions.', 0, min=0),
     rate_hz: float = option('Conversion cycles per second.', 100.0, min=0.1, max=1e5),
     temperature_rate_hz: float | None = option(
         "Temperature readings per second; default: the sensors' rate.", min=1e-4, max=100.0
@@ -52,7 +52,10 @@ def simulate(
     seed: int = option('Seed of the noise.', 0, min=0),
     gravity: float = option('Local gravity in m/s^2.', STANDARD_GRAVITY),
     imu: bool = option(
-        'Write sensor_msgs/Imu, with the angular rate if the unit has a gyroscope.', False, '--imu'
+        'Write sensor_msgs/Imu instead of counts, with the angular rate if the unit has a '
+        'gyroscope.',
+        False,
+        '--imu',
     ),
     level: int = option(
         'Compression of the bags (zstd level): 1 is fast, 19 gives the smallest files.',
@@ -61,9 +64,9 @@ def simulate(
         max=19,
     ),
     k2: float = option(
-        'Quadratic nonlinearity K2 of all axes in ug/g^2; it changes by 1 %/K.', 0.0
+        'Quadratic nonlinearity K2 of all axes in ug/g^2; K2 changes by 1 %/K.', 0.0
     ),
-    k3: float = option('Cubic nonlinearity K3 of all axes in ug/g^3; it changes by 1 %/K.', 0.0),
+    k3: float = option('Cubic nonlinearity K3 of all axes in ug/g^3; K3 changes by 1 %/K.', 0.0),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -71,8 +74,8 @@ def simulate(
     Simulate bags of a thermal test with known truth.
 
     The unit is simulated from its physics (heat flow, parts with
-    temperature coefficients, noise, converter); the truth is in each bag's
-    metadata.
+    temperature coefficients, noise, converter); the metadata of each bag
+    contain the true parameters.
 
     Example:
       thermo_comp simulate --rate-hz 2 --positions 12 -o bags/sim
@@ -141,7 +144,7 @@ def simulate(
 def _metadata(
     unit: 'UnitModel', station: 'Position', truth: dict[str, Any], gravity: float, is_known: bool
 ) -> dict[str, str]:
-    """Return the metadata of a bag: serial, truth, and for a rotation how |f| is known."""
+    """Return a bag's metadata: serial, true parameters, for a rotating unit the source of |f|."""
     from .. import __version__
     from ..fitting import known_force
 

@@ -4,10 +4,10 @@
 Owns the reading of an IMU and a barometer from logs of autopilots, by the optional dependencies
 ``px4`` and ``ardupilot``.
 
-An IMU's thermometer lags the surroundings: its readings become the board temperature. The readings
-of the barometer's thermometer follow the surroundings: they become the case temperature, or the
-board temperature if the IMU has no thermometer. A simulator's log is refused: without noise the
-fit cannot weight its samples.
+The thermometer of an IMU lags the surroundings, so its readings become the board temperature. The
+thermometer of a barometer follows the surroundings, so its readings become the case temperature,
+or the board temperature if the IMU has no thermometer. A simulator's log is refused, because the
+fit cannot weight samples without noise.
 
 PX4's ULog (``.ulg``): ``sensor_accel`` holds the driver's samples before PX4's corrections, with
 the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher rate. If
@@ -58,7 +58,7 @@ _Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, _Co
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
-_NO_NOISE = 1e-6  # largest sd at rest that is rounding, as in a simulator's log [g]
+_NO_NOISE = 1e-6  # a smaller sd at rest is a rounding error, as in a simulator's log [g]
 _AXES = ('x', 'y', 'z')
 _PROFILE = 'add 4 to SDLOG_PROFILE (thermal calibration): PX4 then logs sensor_accel at 10 Hz'
 _BAROMETERS = {'vehicle_air_data': 'baro_temp_celcius', 'sensor_baro': 'temperature'}
@@ -160,7 +160,7 @@ def _ulog(path: Path) -> _Held:
             name,
             [0, *(int(change[0]) * 1000 for change in changes)],
             [float(log.initial_parameters.get(name, 0)), *(float(row[2]) for row in changes)],
-            f'the log holds sensor_combined alone: {_PROFILE}',
+            f'the log has only sensor_combined: {_PROFILE}',
         )
         compensated = dict.fromkeys(accels, correction)
     imus = {}
@@ -185,7 +185,7 @@ def _combined(columns: _Columns) -> list[_Columns]:
     relative = _column(columns, 'accelerometer_timestamp_relative')
     rows = np.flatnonzero(np.isfinite(relative) & (relative != _NOT_THERE))
     stamp_us = columns['timestamp'][rows].astype(np.int64) + relative[rows].astype(np.int64)
-    # A message with a new rate alone repeats the last accelerometer sample and its stamp.
+    # A message with a new angular rate only repeats the last accelerometer sample and its stamp.
     is_new = np.diff(stamp_us, prepend=stamp_us[:1] - 1) != 0
     names = [f'{name}[{i}]' for name in ('accelerometer_m_s2', 'gyro_rad') for i in range(3)]
     parts = _vectors(columns, names)[rows[is_new]].T.reshape(2, 3, -1)
@@ -194,7 +194,7 @@ def _combined(columns: _Columns) -> list[_Columns]:
 
 
 def _stamps(columns: _Columns) -> Ints:
-    """Return stamps from times since boot [us]; `NO_STAMP` if negative or over a century."""
+    """Return stamps from times since boot [us]; `NO_STAMP` for times < 0 or over a century."""
     # New logs have the time of the sample, old logs only the time of its publication.
     micros = columns['timestamp_sample' if 'timestamp_sample' in columns else 'timestamp']
     size = micros.astype(np.float64)
@@ -212,7 +212,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the angular rate to the accelerometer's stamps; None if it is not sufficient."""
+    """Interpolate the angular rate to the accelerometer's stamps; None if sparse or not finite."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -252,7 +252,6 @@ def _dataflash(path: Path) -> _Held:
                     title = label.decode('ascii', 'replace')
                     changes.setdefault(title, []).append((int(at) * 1000, float(value)))
                 continue
-            # In old logs the first IMU has the type IMU, the second IMU has the type IMU2.
             old = int(name[-1]) - 1 if name[-1].isdigit() else 0
             table |= {'timestamp': stamp_us, 'I': table.get('I', np.full(len(stamp_us), old))}
             for number in np.unique(table['I'][: len(stamp_us)]).tolist():
@@ -278,7 +277,7 @@ def _dataflash(path: Path) -> _Held:
         name = f'INS_TCAL{number + 1}_ENABLE'
         course = changes.get(name) or [(0, float(reader.params.get(name, 0.0)))]
         since_ns, values = zip(*course, strict=True)
-        advice = 'set it to 0 and record again'
+        advice = f'set {name} to 0 and record again'
         compensated[number] = _Correction(name, since_ns, values, advice)
     return imus, baros, compensated
 
@@ -329,7 +328,7 @@ def _instance(present: Mapping[int, T], wanted: int | None, what: str, path: Pat
 
 
 def _reported(readings: Readings) -> Readings:
-    """Drop invalid readings, and all readings if all are 0: the sensor has no thermometer."""
+    """Drop invalid readings; drop all if all are 0, because the sensor has no thermometer."""
     use = np.isfinite(readings.celsius) & (readings.stamp_ns != NO_STAMP)
     use &= bool(readings.celsius[use].any())
     return readings.take(use)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the reading of bags, of ROS 1 and 2, with topics and units other than those of thermo_comp.
+Owns the reading of bags, of ROS 1 and 2, with topics and units other than those of the node.
 
 Drivers choose their topic names, and some drivers do not publish m/s^2. The Imu topic is found by
-its type. The thermometer in the namespace of the Imu becomes the board's, a thermometer in the
-namespace of a barometer the case's. The norm of samples at rest must be gravity in their unit.
+its type. The thermometer in the namespace of the Imu becomes the board thermometer, a thermometer
+in the namespace of a barometer the case thermometer. The norm of samples at rest must be gravity.
 """
 
 from pathlib import Path, PurePosixPath
@@ -32,7 +32,7 @@ def bag_log(
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
-    """Read a bag; search the topics that are None; `unit` is the unit of the Imu topic."""
+    """Read a bag; search for topics that are None; `unit`: unit of acceleration of the Imu."""
     present = inspect_recording(path).topics
     with translated(path):
         inputs = find_topics(present, imu, board, case)

@@ -5,9 +5,9 @@ Owns column maps of tables: the content and unit of each column, and the message
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table without headings, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: times rise from row to row, and the norm of readings at rest is
-gravity, which gives their unit. An angular rate is taken to be in deg/s if its numbers, as rad/s,
-would be faster than a turn by hand.
+wz]`` as for imu_tk, is guessed: times rise from row to row, and the norm of samples at rest is
+gravity, from which the unit follows. An angular rate is taken to be in deg/s if its numbers, as
+rad/s, would be faster than a turn by hand.
 """
 
 from collections.abc import Sequence
@@ -35,19 +35,19 @@ _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
 #: A turn by over `_TURN` rad within two blocks of `_BLOCK` samples, between still blocks (sd below
-#: `_QUIET` g), excludes times in ms; intervals of up to `_SLOW_S` s are then plausible.
+#: `_QUIET` g), is too fast for times in ms; intervals of up to `_SLOW_S` s are then plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
-#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up
-#: may be in this range, but its steps are larger than this interval.
+#: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up,
+#: taken as seconds, may be in this range, but its steps are larger than this interval.
 _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: Largest ratio of the range of temperatures in a log to the duration of the log [K/s]; a hair
 #: dryer warms a board by some 0.1 K/s.
 _FASTEST_K_S = 0.5
 # Largest share of rows in which a temperature in whole degrees changes. The numbers of boards or
-# sensors in a column alternate from row to row, so they change in a larger share of the rows.
+# sensors in a column alternate from row to row, so these numbers change in more of the rows.
 _FEW_CHANGES = 0.1
-_RISING = 0.7  # smallest share of rows with a later time than the row before; times may repeat
+_RISING = 0.7  # smallest share of rows with a later time than the row before; the rest may repeat
 #: A step from the uppermost to the lowest tenth of a counter's range is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
@@ -58,7 +58,6 @@ _GIVE_MAP = f'give {_A_MAP}'
 class Accel:
     """
     The accelerometer's three columns; `output` is the message written, counts or Imu (m/s^2).
-
     `clip`: lowest and highest reading, at which the sensor is saturated, in the table's unit;
     `offset`: reading at zero force, which is subtracted, such as 32768 in offset binary.
     """
@@ -356,7 +355,7 @@ def _stamp(
         # Shortest possible duration of the log [s], as boards change by at most `_FASTEST_K_S`.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
-        # Take the largest unit with a plausible interval between samples: 5 ms is, 5 s is not.
+        # Take the largest unit that gives a plausible interval between samples (5 ms, not 5 s).
         for unit, exponent in STAMP_EXPONENTS.items():
             size = 10.0 ** (exponent - 9)
             begin, step_s = first * size, step * size
@@ -368,7 +367,6 @@ def _stamp(
 
 
 def _no_time(column: Column | None, steps: Floats) -> str:
-    """Describe the fault of a column of times."""
     if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
         shown = f'{(steps == 0.0).mean():.0%}'
         return (
@@ -384,7 +382,7 @@ def _no_time(column: Column | None, steps: Floats) -> str:
 
 
 def _turns_at_once(accel: Floats) -> bool:
-    """Whether the unit turns between still blocks, faster than possible with times in ms."""
+    """Whether the unit turns between still blocks faster than by hand, if times were in ms."""
     blocks = accel[: len(accel) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, 3)
     mean = blocks.mean(axis=1)
     size = np.linalg.norm(mean, axis=1, keepdims=True)

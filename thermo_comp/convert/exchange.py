@@ -42,9 +42,8 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write the constants and the curves of soaks in the format of one of `TOOLS`: return `text`, and
+    Write the constants and the static curves in the format of one of `TOOLS`: return `text`, and
     `notes` on the parts of the calibration that are lost.
-
     `number` is the number of the parameter set or IMU, if the file numbers them; PX4 matches the
     sensor by `device_id`. With `up`, the attitude as a unit vector, the error of scale times
     gravity is added to the offset of an autopilot.
@@ -58,8 +57,8 @@ def export_calibration(
         content = _thermal(calibration, curves, reference_c, up)
         K = ' '.join(f'{factor:.6g}' for factor in curves.K)
         of_counts = (
-            f'offsets are counts divided by K: the driver must scale counts with K of x y z {K} '
-            'counts per m/s^2'
+            f'the offsets are in m/s^2: the driver must divide counts by K of x y z {K} counts '
+            'per m/s^2'
         )
     else:
         content = _constant(calibration, curves)
@@ -117,7 +116,7 @@ def _thermal(
 ) -> Content:
     """Return each axis' offset over temperature as a cubic, for an autopilot."""
     d, notes = curves.temperature - reference_c, []
-    # The driver divides counts by K before the tool's correction; it leaves m/s^2 unchanged.
+    # Before the tool's correction the driver divides counts by K, but does not change m/s^2.
     gain = curves.K if calibration.unit.input == 'm/s^2' else np.ones(3)
     loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
     offset = (curves.level / curves.K)[:, None] + curves.bias + loads[:, None] * curves.scale
@@ -125,7 +124,7 @@ def _thermal(
     cubics, misfit = _cubics(d, offset)
     if misfit > 0.01 * MICRO_G:
         notes.append(f'cubics replace the bias functions: error up to {ug_text(misfit)}')
-    folded = 'folded into the offset at one attitude'
+    folded = 'included in the offset for one attitude'
     if curves.scale_drift > 1e-8:
         lost = f'{_millionths(curves.scale_drift)} ppm'
         notes.append(f'scale over temperature is {folded if up else "lost"}: up to {lost}')
@@ -159,7 +158,7 @@ def _constant(calibration: Calibration, curves: _Curves) -> Content:
     drift = 'the calibration has no correction for temperature'
     if calibration.needs_temperature:
         drift = (
-            f'over the calibrated range the bias moves by up to '
+            f'over the calibrated range the bias changes by up to '
             f'{ug_text(float(np.max(np.abs(curves.bias))))}, the scale by '
             f'{_millionths(curves.scale_drift)} ppm'
         )

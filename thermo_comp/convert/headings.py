@@ -86,7 +86,6 @@ def read_headings(
 ) -> Headings | None:
     """
     Recognise columns by their headings; None if no accelerometer is among the columns.
-
     `is_plausible`: whether the values of a column, taken in a unit, can be temperatures
     """
     names = {_plain(heading): heading for heading in reversed(headings)}

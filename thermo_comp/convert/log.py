@@ -39,8 +39,8 @@ _TOLERANCE = 0.2
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12
-# Ratio of the sd of a cell's samples to the quiet level above which the unit is handled: the sd of
-# 12 samples of noise stays within a factor of 2 of the mean sd.
+# Ratio of the sd of a cell's samples to the quiet level above which the unit is handled; noise
+# alone gives cells of 12 samples a ratio below 2.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
@@ -50,7 +50,7 @@ PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # number of rows processed at a time, to limit the memory
 _EXAMPLES = 5
 _RESTART_NS = 10**9  # a larger backward step of stamps is a restart of the clock [ns]
-SLOW_HZ = 5.0  # sample rate below which a log has no short rests, only soaks
+SLOW_HZ = 5.0  # sample rate below which short rests have too few samples [Hz]
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class ForeignLog:
 
 @dataclass(frozen=True)
 class Stillness:
-    """Rests and movements of a log; `magnitude` and `noise` in its unit, NaN for few samples."""
+    """Rests and movements of a log; `magnitude`, `noise`: in the log's unit, NaN if unknown."""
 
     magnitude: float  # median |a| of the quiet cells
     noise: float  # median sd per axis of the quiet cells
@@ -206,7 +206,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
     reason = contradiction(log.unit, stillness.magnitude, log.counts_per_g)
     if reason is not None:
         raise RecordingError(
-            f'the accelerometer is stated in {log.unit}, but {reason}', path=log.path
+            f'the stated unit of the accelerometer is {log.unit}, but {reason}', path=log.path
         )
     low, high = PLAUSIBLE_CELSIUS
     for name, readings in log.temperatures.items():
@@ -223,7 +223,7 @@ def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
 def _log_times(stamp_ns: Ints, shifts: Ints | None = None) -> tuple[Ints, Ints]:
     """
     Return log times that never decrease, and the shift added after each restart of the clock [ns].
-    For readings of a thermometer, give the `shifts` of the samples to shift both alike.
+    For readings of a thermometer, give the samples' `shifts`, so that both get the same shifts.
     """
     is_restart = np.diff(stamp_ns, prepend=stamp_ns[:1]) < -_RESTART_NS
     if shifts is None or len(shifts) != is_restart.sum():
@@ -248,7 +248,7 @@ def _without_impossible(log: ForeignLog) -> tuple[ForeignLog, int]:
 
 
 def _write(log: ForeignLog, output: Path, force: bool, progress: Callable[[float], None]) -> None:
-    """Write the messages with log times that never decrease, which keeps the order of rows."""
+    """Write the messages with log times that never decrease, so that the order of rows is kept."""
     topics, n = Topics(), len(log.stamp_ns)
     newest, shifts = _log_times(log.stamp_ns)
     per_g = PER_G.get(log.unit, log.counts_per_g or 1.0)
@@ -341,6 +341,6 @@ def contradiction(stated: str, magnitude: float, counts_per_g: float | None) -> 
     if stated != 'counts':
         return None if inferred == stated else f'{reason}: that looks like {inferred}'
     if counts_per_g is not None and abs(magnitude / counts_per_g - 1.0) > _TOLERANCE:
-        text = f'|a| at rest is {magnitude:.4g} counts, {counts_per_g:g} per g are stated'
+        text = f'|a| at rest is {magnitude:.4g} counts, but {counts_per_g:g} counts/g are stated'
         return f'{text}: is there an `offset`?' if magnitude > 2.0 * counts_per_g else text
     return f'{reason}: that looks like {inferred}' if magnitude < 50.0 else None

@@ -30,12 +30,12 @@ def kind_of(path: Path) -> Literal['table', 'log', 'bag']:
 
 def read_log(path: Path, **given: Any) -> ForeignLog:
     """
-    Read a table, a PX4 or ArduPilot log, or a bag with other topics.
+    Read a table, a PX4 or ArduPilot log, or a bag with topics or units other than the node's.
 
     Table: `columns` is the path of a table's column map (default: guessed), `rate_hz` the sample
     rate of a table without times. Log: `imu` and `baro` are numbers from 0, `allow_compensated`
     accepts samples that the autopilot has corrected. Bag: `topic` maps ``imu``, ``board`` and
-    ``case`` to topics, `unit` is the unit of the Imu topic.
+    ``case`` to topics, `unit` is the unit of acceleration of the Imu topic.
 
     Raises ValueError for a keyword that does not apply to this kind of file, RecordingError if the
     file cannot be read.

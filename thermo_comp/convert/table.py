@@ -36,10 +36,10 @@ Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 
 _SNIFF_BYTES = 65536
-_LAYOUT_ROWS = 50  # number of rows, the last of the first 64 KiB, that decide the layout
+_LAYOUT_ROWS = 50  # number of rows at the end of the first 64 KiB from which the layout follows
 _PREAMBLE_ROWS = 1000  # largest number of rows before the table, as some loggers write
 _ROWS_AT_ONCE = 4096  # number of rows whose cells are read together
-_MOST_ROWS_PER_BYTE = 4  # more rows per byte of a Parquet file are not measurements
+_MOST_ROWS_PER_BYTE = 4  # largest plausible number of rows per byte of a Parquet file
 #: Powers of ten from a unit of time to nanoseconds.
 STAMP_EXPONENTS: dict[TimeUnit, int] = {'s': 9, 'ms': 6, 'us': 3, 'ns': 0}
 #: Date of ISO 8601, in UTC unless an offset is given; the name of a zone may follow in brackets.
@@ -135,7 +135,7 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # Most rows may lack last cells, of a slower thermometer: take the width of whole rows.
+        # Most rows may lack the last cell, of a slower thermometer: use the width of full rows.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))
@@ -318,7 +318,6 @@ def read_parquet(
 ) -> Table:
     """
     Read columns of a Parquet file as `read_text` does; timestamps of Parquet state their unit.
-
     If `columns` is None all columns are read, and columns without numbers become NaN.
     """
     pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file', path)

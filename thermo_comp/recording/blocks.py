@@ -32,13 +32,13 @@ BLOCK_MESSAGES = 1 << 15
 #: Stands for the stamp of a message without a stamp: the earliest stamp that a header can hold.
 NO_STAMP_NS = -(2**31) * 10**9
 _JUMP_NS = 10**9  # a larger backward step of the stamps is a jump of time [ns]
-LONGEST_PAUSE_NS = 3600 * 10**9  # a longer jump of the stamps is shortened to this [ns]
+LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
 #: Largest number of jumps in a recording with a valid clock.
 _MOST_JUMPS = 100
 # A thermometer uses another clock than the accelerometer if at least this number of its readings
 # has a median distance from the stamps of the samples around them above the second number [s].
 _FEWEST_READINGS, _APART_S = 10, 10.0
-#: `Readings.thinned` keeps an unchanged reading after this time [ns]: the sensor is not lost.
+#: Time between two equal readings that `Readings.thinned` keeps [ns].
 _REPEAT_NS = 10_000_000_000
 #: Duration of a recording above which the mean interval between messages is limited, and the
 #: largest mean interval [ns].
@@ -56,8 +56,8 @@ class Topic(NamedTuple):
 
 class BagFile:
     """
-    An open file of a bag. `topics` are by channel number; `definitions` are encoding and text by
-    message type; `truncated` describes missing data. Errors name the file by its `path`.
+    An open file of a bag: `topics` by channel number, `definitions` (encoding and text) by message
+    type, a description `truncated` of missing data, and the `path` that errors name.
     """
 
     storage = 'mcap'
@@ -76,10 +76,10 @@ class BagFile:
 class RecordingInfo:
     """
     The content of a bag, known before its messages are read.
-    `topics`: message type (several joined by `` | ``) and number of messages by name. Start and
-    end are log times, or 0. `truncated` describes the missing part; `metadata` holds the writer's
-    pairs of key and value; `input` is the kind of accelerometer topic that is read; `chosen` has
-    notes on topics selected by their type and on stamps.
+    `topics`: message type (several joined by `` | ``) and number of messages by name. `start_ns`
+    and `end_ns` are log times, 0 without messages. `truncated` describes the missing part;
+    `metadata` holds the writer's pairs of key and value; `input` is the kind of the accelerometer
+    topic; `chosen` has notes on topics selected by their type and on stamps.
     """
 
     path: Path
@@ -113,7 +113,7 @@ class ImuColumns(NamedTuple):
 
     @classmethod
     def of_rate(cls, rate: Floats | None) -> ImuColumns:
-        """Build from angular rates, or None; covariances are unknown, no orientation (REP 145)."""
+        """Build from angular rates or None; orientation absent, covariances unknown (REP 145)."""
         none, unknown = np.array([-1.0] + 8 * [0.0]), np.zeros(9)
         level = np.array([0.0, 0.0, 0.0, 1.0])
         if rate is None:
@@ -137,8 +137,8 @@ class Readings(NamedTuple):
         return Readings(self.stamp_ns[which], self.celsius[which])
 
     def thinned(self) -> Readings:
-        """Keep finite readings that differ from the last one kept, and a reading every 10 s."""
-        # A table repeats a reading in each row until the next; repeats look like a stuck sensor.
+        """Keep finite readings that differ from the last kept one, and a reading every 10 s."""
+        # A table repeats a reading in each row up to the next reading, as a stuck sensor does.
         kept: list[int] = []
         last_ns, last = 0, math.nan
         rows = zip(self.stamp_ns.tolist(), self.celsius.tolist(), strict=True)
@@ -156,8 +156,8 @@ class Block:
     """
     Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
     `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu; `imu`
-    holds the other fields of sensor_msgs/Imu. The keys of `temperatures` are thermometers; those
-    of `log_ns` and, if requested, of the serialized messages `raw` are roles.
+    holds the other fields of sensor_msgs/Imu. The keys of `temperatures` are thermometers; the
+    keys of `log_ns` and, if requested, of the serialized messages `raw` are roles.
     """
 
     accel_stamp_ns: Ints
@@ -252,9 +252,9 @@ def joined(blocks: Sequence[Block]) -> Block:
 
 def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
-    Give a reading without a stamp the newest stamp of the samples before the reading; `last_ns` is
-    the newest stamp before the block. Return the block and its newest stamp. Readings before the
-    first sample are dropped. Log times would depend on the speed of a playback.
+    Give a reading without a stamp the newest stamp of the samples before the reading, and not the
+    log time, which depends on the speed of a playback; `last_ns` is the newest stamp before the
+    block. Return the block and its newest stamp. Readings before the first sample are dropped.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -282,7 +282,7 @@ def _restamp(messages: Messages, stamp_ns: Ints) -> None:
 
 def unstamped(stamp_ns: int) -> str:
     """Return the message for samples that all have the same stamp."""
-    return f'all its samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
+    return f'all samples are stamped {stamp_ns * 1e-9:g} s: the driver does not stamp them'
 
 
 def clocks_apart(block: Block) -> str:
@@ -306,8 +306,9 @@ def clocks_apart(block: Block) -> str:
 def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
-    A clock that is set during a recording leaves a gap of years, too long for a grid over time.
-    After an hour without readings the thermal state is unknown. RecordingError for invalid clocks.
+    A clock that is set during a recording leaves a gap of years, too long for a grid over time. A
+    gap of an hour suffices: after it the thermal state is unknown. RecordingError for more than
+    `_MOST_JUMPS` jumps, or, above `_SPARSE_NS`, messages at mean intervals over `_SPARSEST_NS`.
     """
     last_ns: int | None = None
     offset = 0
@@ -330,7 +331,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
         n_messages += len(read)
         span_ns += int(np.sum(np.where(is_jump, LONGEST_PAUSE_NS, np.maximum(steps, 0))))
         if n_jumps > _MOST_JUMPS or span_ns > max(_SPARSE_NS, n_messages * _SPARSEST_NS):
-            reason = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days, '
+            reason = f'{n_messages} messages stamped over {span_ns / 86400e9:.0f} days with '
             reason += f'{n_jumps} jumps by more than an hour: no recording of a thermal test'
             raise RecordingError(clocks_apart(block) or reason, path)
         offsets = np.empty_like(moved)

@@ -40,18 +40,18 @@ class CauseCounter:
         """Describe why the samples cannot be those of an accelerometer at rest; '' if they can."""
         if self._n_absent > _FAULT_SHARE * self._n:
             return (
-                'its messages are marked as without acceleration '
-                '(linear_acceleration_covariance[0] = -1): another topic of the driver has it'
+                'the messages are marked as without acceleration '
+                '(linear_acceleration_covariance[0] = -1): use another topic of the driver'
             )
         if self._n > 1 and len(self._stamps_ns) == 1:
             return unstamped(next(iter(self._stamps_ns)))
         if self._n_zero == self._n and self._n:
-            return 'all its samples are exactly zero: the sensor does not answer'
+            return 'all samples are exactly zero: the sensor does not answer'
         if self._n_zero > _GLITCH_SHARE * self._n:
             share = 100.0 * self._n_zero / self._n
             return (
-                f'{share:.0f} % of its samples are exactly zero, between others: two sources on '
-                'one topic, or messages without an acceleration'
+                f'{share:.0f} % of the samples are exactly zero, between other samples: the topic '
+                'has two sources, or messages without an acceleration'
             )
         return self._unit_of(cells, still_sd) if self._is_imu else ''
 
@@ -67,7 +67,7 @@ class CauseCounter:
             if _WITH_GRAVITY[0] < norm / one_g < _WITH_GRAVITY[1] and sd < still_sd * one_g:
                 return (
                     f'samples at rest have the norm {norm:.4g}, not {STANDARD_GRAVITY:.2f} m/s^2: '
-                    f'its samples are in {unit}, make them m/s^2 with thermo_comp convert'
+                    f'the samples are in {unit}, convert them to m/s^2 with thermo_comp convert'
                 )
         if norm < _WITHOUT_GRAVITY * STANDARD_GRAVITY and sd < still_sd * STANDARD_GRAVITY:
             return (

@@ -43,11 +43,11 @@ MESSAGE = int(Opcode.MESSAGE)
 _ENDS_EARLY = 'a record ends too early'
 _ZERO_OPCODE = 'a record has the opcode 0'
 MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
-#: A file may expand to `_MAX_GROWTH` times its size plus `_FREE_GROWTH_BYTES` [bytes].
+#: A compressed file may expand to `_MAX_GROWTH` times its size plus `_FREE_GROWTH_BYTES` [bytes].
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
 _MAX_WINDOW = 1 << 27
-_STEP_BYTES = 1 << 16  # size of a decompressed piece: at most this is lost before a damage [bytes]
+_STEP_BYTES = 1 << 16  # size of a decompressed piece; at most one piece before a damage is lost
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,
@@ -131,7 +131,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
             data = inflate(compression, data[data_at:], MAX_CHUNK_BYTES, is_torn=True)
             return scan_records(data, on_record)[0]
         if head.length != span.length or head.size != span.size:
-            raise DamagedError('its size differs from the index of the file')
+            raise DamagedError('its size differs from that in the index of the file')
         data = inflate(compression, data[data_at : span.length], span.size, span.size + 1)
         if len(data) != span.size:
             raise DamagedError(f'{len(data)} bytes after decompression, expected {span.size}')
@@ -148,7 +148,7 @@ def load(read_at: Callable[[int, int], bytes], span: Span, on_record: OnRecord) 
 
 
 def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
-    """Find all messages of a complete chunk, with the message index after it as a hint."""
+    """Find all messages of a complete chunk, if possible by the message index after the chunk."""
     messages = _indexed(data, index)
     if messages is None:
         messages, reason = scan_records(data, on_record)
@@ -158,7 +158,7 @@ def locate(data: Bytes, index: memoryview, on_record: OnRecord) -> Messages:
 
 
 def _indexed(data: Bytes, index: memoryview) -> Messages | None:
-    """Find messages by a chunk's message index; None if they do not fill the chunk exactly."""
+    """Find messages by a chunk's index; None if the messages do not fill the chunk exactly."""
     columns: list[Ints] = []
     begin = 0
     while begin + _INDEX_HEAD.size <= len(index):
@@ -247,7 +247,7 @@ def expand(packed: Path, target: Path) -> str | None:
 def inflate(
     compression: str, packed: Any, limit: int, step: int = _STEP_BYTES, *, is_torn: bool = False
 ) -> Bytes:
-    """Decompress bytes, of a torn chunk the readable part; DamagedError for over `limit` bytes."""
+    """Decompress bytes, or the readable part of a torn chunk; DamagedError above `limit` bytes."""
     if not compression:
         return np.asarray(packed)
     pieces: list[bytes] = []
@@ -266,7 +266,7 @@ def inflate_ros1_chunk(packed: bytes) -> bytes:
 
 
 def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[bytes]:
-    """Decompress bytes, or a zstd file, by `step` bytes; DamagedError for over `limit` bytes."""
+    """Decompress bytes or a zstd file in pieces of `step` bytes; DamagedError above `limit`."""
     n_left = limit
     for piece in iter(partial(_reader(compression, source), step), b''):
         n_left -= len(piece)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # Standard normal quantiles of the probabilities 0.1 and 1 - 1e-11.
 _TENTH, _NEVER = -1.2816, 6.7
-# Noise is coloured if a cell's degrees of freedom are below this share of those of white noise;
+# Noise is coloured if a cell's degrees of freedom are below this fraction of those of white noise;
 # smallest number of degrees of freedom of a cell; number of iterations in `spread_of_variances`
 # and of trial values in `roughest_at_rest`.
 _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
@@ -29,8 +29,7 @@ _COLOURED, _FEWEST_FREE, _ITERATIONS = 0.5, 2.0, 30
 def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats:
     """
     Return the spread of the variances of cells at rest, relative to white noise, per axis: the
-    ratio of the 1 - 1e-11 quantile to the 0.1 quantile, divided by this ratio for white noise.
-
+    ratio of the 1 - 1e-11 quantile to the 0.1 quantile, divided by that ratio of white noise.
     With a correlation r of successive samples the effective number of samples is (1 - r) / (1 + r)
     times their number, and the roughness is 1 - r times the mean variance. The mean variance
     follows from the tenth percentile `level` of the variances and the effective number of samples.
@@ -53,7 +52,6 @@ def spread_of_variances(cells: Cells, plausible: Bools, level: Floats) -> Floats
 def roughest_at_rest(cells: Cells, quiet: Bools, is_coloured: Bools, ratio: float) -> Floats:
     """
     Return the largest roughness of a cell at rest, per axis; infinite for white noise.
-
     Coloured noise hides a step in a cell's mean and variance, but not in the changes from sample
     to sample. The roughness is taken as chi-square distributed, with the degrees of freedom that
     give the ratio of its tenth percentile to its median.

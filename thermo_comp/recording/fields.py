@@ -45,7 +45,7 @@ def typestore() -> Any:
 
 
 def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitions:
-    """Return message definitions with that of `kind`, from the bag or else from ROS 2 Jazzy."""
+    """Return the message types of ROS 2 Jazzy; a definition of `kind` in the bag comes first."""
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
     defined: dict[str, Any] = {}
@@ -65,7 +65,7 @@ def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitio
 
 
 def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[str]:
-    """List the number fields with `temp` in their names, without minima and maxima."""
+    """List the fields of numbers with `temp` in their names, except minima and maxima."""
     try:
         fields = definitions_of(kind, known)[kind][1]
     except RecordingError:
@@ -82,14 +82,14 @@ def temperature_fields(kind: str, known: Mapping[str, tuple[str, str]]) -> list[
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A number in messages of a type, given its path; RecordingError if no number is there."""
+    """A number in messages of the type `kind`, at the end of a `path` of field names."""
 
     kind: str
     path: str
     definitions: Definitions
 
     def __post_init__(self) -> None:
-        """Refuse a path that does not end at a number."""
+        """Raise RecordingError for a path that does not end at a number."""
         self._find(Messages.of([], [], []), self.path)
 
     @property

@@ -13,14 +13,14 @@ _SDS = 25.0
 # Smallest distance of a glitch from the mean of its neighbours, as a share of the norm of the
 # samples: single samples of a converter that carries its remainder flip by one count.
 _LEAST = 0.02
-# Smallest number of samples for which the noise is estimated; in fewer no glitch is detected.
+# Smallest number of samples among which glitches are searched, because the noise is estimated.
 _FEWEST = 30
 
 
 def is_glitch(samples: Floats, quantum: Floats) -> Bools:
     """
-    Return which samples, shape (n, 3), are glitches: a glitch is far from both neighbours, these
-    agree, and no motion is near. A glitch that stays in the data would end a rest, like a knock.
+    Return which samples, shape (n, 3), are glitches: a glitch is far from its two neighbours, the
+    neighbours agree, and no motion is near. A glitch left in the data would end a rest.
     """
     result = np.zeros(len(samples), dtype=bool)
     if len(samples) < _FEWEST:
@@ -38,7 +38,7 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
         far[1:-1] = bend > limit
         if far.any():
             far[1:-1] &= np.abs(x[2:] - x[:-2]) < 0.5 * bend
-    # A glitch has three calm samples on each side, beside its two neighbours.
+    # A glitch has three calm samples on each side, beyond its two neighbours.
     at = np.flatnonzero(is_far.any(axis=1))
     beside = np.array([-4, -3, -2, 2, 3, 4])
     around = np.clip(at[:, np.newaxis] + beside, 0, len(samples) - 1)

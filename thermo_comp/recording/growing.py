@@ -3,10 +3,10 @@
 """
 Owns live recording: new messages of a bag that another program writes, and numbered bags.
 
-Each pass reads the growing bag from its beginning, so the pauses grow with the duration of a pass.
-New messages are written with the node's topic names to numbered bags, from `01.mcap` on. The end
-of a position is recognised with a delay, so the newest messages are held back until the position
-that they belong to is known.
+Each pass reads the growing bag from its beginning; the pause after a pass is at least five times
+as long as the pass. New messages are written with the node's topic names to numbered bags, from
+`01.mcap` on. The end of a position is recognised with a delay, so the newest messages are held in
+memory until their position is known.
 """
 
 import re
@@ -25,7 +25,7 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # content of a chunk, lost if the process is killed: 17 s of 100 Hz counts
+_CHUNK_BYTES = 1 << 17  # size of a chunk, 17 s of counts at 100 Hz; a killed process loses a chunk
 _PERIOD_S = 1.0
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.
@@ -52,7 +52,8 @@ def growing_blocks(
         try:
             reader = open_recording(path, topics, require=())
         except RecordingError:
-            # A recorder creates a file before it writes records: an empty or growing file is new.
+            # A recorder creates a file before it writes records, so an empty or growing file that
+            # is not a bag yet is no error.
             before, size = size, _size(path)
             if n_seen or 0 < size == before:
                 raise
@@ -97,8 +98,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Copy an unfinished bag to a bag with `number`, or else the next free number, and delete the
-    unfinished bag; None for a bag without messages. RecordingError for an unreadable bag.
+    Copy an unfinished bag to a bag with `number` (the next free number if this is taken), and
+    delete the unfinished bag; None for a bag without messages. RecordingError if it is unreadable.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

@@ -46,8 +46,8 @@ _MAX_HELD_BYTES = 1 << 26  # largest memory for messages of overlapping chunks [
 _CUTS = {
     0: 'it is unreadable from byte {at} on',
     int(Opcode.CHUNK): 'it ends inside a chunk, of which the first {} messages are read',
-    int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk, which is read whole',
-    -1: 'it ends inside a record, and everything before this record is read',
+    int(Opcode.MESSAGE_INDEX): 'it ends inside the index of its last chunk; the chunk is complete',
+    -1: 'it ends inside a record; all records before it are read',
 }
 #: Record types other than messages that are read.
 _KINDS: Mapping[int, Any] = {
@@ -131,7 +131,7 @@ class McapFile(BagFile):
         if summary == 0:
             return at
         if not begin <= summary <= at:
-            raise DamagedError(f'the footer puts the summary at byte {summary}')
+            raise DamagedError(f'the summary cannot be at byte {summary}, as the footer states')
         if at - summary <= _MAX_SUMMARY_BYTES:
             self._read_summary(self._read_at(summary, self._size - summary))
         return summary
@@ -188,7 +188,7 @@ class McapFile(BagFile):
     def _scan(self, at: int, end: int | None) -> None:
         """Read the file record by record; if `end` is None, up to the last complete message."""
         stop = self._size if end is None else end
-        words = 'it ends between two records, so more may have followed'
+        words = 'it ends between two records, so further records may be missing'
         spans = [Span(0, 0)]
         while at < stop:
             head = self._read_at(at, min(HEAD_BYTES, stop - at))
@@ -197,7 +197,7 @@ class McapFile(BagFile):
             is_next = at == last.position + last.length + last.index_length
             if len(head) < PREFIX.size or at + step > stop or opcode == 0:
                 if end is not None:
-                    raise DamagedError(f'the record at byte {at} is not whole')
+                    raise DamagedError(f'the record at byte {at} is not complete')
                 words = _CUTS.get(opcode, _CUTS[-1]).format('{}', at=at)
                 if opcode == 0 and at == last.position + last.length:
                     # Let the span contain zeros, so that `scan_records` drops its last message.
@@ -220,7 +220,8 @@ class McapFile(BagFile):
             elif opcode in _KINDS and length <= _MAX_SMALL_RECORD:
                 self._on_record(opcode, self._read_at(at + PREFIX.size, length))
             elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                raise DamagedError(f'the record at byte {at} has {length} bytes')
+                limit = f'limit {_MAX_SMALL_RECORD} bytes'
+                raise DamagedError(f'the record at byte {at} has {length} bytes, {limit}')
             elif opcode in {Opcode.DATA_END, Opcode.FOOTER}:
                 words = 'its summary is missing, but all messages are there'
                 break
@@ -269,7 +270,7 @@ def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Me
         if sum(len(piece.data) for piece in held.values()) > _MAX_HELD_BYTES:
             raise DamagedError(
                 'too many of its chunks overlap in time to be read in bounded memory; '
-                'sort its messages by time with another tool'
+                'sort the messages of the file by time with another tool'
             )
         if ready:
             yield join_messages(ready).in_order()

@@ -19,20 +19,20 @@ from .reader import RecordingReader, open_recording
 from .stillness import STILL_SD, CellAccumulator, still_intervals, why_restless
 from .topics import PLAIN, Topics, shown
 
-#: Range of readings that are probably in kelvins: in degC a board would not survive them.
+#: Range of readings that are probably in kelvins: no board survives such temperatures in degC.
 KELVINS = (180.0, 480.0)
 _RAMP_WINDOW_S = 120.0  # time over which the rate of a ramp is averaged [s]
 _CELL_S, _MIN_REST_S = 0.5, 3.0  # lengths of a cell and of the shortest still interval [s]
 _GAP_INTERVALS = 5.0  # shortest gap, in median intervals between samples
 _NO_SAMPLES = (
-    'no accelerometer samples: record accel/counts or imu/uncompensated, or name yours with '
-    '--topic counts=TOPIC or --topic imu=TOPIC'
+    'no accelerometer samples: record accel/counts or imu/uncompensated, or name another topic '
+    'with --topic counts=TOPIC or --topic imu=TOPIC'
 )
 
 
 @dataclass(frozen=True)
 class ThermometerSurvey:
-    """A thermometer: range [degC], largest rates of 2-min means [K/min], smallest step [K]."""
+    """A thermometer: range [degC], largest rates of its 2-min means [K/min], quantum [K]."""
 
     n: int
     rate_hz: float
@@ -46,7 +46,7 @@ class ThermometerSurvey:
 @dataclass(frozen=True)
 class Survey:
     """
-    Summary of a recording for a fit. The rate of samples is the inverse of their median interval;
+    Summary of a recording. The sample rate is the inverse of the median interval between samples;
     still intervals last at least 3 s; findings describe obstacles to a fit.
     """
 
@@ -69,8 +69,8 @@ def thermal_findings(
     board = thermometers.get('board')
     if board is None:
         findings.append(
-            'no board temperature: a thermal fit needs temperature/board, or name yours with '
-            f'--topic board=TOPIC{among}'
+            'no board temperature: a thermal fit needs temperature/board, or another topic given '
+            f'with --topic board=TOPIC{among}'
         )
     else:
         heating, cooling = board.steepest_heating_k_min, -board.steepest_cooling_k_min
@@ -82,7 +82,7 @@ def thermal_findings(
         for name, rate in (('heating', heating), ('cooling', cooling)):
             if rate < RAMP_K_MIN:
                 findings.append(
-                    f'no {name} ramp: record one, or {name} is corrected by extrapolation'
+                    f'no {name} ramp: {name} will be corrected by extrapolation; record a ramp'
                 )
     for name, thermometer in thermometers.items():
         reads = f'{name} reads {thermometer.lowest:.4g} .. {thermometer.highest:.4g}'
@@ -92,19 +92,19 @@ def thermal_findings(
             findings.append(f'temperature/{reads} degC: that looks like kelvins')
     if 'case' not in thermometers:
         findings.append(
-            'no case temperature: the regime will follow the slower board sensor; name yours '
-            f'with --topic case=TOPIC{among}'
+            'no case temperature: the regime will be detected from the slower board thermometer; '
+            f'name a case thermometer with --topic case=TOPIC{among}'
         )
     return findings
 
 
 def unused_thermometers(reader: RecordingReader) -> list[str]:
-    """List unused topics that may hold a temperature: of a barometer, the air, another IMU."""
+    """List unused topics that may hold a temperature, as of a barometer or another IMU."""
     candidates = []
     paths = {role: field.path for role, field in reader.fields.items()}
     used = {(name, paths.get(role)) for role, name in reader.topics.items()}
     for name, (kind, count) in sorted(reader.info.topics.items()):
-        # A Temperature, Float32 or Float64 needs no field name.
+        # Messages of the types Temperature, Float32 and Float64 need no field name.
         if not count or not used.isdisjoint({(name, None), (name, PLAIN.get(kind))}):
             continue
         if kind == TEMPERATURE or (kind in PLAIN and 'temp' in name.lower()):
@@ -206,7 +206,7 @@ class _Clock:
         later = stamp_ns[not self.n :]
         steps = np.diff(later, prepend=self.last_ns)
         self.n, self.last_ns = self.n + len(stamp_ns), int(stamp_ns[-1])
-        # After a step back by an hour or less, samples up to the newest stamp are left out.
+        # After a backward step by an hour or less, samples up to the newest stamp are left out.
         restarts = np.flatnonzero(steps < -LONGEST_PAUSE_NS)
         self.n_restarts += len(restarts)
         for number, part in enumerate(np.split(later, restarts)):

@@ -54,7 +54,6 @@ _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
-
     The roles in `require` must be in the bag. `info` describes the bag; after all blocks are read,
     `info.truncated` names the missing messages. `topics` are the bag's topics by role, `fields`
     the fields that hold the reading of a thermometer, by role, `definitions` encoding and text by
@@ -77,7 +76,7 @@ class RecordingReader(ExitStack):
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
             bare = [role for role, field in self.fields.items() if not field.has_stamp]
-            note = f'no stamps in {", ".join(bare)}: dated by the sample before each reading'
+            note = f'no stamps in {", ".join(bare)}: a reading gets the stamp of the last sample'
             chosen = '; '.join(filter(None, (selected.chosen, note if bare else '')))
             self.info = replace(self.info, input=selected.input, chosen=chosen or None)
         except BaseException as error:
@@ -89,7 +88,7 @@ class RecordingReader(ExitStack):
         #: Time from the bag's first sample to the first sample of the selected part [s]; 0 until
         #: this sample has been read.
         self.since_s = 0.0
-        self.apart = ''  # warning about a clock that does not run or a second clock, if found
+        self.apart = ''  # warning about stamps that are all equal, or of a second clock
 
     def _fields(self, selected: Selected) -> Iterator[tuple[Role, Field]]:
         for role, path in selected.fields.items():
@@ -181,7 +180,7 @@ class RecordingReader(ExitStack):
                 self.info = replace(self.info, truncated=losses)
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
-        """Read serialized messages of topics (the bag's names), roughly in log-time order."""
+        """Read serialized messages of topics (the bag's names) in batches, in reading order."""
         for _, channels, messages in self._read(topics, {'cdr'}):
             for number, topic in channels.items():
                 if len(batch := messages.of_channels([number])):
@@ -269,7 +268,7 @@ def _described(path: Path) -> _Description:
             if files:
                 if len({re.sub(r'_[0-9]+$', '', file.stem) for file in files}) > 1:
                     raise RecordingError(
-                        f'a folder of several bags: give its {len(files)} *{suffix} files', path
+                        f'a folder of several bags: name its {len(files)} *{suffix} files', path
                     )
                 note = 'metadata.yaml is missing, the recording was not finished'
                 return _Description(suffix[1:], tuple(sorted(files, key=_place_of)), note=note)

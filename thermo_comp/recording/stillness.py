@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns still intervals: sums samples to short cells (count, mean, variance) and finds still cells.
+Owns still intervals: sums samples in short cells (count, mean, variance) and finds still cells.
 
 Two tests are relative to the noise of the bag's quiet cells: the variance inside a cell
 (vibration, handling) and the step between adjacent cells (a turn, a knock). A step starts a new
-interval, because a tilt by a microradian already changes a reading by a micro-g. Temperature also
-tilts a unit at rest, so a steady change over several cells, slower than the Earth rotates, is a
-drift and not a step. Two tests have absolute limits, because the quietest tenth of a flight is not
-a rest: the scatter of a sensor at rest is below `still_sd`, and its angular rate near a level.
+interval, because a tilt by a microradian already changes a sample by a micro-g. Temperature also
+tilts a unit at rest, so a steady change over several cells of at most 50 micro-g/s is a drift and
+not a step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest:
+at rest the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its level.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ VARIANCE_RATIO = 4.0
 #: in most flights.
 STILL_SD = 0.05
 # Largest sd of the angular rate within a cell at rest, and largest distance of a cell's mean rate
-# from the level [rad/s]. The level is the median rate over `_LEVEL_S` [s]: it follows the drift.
+# from the level [rad/s]. The level, interpolated medians of `_LEVEL_S` [s], follows a bias drift.
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # `without_rotation` subtracts from the angular rate its median over this time [s].
 _ROTATION_S = 10.0
 # Smallest step between adjacent cells that ends a rest, in robust sd of all steps.
 _STEP_SDS = 8.0
-# The drift is the median of this number of steps between cells; largest drift [g/s].
+# Number of steps between cells whose median is the drift; largest drift [g/s].
 _DRIFT_STEPS, _DRIFT = 9, 5e-5
-# Number of samples searched for a quantum, and number of changes that must be whole multiples of
-# the smallest change, to prove that this is the quantum.
+# Number of samples searched for a quantum; smallest number of changes that show the quantum if all
+# are whole multiples of the smallest change.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that a cell of slow samples may fill
-_LONGEST_CELL_NS = 86400e9  # a longer cell is due to wrong stamps [ns]
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that one cell may fill at low rates
+_LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
 MIN_SAMPLES = 30  # smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
 _WORD = 32768.0  # middle of the range of unsigned 16-bit numbers
@@ -59,10 +59,10 @@ class Cells:
     mean time of a cell's samples since `start_ns` [s]; `index` the cell's number on the time grid.
     Samples that are not finite or whose stamp does not rise are dropped, as are glitches, see
     `is_glitch`. `n_repeated` counts the samples with the stamp of the sample before. `quantum` is
-    the step between the possible values of the samples, or 0; `middle` is 32768 for unsigned
-    16-bit words, else 0; rates are in rad/s. `roughness` is half the mean square change from
-    sample to sample, which equals the variance for white noise; `seam` is the change from the last
-    sample of the cell before, if adjacent, to a cell's first sample.
+    the step between the possible values of the samples, or 0 if unknown; `middle` is 32768 for
+    unsigned 16-bit words, else 0; rates are in rad/s. `roughness` is half the mean square change
+    from sample to sample, which equals the variance for white noise; `seam` is the change from the
+    last sample of the adjacent cell before to a cell's first sample, 0 after a gap.
     """
 
     start_ns: int
@@ -93,8 +93,8 @@ class Cells:
 
 class CellAccumulator:
     """
-    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer.
-    Whole cells fill a window of `window_s`, or `STRETCHES` windows if a cell is longer.
+    Reduces streamed samples to cells of `cell_s`, or of `least` samples if these last longer. A
+    whole number of cells fills a window of `window_s`, or several (`STRETCHES`) for longer cells.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class CellAccumulator:
             self._sums = [np.empty((0, 15 if rate is None else 21))]
         self._last_ns = int(stamp_ns[-1])
         for first in range(0, len(samples), _QUANTUM_SAMPLES):
-            # Samples that are equal to the sample before do not show the quantum.
+            # Repeated samples do not show the quantum, so `_n_looked_at` does not count them.
             if self._n_looked_at >= _QUANTUM_SAMPLES:
                 break
             part = samples[first : first + _QUANTUM_SAMPLES - self._n_looked_at]
@@ -162,7 +162,7 @@ class CellAccumulator:
         self._accumulate(stamp_ns, samples, rate)
 
     def forget(self, stamp_ns: int) -> None:
-        """Drop the cells before a stamp."""
+        """Drop the cells before a stamp [ns]."""
         first = (stamp_ns - self._start_ns) // max(self._cell_ns, 1)
         n = int(np.searchsorted(self.cells().index, first))
         self._sums = [self._sums[0][n:]]
@@ -207,8 +207,8 @@ class CellAccumulator:
         step, between = float(np.median(steps)), 0.0
         gaps = steps[steps > 10.0 * step]
         if gaps.sum() > 0.5 * steps.sum():
-            # A buffer that is polled gives bursts of samples at a constant interval, at most 5 s,
-            # and a cell contains two bursts. Pauses of a tumble by hand are irregular or longer.
+            # A polled buffer gives a burst of samples at a constant interval of at most 5 s; a
+            # cell then has two bursts. Pauses of a tumble by hand are irregular or longer.
             usual = float(np.median(gaps))
             is_regular = np.mean(np.abs(gaps - usual) < 0.2 * usual) > 0.9
             if is_regular and usual < 5e9:
@@ -248,7 +248,7 @@ class CellAccumulator:
 
 
 def widened(full_scale: float, samples: Floats) -> float:
-    """Return the full scale of 24- or 32-bit words if most samples exceed 16 bits."""
+    """Return `full_scale`, or that of 24- or 32-bit words if most samples exceed 65536."""
     size = np.max(np.abs(samples), axis=1) if len(samples) else np.zeros(1)
     if np.median(size) < 2.0 * _WORD:
         return full_scale
@@ -267,20 +267,19 @@ def _part_of(window_s: float, least: float) -> float:
 def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
     """
     Return the quantum of each axis from the changes between samples; 0 without a quantum.
-
-    `few`: for each axis the changes of earlier samples, if they were too few; it is updated.
+    `few`: the changes of earlier samples of each axis, as long as these are fewer than three.
     """
     result = np.zeros(3)
     for axis in range(3):
         changes = np.abs(np.diff(samples[:, axis]))
         changes = np.sort(np.concatenate((few[axis], changes[changes > 0.0])))
-        # One change or two may be turns of the unit.
+        # One or two changes may be turns of the unit.
         few[axis] = changes[: 3 * (len(changes) < 3)]
         if len(changes) < 3:
             continue
-        # Changes of the same multiple of the quantum differ by rounding only.
+        # Changes by the same multiple of the quantum differ by rounding only. A quantum is shown
+        # by few different changes, a single one, or whole multiples of the smallest change only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
-        # All changes must be whole multiples of the smallest change.
         steps = changes / changes[0]
         is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()
         if n_levels < 0.2 * len(changes) or n_levels == 1 or is_whole:
@@ -330,7 +329,8 @@ def still_runs(
         quiet = plausible & (cells.variance <= ratio * noise + by_drift).all(axis=1)
         roughest = roughest_at_rest(cells, quiet, colour > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
-        # At rest the samples on both sides of a seam differ by at most `_STEP_SDS` sd of noise.
+        # At rest the last sample of a cell and the first sample of the next cell differ by at most
+        # `_STEP_SDS` sd of a difference of two samples.
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
         # Exclude cells adjacent to a moving cell or to a step: the motion may extend into them.
@@ -361,18 +361,18 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
     if full.any() and not (full & under).any():
         least = np.sqrt(np.min(cells.variance[full].max(axis=1))) / _one_g(cells)
         return (
-            f'its samples scatter by at least {1e3 * least:.3g} mg (sd), the limit at rest is '
+            f'the samples scatter by at least {1e3 * least:.3g} mg (sd), the limit at rest is '
             f'{1e3 * still_sd:.3g} mg (--still-sd): was the unit worn, driven or shaken?'
         )
     if (full & under & _is_turning(cells)).sum() > 0.5 * full.sum():
-        return 'its angular rate is never that of a rest (is it in rad/s?)'
+        return 'the angular rate mostly varies more than at rest (is the rate in rad/s?)'
     edges = np.diff(np.r_[0, (full & under).astype(np.int8), 0])
     runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
     longest_s = float(np.max(runs, initial=0)) * cells.cell_s
     longest = f'{longest_s:.3g}' if longest_s < 999.5 else f'{longest_s:.0f}'
     return (
-        f'it is quiet for {longest} s at most, as if worn or driven: the unit must rest in '
-        'each position'
+        f'the unit is quiet for {longest} s at most, as if worn or driven, but must rest in each '
+        'position'
     )
 
 
@@ -410,7 +410,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, plausible: Bools) -> Floats:
-    """Return the median step between cells around each pair of cells, limited, (n - 1, 3)."""
+    """Return the median of the steps around each step between cells, limited, (n - 1, 3)."""
     both = plausible[1:] & plausible[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2

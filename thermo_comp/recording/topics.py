@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the search for the topics of the inputs in a bag, and messages for missing topics."""
+"""Owns the search for the inputs' topics in a bag, and error messages for missing topics."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
 _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
 #: Message of the commands and of the node for a topic that is named for two inputs.
 TWINS = (
-    'one topic for both {} and {}: a single thermometer is the board, leave the other input out'
+    'one topic for both {} and {}: name a single thermometer as the board, not as another input'
 )
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
-_FIRST_STAMP_S = 1e8  # limits of a `Part` from here on are stamps [s]: the year 1973
+_FIRST_STAMP_S = 1e8  # limits of a `Part` from this number on are stamps (the year 1973) [s]
 
 #: Message type and number of messages of each topic of a bag.
 Present = Mapping[str, tuple[str, int]]
@@ -108,7 +108,7 @@ class Topics:
     def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
         """
         Build from topics by input: ``counts``, ``imu``, ``board``, ``case``, ``temperature/NAME``.
-        If only counts or only Imu is among them, this input is read.
+        If the topic of only one of ``counts`` and ``imu`` is given, this input is read.
         """
         roles: dict[str, Any] = {}
         further = {}
@@ -138,7 +138,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Topics and fields by role, the kind of accelerometer input, a note on topics by type."""
+    """Topics and fields by role, kind of accelerometer input, note on topics chosen by type."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]
@@ -174,7 +174,7 @@ def is_thermometer(name: str) -> bool:
 
 
 def shown(name: str) -> str:
-    """Return a name from a bag without control characters and shortened, safe to print."""
+    """Return a name from a bag as safe to print: shortened, without control characters."""
     return one_line(name if len(name) <= _MAX_SHOWN else name[:_MAX_SHOWN] + '...')
 
 
@@ -291,7 +291,7 @@ def _text_of_corrected(name: str) -> str:
 
 
 def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
-    """Ask whether an unused temperature topic is the board's; '' without such topics."""
+    """Return advice on unused temperature topics, one of which may be the board's, or ''."""
     names = [
         shown(name)
         for name, (kind, count) in present.items()
@@ -300,13 +300,13 @@ def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> st
     if not names:
         return ''
     text = ' or '.join(sorted(names))
-    return f'no {board}: is it {text}? name it with --topic board=TOPIC'
+    return f'no {board}: if the board thermometer is {text}, give --topic board=TOPIC'
 
 
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find those in `topics.further`, and thermometers in the namespace of board or case."""
+    """Find the thermometers `topics.further`, and others in the namespace of board or case."""
     both = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))
@@ -364,7 +364,7 @@ def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -
     if corrected and not {'counts', 'imu'}.isdisjoint(wanted):
         listed += f'; {_text_of_corrected(corrected)}'
     if wanted.keys() == {'imu'} and any(is_called(name, _USUAL.counts) for name in present):
-        listed += '; the calibration or --input wants an Imu in m/s^2, not counts'
+        listed += '; the calibration or --input requires an Imu in m/s^2, not counts'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
     return RecordingError(
         f'no such topic; the bag has {listed}; name another with {option}',

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns everything that touches ROS: node, parameters, diagnostics, player, recorders."""
+"""Owns all code that uses rclpy: node, parameters, diagnostics, player, recorders."""

@@ -46,7 +46,7 @@ class Traffic:
     n_lost: int = 0  # samples that the driver sent and the node did not receive
     n_unpublished: int = 0  # output messages that the middleware did not accept
     n_malformed: int = 0  # messages that could not be read
-    n_flags: int = 0  # regime flags published, one for each deciding reading
+    n_flags: int = 0  # regime flags published, one for each reading from which the regime follows
     n_fallback: int = 0  # samples that rclpy had to convert to the plain form
     n_contested: int = 0  # messages dropped because more than one publisher may have sent them
 
@@ -121,8 +121,8 @@ class SampleConverter:
 
 def read_temperature(data: bytes) -> tuple[int, float] | None:
     """Read stamp [ns] and temperature of a serialized Temperature; None for malformed bytes."""
-    # rclpy's deserialization would cost as much as several samples: its code is not in the cache
-    # of a node that sleeps between samples.
+    # rclpy's deserialization would take the CPU time of several samples, because its code is not
+    # in the processor's cache when the node wakes up.
     data, start = _plain(data, 16, Temperature)
     if not start:
         return None

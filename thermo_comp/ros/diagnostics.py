@@ -31,10 +31,10 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # time without samples until readings apply [s]; Fast DDS may deliver 3 s late
+IDLE_S = 5.0  # time without samples until readings are used [s]; Fast DDS may deliver 3 s late
 #: Readings stamped later than the samples by more than this time use another clock [s].
 AHEAD_S = 5.0
-#: The samples have stopped if the next sample is late by more than both times [cycles], [s].
+#: Samples have stopped if the next sample is late by the larger of two times [cycles], [s].
 SILENT_CYCLES, SILENT_S = 5.0, 0.5
 #: Largest error of |f| at rest without a warning, in standard deviations of the error.
 GRAVITY_SIGMAS = 5.0
@@ -59,14 +59,14 @@ _RISEN = {
 }
 
 _FAULTS = {
-    Fault.STILL: 'stands still to the bit, its uncertainty grows',
-    Fault.FROZEN: 'frozen while the other thermometer moves: not used',
+    Fault.STILL: 'stands still (equal readings), its standard deviation grows',
+    Fault.FROZEN: 'frozen (equal readings) while the other temperature changes: not used',
     Fault.STEP: 'jumped by {:+.2f} K; its readings are not used',
     Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
 }
 
 _BEYOND_FORCE = (
-    'above the largest of the fit: the nonlinear terms are extrapolated, the covariance grows'
+    'above the largest |f| of the fit: the nonlinear terms are extrapolated, the covariance grows'
 )
 
 Finding = tuple[int, str]  # level and text
@@ -108,8 +108,8 @@ class Reporter:
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._inputs(), *self._lost_rests()]
         findings += findings_of(loaded, status, new, rate, silence_s)
-        # Without a nonlinearity the warning begins 1 g above the fit's |f|, where the unknown
-        # square term has an sd of 0.1 mg, and not at each acceleration of a vehicle.
+        # If the calibration has no nonlinear terms, the warning begins 1 g above the fit's |f|,
+        # where the unknown square term has an sd of 0.1 mg, and not at each vehicle acceleration.
         least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > least:
             findings.append((_WARN, f'|f| {over:.3g} m/s^2 {_BEYOND_FORCE}'))
@@ -157,7 +157,6 @@ class Reporter:
             self._relay.traffic.n_lost += n_lost
 
     def _inputs(self) -> Iterator[Finding]:
-        """Yield the problems with publishers of inputs."""
         for name, source in self._relay.inputs.items():
             n_publishers, topic = source.count_publishers(), source.subscription.topic_name
             if n_publishers > 1 and source.sources.is_contested:
@@ -168,10 +167,9 @@ class Reporter:
                 yield _WARN, f'{n_publishers} publishers on {topic}, of which one sends'
             elif not n_publishers and (mismatch := _mismatch(self._node, source.subscription)):
                 level = _ERROR if name in ('sample', 'board') else _WARN
-                yield level, f'no messages of a publisher on {topic}: {mismatch}'
+                yield level, f'messages of a publisher on {topic} are not received: {mismatch}'
 
     def _lost_rests(self) -> Iterator[Finding]:
-        """Yield a warning with the reason if rests could not be written to the rest log."""
         rests = self._relay.rests
         if rests is not None and rests.log.reason:
             lost = counted(rests.log.n_lost, 'rest')
@@ -299,7 +297,7 @@ def findings_of(
     elif status.is_board_lost and needs_board:
         yield _ERROR, f'board temperature {status.board_age_s:.1f} s old, nothing is published'
     elif status.is_board_stale and math.isfinite(status.board_age_s):
-        yield _WARN, f'board temperature {status.board_age_s:.1f} s old, held'
+        yield _WARN, f'board temperature {status.board_age_s:.1f} s old, but still used'
     for name, (level, text) in _RISEN.items():
         if new[name]:
             yield level, f'{text.format(full_scale=unit.full_scale)}: {new[name]}'
@@ -313,7 +311,7 @@ def findings_of(
         yield _ERROR, SWAPPED
     gravity = status.gravity
     if gravity is not None:
-        missed = f'|f| at rest misses gravity by {gravity.residual:+.2e}'
+        missed = f'|f| at rest differs from gravity by {gravity.residual:+.2e}'
         missed += f' +- {gravity.residual_sd:.1e} m/s^2'
         if status.is_refuted:
             yield _ERROR, f'{missed}: another unit, or an axis reversed? Nothing is published'

@@ -4,9 +4,9 @@
 Owns the node's parameters: their table, and the services that set them.
 
 The table of the parameters is `NodeConfig`. The node runs with one immutable `NodeConfig`; a
-change makes a new `NodeConfig` or is refused as a whole. Files are read while a separate thread
-waits; the node's loop then replaces the reference to the `NodeConfig`. Requests are answered in
-order of arrival, but a request without a file does not wait for requests with files.
+change makes a new `NodeConfig` or is refused as a whole. A separate process reads files, while a
+thread waits for it; the node's loop then replaces the reference to the `NodeConfig`. Requests are
+answered in order of arrival, but a request without a file does not wait for requests with files.
 """
 
 import math
@@ -67,8 +67,8 @@ class NodeConfig:
     )
     topics: str = _parameter(
         '',
-        'Inputs whose topics have other names: INPUT=TOPIC[:FIELD], separated by commas, or a '
-        'file of such lines, as in config/drivers. Fixed at start.',
+        'Topics of inputs, if not the default topics: INPUT=TOPIC[:FIELD], separated by commas, '
+        'or a file like those in config/drivers. Fixed at start.',
         longest=4096,
         is_fixed=True,
     )
@@ -81,8 +81,8 @@ class NodeConfig:
     )
     input: str = _parameter(
         'counts',
-        'Input to compensate: accel/counts (Vector3Stamped) or imu/uncompensated (Imu). Default: '
-        'the input that `topics` names.',
+        'Input to compensate: accel/counts (Vector3Stamped) or imu/uncompensated (Imu). If '
+        '`topics` names one of the two at the start, that input is used.',
         choices=('counts', 'imu'),
     )
     frame_id: str = _parameter(
@@ -92,7 +92,7 @@ class NodeConfig:
     )
     transition_time: float = _parameter(
         _DEFAULTS.transition_time_s,
-        'Time over which the coefficients change from one regime to the other [s]; up to ten '
+        'Time over which the coefficients change after a switch of the regime [s]; up to ten '
         'times as long if the output would change faster than 1 ug per second; 0: at once.',
         (0.0, 3600.0),
     )
@@ -103,7 +103,8 @@ class NodeConfig:
     )
     case_timeout: float = _parameter(
         _DEFAULTS.case_timeout_s,
-        'Age of the last case temperature from which the board sensor decides the regime [s].',
+        'Age of the last case temperature above which the regime follows from the board '
+        'temperature alone [s].',
         (0.1, 86400.0),
     )
     stuck_timeout: float = _parameter(
@@ -120,9 +121,9 @@ class NodeConfig:
     )
     gravity_tolerance: float = _parameter(
         _DEFAULTS.gravity_tolerance_m_s2,
-        'Error of |f| at rest [m/s^2] at which publishing stops (another unit; a reversed '
-        'axis changes |f| by at most twice the bias of the axis); '
-        '0: publishing never stops.',
+        'Error of |f| at rest [m/s^2] at which publishing stops, as with the calibration of '
+        'another unit; 0: publishing never stops. A reversed axis changes |f| at rest by at most '
+        'twice the bias of the axis.',
         (0.0, 100.0),
     )
     diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))
@@ -225,8 +226,8 @@ def _checked(name: str, value: Any) -> Any:
 class ParameterRequests:
     """Answers a node's parameter services."""
 
-    # `prepare` reads files for a parameter change in parallel to the samples, `apply` sets
-    # the prepared result between two samples; an exception in either refuses the change.
+    # `prepare` reads files for a parameter change in parallel to the samples, `apply` sets the
+    # prepared result between two samples; an exception of one of the functions refuses the change.
     def __init__(
         self,
         loop: WaitLoop,
@@ -267,7 +268,7 @@ class ParameterRequests:
                     respond()
 
         if n > PARAMETERS_LIMIT:
-            reason = f'{n} parameters at once, at most {PARAMETERS_LIMIT}'
+            reason = f'{n} parameters in one request, at most {PARAMETERS_LIMIT} are allowed'
         elif waits and self._n_waiting >= WAITING_LIMIT:
             reason = 'too many requests are waiting, try again'
         elif groups:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the player: publishes a bag on the node's input topics, with `/clock`, paced or as fast as the
-subscribers take it.
+Owns the player: publishes a bag on the node's input topics, with `/clock`, at a multiple of real
+time or as fast as the subscribers acknowledge messages.
 
 Topics have the node's relative names, messages are unchanged and in the bag's order; ROS 1
 messages are rewritten in CDR. After `WINDOW` messages of a topic the player waits until every
@@ -45,9 +45,9 @@ WINDOW: dict[Role, int] = defaultdict(lambda: 50, accel=200)
 CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
 #: Interval of the checks for acknowledgements, which Fast DDS sends within some 5 ms [s].
 ACKNOWLEDGEMENT_NAP = 0.0005
-#: Time for subscribers to discover the player if the middleware does not report it [s].
+#: Time for subscribers to discover the player, if the middleware does not report this [s].
 SETTLING = 0.3
-PATIENCE = 30.0  # how long a subscriber may leave messages unacknowledged [s]
+PATIENCE = 30.0  # longest time in which a subscriber may acknowledge no message [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ def play(
 def opened_player(
     path: str | Path, rate: float, topics: Topics | None = None, ros_args: Sequence[str] = ()
 ) -> Iterator[Player]:
-    """Open a bag for playing at `rate` times real time; 0 is as fast as subscribers take it."""
+    """Open a bag for playing at `rate` times real time; 0: as fast as subscribers acknowledge."""
     if not rate >= 0.0:
         raise ValueError(f'`rate` must be zero or positive, got {rate}')
     with (

@@ -33,14 +33,13 @@ def use_profile() -> None:
 
 class SignalWatch:
     """
-    Turns the first signal into a call; a second signal ends the process. The object must be used
-    in the main thread.
-
-    A process that has not ended `ending_s` [s] after the call is ended by `os._exit`.
+    Calls a stop function at the first signal; a second signal ends the process. The object must be
+    used in the main thread. A process that has not ended `ending_s` [s] after the call is ended by
+    `os._exit`.
     """
 
-    # Another thread calls the stop function: while the main thread waits in the middleware, the
-    # interpreter runs no signal handlers.
+    # A separate thread calls the stop function, because the interpreter runs no signal handlers
+    # while the main thread waits in the middleware.
 
     def __init__(self, ending_s: float | None = None) -> None:
         self._ending_s = ending_s

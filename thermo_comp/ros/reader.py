@@ -4,7 +4,7 @@
 Owns the reading of calibrations in a separate process, in parallel to the samples.
 
 A parser holds the interpreter lock for milliseconds at a time, so a thread would delay samples.
-If a file makes its reader crash or hang, the node only sees a process that ended or timed out.
+If a file makes the process crash or hang, the node continues and refuses the file.
 """
 
 import ctypes
@@ -28,7 +28,7 @@ from ..online.trial import tried
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 
-#: Time limit for reading a file [s]: a file that takes longer hangs, as on a lost network drive.
+#: Time limit for reading a file [s]; above it the file hangs, as on a lost network drive.
 LIMIT_S = 10.0
 _ENDING_S = 0.5  # time to wait for a killed process [s]
 _PR_SET_PDEATHSIG = 1  # option of Linux prctl: the signal sent when the parent ends
@@ -71,7 +71,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
             raise
         raise CalibrationError(error.rule, name) from error
     except Exception as error:
-        # No error of a file may end the node; a home folder of an unknown user is a RuntimeError.
+        # No error of a file may end the node; `expanduser` raises RuntimeError for unknown users.
         has_reason = isinstance(error, OSError) or type(error) is ValueError
         reason = getattr(error, 'strerror', None) or (has_reason and str(error))
         raise CalibrationError(

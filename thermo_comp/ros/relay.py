@@ -3,8 +3,8 @@
 """
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
-Messages do not identify their publisher. A topic with more than one publisher is ignored, as is
-the first batch after a publisher has left, which may hold messages of this publisher.
+Messages do not identify their publisher. While several publishers may send on a topic, its
+messages are dropped, and also the first batch after a publisher has left, which may be from it.
 """
 
 from bisect import bisect_left, bisect_right
@@ -29,7 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading applies once a reading that is later by this time has arrived [ns].
+#: Without samples, a reading is used when a reading with a stamp later by this time arrives [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
@@ -101,7 +101,7 @@ class Relay:
             raise ThermoCompError(reason, key=output)
 
     def follow_types(self) -> None:
-        """Subscribe again to thermometers whose messages have another type."""
+        """Subscribe again to thermometers whose publisher sends another type than Temperature."""
         for name, raw in list(self.thermometers.items()):
             if self._fields[name].kind is not Temperature or raw.count_publishers():
                 continue
@@ -189,14 +189,13 @@ class Relay:
             self.rests.gather(messages, self.running.loaded, self.running.compensator)
 
     def advance_without_samples(self, silence_ns: int) -> None:
-        """Apply readings without samples, so that the regime flag is still published."""
+        """Use readings while no samples arrive, so that the regime flag is still published."""
         if self._newest_reading_ns is None:
             return
         horizon_ns = self._newest_reading_ns - IDLE_NS
         compensator = self.running.compensator
         last_ns = compensator.now_ns
         if last_ns is not None:
-            # Use readings stamped at most `silence_ns` after the last sample.
             horizon_ns = min(horizon_ns, last_ns + silence_ns)
         readings, self._readings = self._readings, []
         for received, reading in readings:

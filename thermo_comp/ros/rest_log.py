@@ -4,8 +4,8 @@
 Owns the rest log of the node: samples at rest become lines of files, without delaying the relay.
 
 The relay appends references to messages to a list. The messages are summed in blocks of `BLOCK`,
-as arrays; a thread writes the lines, so a slow or hanging disk delays nothing. Rests that cannot
-be kept are counted and named in the diagnostics.
+as arrays; a thread writes the lines, so a slow or hanging disk does not delay samples. Rests that
+cannot be written are counted, and the diagnostics give the number and the reason.
 """
 
 import os
@@ -30,7 +30,7 @@ from .reader import LoadedCalibration
 BLOCK = 1024
 #: Largest size of the file of a day, and of the folder [bytes]; a month takes at most 10 MB.
 DAY_BYTES, FOLDER_BYTES = 320_000, 64_000_000
-#: Size up to which the file of a day is not thinned to bound the size of the folder [bytes].
+#: Smallest size of the files that are thinned if the folder is too large [bytes].
 _UNTHINNED_BYTES = 16_000
 #: Largest number of lines that wait for the disk.
 _WAITING = 1000
@@ -74,7 +74,7 @@ class RestLog:
             self._lose('the disk does not answer')
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Write the waiting lines, as far as that takes no longer than `timeout_s`."""
+        """Write the waiting lines; give up if queue or disk take longer than `timeout_s`."""
         try:
             self._lines.put(None, timeout=timeout_s)
         except Full:
@@ -209,7 +209,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of the little-endian messages as long as the last message."""
+    """Read stamps [ns] and samples of little-endian messages with the length of the last one."""
     size = len(messages[-1]) if messages else 0
     # Shorter messages than those with an empty frame_id are malformed.
     if size < _SHORTEST[is_imu]:

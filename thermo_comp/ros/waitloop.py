@@ -3,8 +3,8 @@
 """
 Owns the loop around a node's wait sets, and all uses of rclpy beyond its documented API.
 
-rclpy's executor costs ten times the CPU time of the compensation. `WaitLoop` leaves messages
-serialized. While samples flow, the loop waits only for samples, and each wake-up empties their
+rclpy's executor takes ten times the CPU time of the compensation. `WaitLoop` leaves messages
+serialized. While samples arrive, the loop waits only for samples, and each wake-up empties their
 queue; services and ordinary subscriptions are polled. Timers, clients and middleware events are
 not served by this loop.
 
@@ -34,7 +34,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from ..errors import ThermoCompError
 from ..text import one_line
 
-#: Polling period of services and other subscriptions while samples flow [ns].
+#: Polling period of services and other subscriptions while samples arrive [ns].
 OTHERS_PERIOD_NS = 20_000_000
 #: Largest number of messages taken at a time, so that a flood does not block the rest of the node.
 DRAIN_LIMIT = 4096
@@ -58,7 +58,7 @@ Serve = Callable[[Any, Callable[[Any], None]], None]
 
 class Sources:
     """
-    Decides whether a topic's messages are from one publisher while several publishers are known.
+    Decides whether a topic's messages are from one publisher if the middleware lists several.
 
     The middleware lists a killed publisher until its lease of 20 s ends. Messages do not
     identify their publisher, but each publisher numbers its messages, so consecutive numbers over
@@ -161,7 +161,7 @@ class WaitLoop:
         self._rest_ns = int(rest_s * 1e9)
         self._guard = node.create_guard_condition(lambda: None)
         self._raw: list[RawSubscription] = []
-        #: Handlers of services that may answer later than their callback returns.
+        #: Handlers of services; a handler may return before the answer is sent.
         self.handlers: dict[Service, Serve] = {}
         self._soon: deque[Callable[[], None]] = deque()
         self.n_failures = 0  # callbacks that ended in an exception
@@ -176,8 +176,7 @@ class WaitLoop:
     ) -> RawSubscription:
         """
         Subscribe to a topic; its messages stay serialized.
-
-        While samples flow, only messages of the first subscription with `wakes` end a wait.
+        While samples arrive, only messages of the first subscription with `wakes` end a wait.
         """
         # rclpy needs a callback for each subscription, but without an executor never calls it.
         create = partial(self.node.create_subscription, callback=lambda _: None, raw=True)
@@ -203,7 +202,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call a function every `period_s`, replacing an earlier call; cheaper than a timer."""
+        """Call a function every `period_s`, instead of that of an earlier call; needs no timer."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback
@@ -231,7 +230,7 @@ class WaitLoop:
         others |= {service: partial(self._take_request, service) for service in node.services}
         waking = next((subscription for subscription in self._raw if subscription.wakes), None)
         rest_ns = 0
-        # With reliable QoS a wake-up costs less than a short sleep: make no pause.
+        # Pause only with best-effort QoS: with reliable QoS a wake-up takes less than a sleep.
         if waking and waking.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             rest_ns = self._rest_ns
         crowd_ns = rest_ns * 3 // 4
