@@ -46,8 +46,8 @@ A file is refused if it has unknown or missing keys, text in place of a number, 
 ranges that do not rise, functions that are not normalised at the reference temperature, a scale that
 could reach zero within its ranges, a posterior of the wrong size, another `format_version`, YAML
 aliases or tags, or more than 8 MiB. The error names the file, the key, the value and the expected
-value. Numbers are written with all digits and the posterior in single precision, so that reading
-and writing a file again does not change it. The last line of a written file is `...`: a written file that is cut, for
+value. Numbers are written with all digits and the posterior in single precision, so that a file
+that is read and written is not changed. The last line of a written file is `...`: a written file that is cut, for
 example by a copy that has not ended, is refused.
 
 The main keys:
@@ -105,8 +105,8 @@ INTERFACE = """\
 # ROS interface of the node
 
 The node is `thermo_comp`, its executable `thermo_comp_node`. All topic names but `/diagnostics` are relative, and can be
-remapped. Samples and regime flags carry the stamps of the inputs, only `/diagnostics` that of the node's clock, so the node
-needs no `use_sim_time`.
+remapped. Samples and regime flags have the stamps of the inputs; only `/diagnostics` is stamped by the node's clock, so the
+node needs no `use_sim_time`.
 
 ## Topics
 
@@ -119,13 +119,12 @@ parameters.
 
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has
 no ROS QoS setting. With the default of Fast DDS, 0 s, each sample for a reliable subscriber wakes a thread of the
-middleware about four times; these wake-ups take a quarter of the node's CPU time. With `nackSupressionDuration` = 20 ms a lost
-sample is sent again up to 20 ms later than with 0 s. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
-`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces the profile of the node; repeat `nackSupressionDuration`
-in the user's profile.
+middleware about four times; these wake-ups take a quarter of the node's CPU time. With 20 ms a lost sample is sent again up
+to 20 ms later than with the default. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
+`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces that of the node: repeat `nackSupressionDuration` there.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
-current thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
+present thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
 missing quantity is -1 (REP 145). If the calibration has a `gyroscope`, the bias at the current thermal state is subtracted
 from `angular_velocity`, and `angular_velocity_covariance` is the noise of a message plus the uncertainty of that bias.
 
@@ -141,8 +140,8 @@ header gets the stamp of the newest sample before it. `output=TOPIC` names the o
 ## Recording a test
 
 `thermo_comp record` runs a separate node, `thermo_comp_record`, which subscribes to the inputs of the compensating node and
-to every other `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is.
-`thermo_comp_record` publishes nothing. See [Recording](recording.md#recording).
+to every further `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is.
+`thermo_comp_record` publishes no topic. See [Recording](recording.md#recording).
 
 ## Parameters
 
