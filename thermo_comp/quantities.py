@@ -84,7 +84,7 @@ _PREPARED: dict[str, Bounds] = {
     # Temperatures.
     'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='from 0 K to red heat'),
     'temperature difference': _between(-1273.15, 1273.15, 'K', 'difference of valid temperatures'),
-    'temperature span': _positive(1e-2, 1273.15, 'K', 'less is noise of a thermometer'),
+    'temperature span': _positive(1e-2, 1273.15, 'K', 'a smaller span is reading noise'),
     'temperature rate': _between(-1e5, 1e5, 'K/min', '100 times a thermal shock of 1000 K/min'),
     'rate span': _positive(1e-6, 2e5, 'K/min', 'no ramp is slower than 1 K in two years'),
     'time constant': _positive(1e-3, 1e8, 's', 'from a bare thermocouple to three years'),
