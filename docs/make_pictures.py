@@ -69,7 +69,7 @@ def draw_chamber(axes: Axes) -> None:
 
 
 def draw_cyclogram(axes: Axes) -> None:
-    """Draw the paper's program, and the readings of two thermometers."""
+    """Draw the chamber program of Golovach's paper, and the readings of two thermometers."""
     program = parse_cyclogram('chamber')
     run = simulate(unit_preset('thermostatted', 1), program, positions(1, 0)[0], rate_hz=0.2)
     hours = np.array(program.time_s) / 3600.0
@@ -118,7 +118,7 @@ def draw_afternoon(axes: Axes) -> None:
 
 
 def series() -> dict[str, tuple[Any, Any]]:
-    """Return the values at the layout's paths in the held-out sample bag."""
+    """Return time [min] and values of the signals of the Foxglove layout, for the held-out bag."""
     recording = tc.read(ROOT / 'bags' / 'held_out.mcap')
     calibration = tc.fit(sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), gravity=9.80665)
     out = calibration.correct(recording.time_s, recording.counts, **recording.temperatures)
@@ -139,7 +139,7 @@ def series() -> dict[str, tuple[Any, Any]]:
 
 
 def draw_layout(figure: Figure) -> None:
-    """Draw the panels in the positions of the layout, with their data."""
+    """Draw the panels of the Foxglove layout, in their positions, with the held-out bag."""
     saved = json.loads(LAYOUT.read_text(encoding='utf-8'))
     data = series()
 
@@ -175,7 +175,7 @@ def draw_layout(figure: Figure) -> None:
 
 
 def draw_year(axes: Axes) -> None:
-    """Draw |f| - g of a vehicle's unit over a year: as calibrated, and updated every week."""
+    """Draw |f| - g of a vehicle's unit over a year, with and without weekly updates."""
     import field_units as units
 
     laboratory = units.calibration()
@@ -209,7 +209,7 @@ def draw_year(axes: Axes) -> None:
 
 
 def main() -> None:
-    """Write the drawings."""
+    """Write the drawings into docs/images."""
     plt.rcParams.update({'svg.hashsalt': 'thermo_comp', 'font.size': 8, 'svg.fonttype': 'none'})
     figure = plt.figure(figsize=(9, 3.3), layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=(1, 1))

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the files that are generated from the code: the JSON schema and the two reference pages.
+Owns the files made from the code: JSON schema, and pages on calibration file and ROS interface.
 
-Run ``python docs/make_reference.py`` after a change of a key or a parameter. A test compares the
-files with the code.
+Run ``python docs/make_reference.py`` after a change of a key of the calibration file or of a
+parameter of the node. A test compares the files with the code.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ A file is refused if it has unknown or missing keys, text in place of a number, 
 ranges that do not rise, functions that are not normalised at the reference temperature, a scale that
 could reach zero within its ranges, a posterior of the wrong size, another `format_version`, YAML
 aliases or tags, or more than 8 MiB. The error names the file, the key, the value and the expected
-value. Numbers are written with all digits and the posterior in single precision, so that reading
-and writing a file again does not change it. The last line of a written file is `...`: a written file that is cut, for
+value. Numbers are written with all digits and the posterior in single precision, so that a file
+that is read and written is not changed. The last line of a written file is `...`: a written file that is cut, for
 example by a copy that has not ended, is refused.
 
 The main keys:
@@ -65,10 +65,10 @@ static:                              # the set of the static regime
     # Fs(t), 0 at t = 0, and Fc(t), 1 at t = 0
     bias_function: {kind: polynomial, coefficients: [0.0, 0.0031]}
     scale_function: {kind: polynomial, coefficients: [1.0, 7.7e-05]}
-response:                            # columns of both sets
+response:                            # columns added to both sets
   - kind: gradient                   # T_case - T_board
     group: gradient
-    range: [-9.0, 9.0]               # the value is limited to it
+    range: [-9.0, 9.0]               # the value is limited to this range
     bias: [0.0021, 0.0014, -0.0006]  # x, y, z: counts per K
     scale: [1.1e-06, 9.0e-07, 1.3e-06]  # relative, per K
   - kind: board                      # T_board - lagged T_board
@@ -105,8 +105,8 @@ INTERFACE = """\
 # ROS interface of the node
 
 The node is `thermo_comp`, its executable `thermo_comp_node`. All topic names but `/diagnostics` are relative, and can be
-remapped. Samples and regime flags carry the stamps of the inputs, only `/diagnostics` that of the node's clock, so the node
-needs no `use_sim_time`.
+remapped. Samples and regime flags have the stamps of the inputs; only `/diagnostics` is stamped by the node's clock, so the
+node needs no `use_sim_time`.
 
 ## Topics
 
@@ -119,17 +119,16 @@ parameters.
 
 With Fast DDS the node uses a profile with `nackSupressionDuration` = 20 ms for its publishers, because this parameter has
 no ROS QoS setting. With the default of Fast DDS, 0 s, each sample for a reliable subscriber wakes a thread of the
-middleware about four times, which takes a quarter of the node's CPU time. With `nackSupressionDuration` = 20 ms a lost
-sample is sent again up to 20 ms later than with 0 s. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
-`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces the profile of the node; repeat `nackSupressionDuration`
-in the user's profile.
+middleware about four times; these wake-ups take a quarter of the node's CPU time. With 20 ms a lost sample is sent again up
+to 20 ms later than with the default. A profile of the user (`FASTRTPS_DEFAULT_PROFILES_FILE`, or
+`DEFAULT_FASTRTPS_PROFILES.xml` in the working directory) replaces that of the node: repeat `nackSupressionDuration` there.
 
 `linear_acceleration_covariance` is a full 3x3 matrix: noise of the sample plus uncertainty of the calibration at the
-current thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
+present thermal state. Without an angular rate or an orientation in the input, the first element of the covariance of the
 missing quantity is -1 (REP 145). If the calibration has a `gyroscope`, the bias at the current thermal state is subtracted
 from `angular_velocity`, and `angular_velocity_covariance` is the noise of a message plus the uncertainty of that bias.
 
-## A driver's own topics
+## The topics of a driver
 
 The parameter `topics` names the driver's topics, like the option `--topic` of the offline commands:
 `topics:=imu=/imu/data,board=/fmu/out/sensor_accel:temperature`, or a file of such lines, as in
@@ -141,8 +140,8 @@ header gets the stamp of the newest sample before it. `output=TOPIC` names the o
 ## Recording a test
 
 `thermo_comp record` runs a separate node, `thermo_comp_record`, which subscribes to the inputs of the compensating node and
-to every other `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is.
-`thermo_comp_record` publishes nothing. See [Recording](recording.md#recording).
+to every further `temperature/<name>`, once the topic has a publisher; the subscription is reliable if the publisher is.
+`thermo_comp_record` publishes no topic. See [Recording](recording.md#recording).
 
 ## Parameters
 
@@ -151,8 +150,8 @@ to every other `temperature/<name>`, once the topic has a publisher; the subscri
 A `set_parameters_atomically` request is checked as a whole before any of its parameters is applied. A separate process
 reads and checks a calibration while samples flow; the node then exchanges the calibration between two samples. An
 invalid `calibration_file` is refused in the response, with the reason, and the running calibration stays. The
-coefficients of a calibration are not parameters, because parameters arrive one at a time, and a polynomial with half of
-its coefficients is wrong.
+coefficients of a calibration are not parameters: parameters arrive one at a time, and a polynomial with old and new
+coefficients together gives a wrong correction.
 
 ```console
 $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
@@ -167,24 +166,24 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | no board temperature yet | nothing is published, ERROR |
 | no board temperature, and a calibration without temperature correction | the constants are applied; the covariance includes a temperature sd of 10 K |
 | board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
-| case temperature older than `case_timeout` | the board decides the regime, WARN, larger covariance |
-| board temperature outside the calibrated range | curves continue along their tangent for a quarter of the range, and are constant beyond; larger covariance, WARN with the distance |
-| gradient or rate outside the calibrated range | constant beyond the edge, larger covariance, WARN with the distance |
+| case temperature older than `case_timeout` | the board decides the regime, the covariance is increased, WARN |
+| board temperature outside the calibrated range | curves continue along their tangent for a quarter of the range, and are constant beyond; the covariance is increased, WARN with the distance |
+| gradient or rate outside the calibrated range | the value is limited to the range, the covariance is increased, WARN with the distance |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
 | a temperature that jumps faster than any part can | the readings are not used until they are plausible again or the thermometer counts as lost |
 | a temperature that is constant while the other temperature changes | the constant readings are not used: the last value is held, then the thermometer counts as lost |
 | both temperatures constant over at least 20 readings and 5 s | the temperatures are used with a growing covariance, WARN |
-| a board temperature that leads the case temperature in ramps (swapped topics) | larger covariance, ERROR |
+| a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
 | counts constant for `stuck_timeout`, on all axes or on one axis while the other two change; three zeros | dropped, counted, ERROR |
 | counts that come faster than their conversion cycle | dropped, counted, ERROR |
 | a magnitude of the specific force at rest that differs from gravity by more than `gravity_tolerance` | nothing is published, ERROR |
-| a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or all messages of a second are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
+| a second publisher of a topic | the topic is not used, ERROR, until one publisher is left or for one second all messages are from one publisher (WARN while the middleware still lists a killed publisher, for 20 s) |
 | a sample without a finite correction | dropped, counted, ERROR |
 | a message of more than 1 kB (a very long `frame_id`) | dropped, counted |
-| a temperature stamped more than 5 s after the next reading of the same thermometer | not used |
+| a temperature stamped more than 5 s after the next reading of the same thermometer | the reading is not used |
 | a sample whose stamp repeats, or goes back by less than a second | dropped, counted |
 | a sample stamped more than 15 s (or ten cycles, if longer) ahead, until a reading or a second sample confirms the time | dropped, counted |
-| a sample whose stamp goes back by a second or more | the estimators restart, reported once |
+| a sample whose stamp goes back by a second or more | all estimators restart, which is reported once |
 
 [Faults](faults.md) lists every fault with its test.
 """
@@ -318,7 +317,7 @@ def _section(
         if len(default) > 40:
             default = 'in the schema'
         meaning = value.get('description', '') or _described(value, definitions)
-        # Escape brackets: an element of a matrix is not a link.
+        # Without code marks, Markdown would read the brackets of M[1][0] as a link.
         meaning = re.sub(r'\w+(\[\d\]){2}', r'`\g<0>`', meaning)
         lines.append(f'| `{key}` | {_type(value)} | {default} | {meaning} |')
     return [*lines, '']
@@ -382,7 +381,7 @@ def parameters_table() -> str:
             limits = '{:g} .. {:g}'.format(*field.metadata['bounds'])
         if field.metadata['choices']:
             limits = ', '.join(f'`{choice}`' for choice in field.metadata['choices'])
-        # A bar, as of |f|, would begin another cell.
+        # An unescaped bar, as in |f|, would begin a new cell of the table.
         meaning = field.metadata['description'].replace('|', r'\|')
         rows.append(f'| `{field.name}` | {kind} | `{default}` | {limits} | {meaning} |')
     return '\n'.join(rows) + '\n'

@@ -77,14 +77,14 @@ _PREPARED: dict[str, Bounds] = {
     # Bounds of the constants of the unit.
     'full scale': _positive(1e-6, 1e16, 'input units', 'float64 holds integers to 9e15'),
     'full-scale force': _positive(1e-3, 1e7, 'm/s^2', 'from a gravimeter to a gun launch'),
-    'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'far beyond any converter'),
+    'scale factor': _positive(1e-9, 1e9, 'input units per m/s^2', 'nine decades either side of 1'),
     'cycle time': _positive(1e-7, 1e5, 's', 'from 10 MHz to one sample a day'),
     'gravity': Bounds(above=9.0, below=10.5, unit='m/s^2', why='on Earth 9.76 to 9.84'),
     'angular rate': _between(-1e3, 1e3, 'rad/s', '1000 rad/s are 57000 deg/s'),
     # Bounds of temperatures, rates and times.
     'temperature': Bounds(at_least=-273.15, below=1000.0, unit='degC', why='from 0 K to red heat'),
-    'temperature difference': _between(-1273.15, 1273.15, 'K', 'of two valid temperatures'),
-    'temperature span': _positive(1e-2, 1273.15, 'K', 'a smaller span is thermometer noise'),
+    'temperature difference': _between(-1273.15, 1273.15, 'K', 'difference of valid temperatures'),
+    'temperature span': _positive(1e-2, 1273.15, 'K', 'a smaller span is reading noise'),
     'temperature rate': _between(-1e5, 1e5, 'K/min', '100 times a thermal shock of 1000 K/min'),
     'rate span': _positive(1e-6, 2e5, 'K/min', 'no ramp is slower than 1 K in two years'),
     'time constant': _positive(1e-3, 1e8, 's', 'from a bare thermocouple to three years'),
@@ -106,7 +106,7 @@ _PREPARED: dict[str, Bounds] = {
     'deviation': _up_to(1e4, 'm/s^2', 'an sd of 1000 g is no information'),
     'rate deviation': _up_to(1e3, 'rad/s', 'an sd of 57000 deg/s is no information'),
     'misalignment deviation': _up_to(1.0, 'rad', 'an sd of 1 rad is no information'),
-    'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'an axis that reads 2 g at 1 g'),
+    'nonlinearity': _up_to(1.0, 'g/g^2 or g/g^3', 'at the bound an axis reads 2 g at 1 g'),
     # Bounds of the results of a fit, and of numbers of samples.
     'error': _up_to(1e7, 'm/s^2', 'the largest full-scale force'),
     'number': _up_to(1e15, '', 'a float64 holds integers up to 9e15 exactly'),
@@ -122,7 +122,7 @@ _PREPARED: dict[str, Bounds] = {
     # Bounds of the lengths of lists in a calibration file.
     'coefficients': Bounds(shortest=1, longest=12, why='powers up to t^11 follow any curve'),
     'knots': Bounds(longest=100, why='one knot per kelvin over 100 K'),
-    'columns': Bounds(longest=2000, why='columns of ten thermometers'),
+    'columns': Bounds(longest=2000, why='the columns of ten thermometers'),
 }
 Positive = Annotated[float, Bounds(above=0.0, below=math.inf)]
 NotNegative = Annotated[float, Bounds(at_least=0.0, below=math.inf)]
