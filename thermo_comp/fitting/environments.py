@@ -23,7 +23,8 @@ from ..text import one_line
 from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
-from .data_checks import Finding
+from .coverage import distinct_directions
+from .data_checks import POSITIONS_NEEDED, Finding
 from .initial_triad import within_positions
 from .initialisation import initial_state
 from .lack_of_fit import drift_variance
@@ -81,12 +82,13 @@ class Contradiction(NamedTuple):
     Bags that contradict an earlier calibration of their unit.
 
     bags: numbers of bags whose drift the calibration does not explain with any lag states at start
-    is_changed: whether ``|f| - g`` is far above the drift and the claimed sd of |f|, so that bias
-        or scale has changed, too
+    is_updated: whether the bags can update the calibration: ``|f| - g`` is far above the drift and
+        the claimed sd of |f|, so that bias or scale has changed, too, or the bags have the six
+        attitudes that determine bias and scale
     """
 
     bags: list[int]
-    is_changed: bool
+    is_updated: bool
 
 
 def contradiction(
@@ -118,17 +120,15 @@ def contradiction(
     lack = np.square(lacks).max(axis=0) if lacks else np.zeros(3)
     ratio = np.sum(drift**2, axis=1) / np.sum(claimed + prior.sigma**2 + lack, axis=1)
     mean = np.bincount(data.bag, ratio) / np.maximum(np.bincount(data.bag), 1)
-    position, n_windows = data.position, np.diff(data.edges)
-    force = regression.force(state)
-    means = [np.bincount(position, axis) / n_windows for axis in force.T]
-    norm = np.linalg.norm(means, axis=0) - regression.norms(state)
+    norm = _norm_errors(regression, state)
     along = regression.at(state, prior).norms_by_unit @ inverse
     usual = np.mean(drift**2) + np.mean(np.sum(along**2, axis=1)) + offset_sd_of(known) ** 2
-    is_changed = bool(_is_far_above(np.mean(norm**2), usual))
+    is_changed = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
         # A minority that agrees by its attitudes alone is of the same environment as the majority.
         is_far[:] = True
+    is_changed |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return Contradiction(np.flatnonzero(is_far).tolist(), is_changed)
 
 
@@ -142,11 +142,19 @@ def _at_calibration(
     return regression, with_calibration(calibration, regression, state)
 
 
+def _norm_errors(regression: Regression, state: State) -> Floats:
+    """Return the error of |f| of each position's mean [m/s^2], shape (n_positions,)."""
+    position, n_windows = regression.windows.position, np.diff(regression.windows.edges)
+    means = [np.bincount(position, axis) / n_windows for axis in regression.force(state).T]
+    return np.asarray(np.linalg.norm(means, axis=0) - regression.norms(state))
+
+
 def with_excluded_error(
     calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool = False
 ) -> tuple[Calibration, Finding]:
     """
-    Add the drift that remains in `bags` after the correction to the lack of fit of both regimes.
+    Add the drift, and the error of |f|, that remain in `bags` after the correction to the lack of
+    fit of both regimes.
 
     `others`: text that names what these bags contradict, other bags or the prior; `is_updated`:
     whether `bags` were used in the fit
@@ -154,9 +162,12 @@ def with_excluded_error(
     windows = thermal_windows(bags, prior_model(calibration))
     regression, state = _at_calibration(calibration, windows.data, calibration.gravity_m_s2)
     drift = within_positions(regression.force(state), windows.data.position)
+    of_norms = np.mean(_norm_errors(regression, state) ** 2)
     regimes = ~windows.is_dynamic, windows.is_dynamic
     static, dynamic = (
-        _widened(regime, np.mean(drift[rows if rows.any() else slice(None)] ** 2, axis=0))
+        _widened(
+            regime, of_norms + np.mean(drift[rows if rows.any() else slice(None)] ** 2, axis=0)
+        )
         for regime, rows in zip(calibration.regime_sets(), regimes, strict=True)
     )
     names = ', '.join(one_line(bag.source.name) for bag in bags)
@@ -168,10 +179,10 @@ def with_excluded_error(
     )
     if is_updated:
         text = (
-            f'{names}: the unit has changed since {others}: |f| at rest and the effects of '
-            f'temperature both differ. The fit leaves a drift of {rms:.0f} ug, which the '
-            f'published uncertainty includes. Bags over the whole temperature range allow '
-            f'a fit without {others}'
+            f'{names}: the unit, or its environment, has changed since {others}: the effects of '
+            f'temperature differ. The fit leaves a drift of {rms:.0f} ug, which the published '
+            f'uncertainty includes. Bags over the whole temperature range allow a fit without '
+            f'{others}'
         )
     finding = Finding('environment', 'advice', text)
     return replace(calibration, static=static, dynamic=dynamic), finding

@@ -202,16 +202,16 @@ def _fit_one_environment(
     """Fit the bags, without bags recorded in another thermal environment, see `environments`."""
     first = _fit(bags, options, progress)
     known = options.prior
-    excluded, is_changed = [], False
+    excluded, may_update = [], False
     if known is None:
         excluded = contradicting_bag(first.fit)
     elif known.unit.serial == first.calibration.unit.serial and not first.fit.windows.data.forces:
-        excluded, is_changed = contradiction(first.fit.windows, known, options)
+        excluded, may_update = contradiction(first.fit.windows, known, options)
     if not excluded:
         return _refined(first, bags, options, progress)
     kept = [bag for k, bag in enumerate(bags) if k not in excluded]
     refit = first
-    is_updated = is_changed and not kept
+    is_updated = may_update and not kept
     if kept:
         refit = _fit(kept, options, progress)
         if known is None and not is_better_without(first.fit, refit.fit, excluded[0]):
