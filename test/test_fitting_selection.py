@@ -150,8 +150,7 @@ def test_estimated_noise_parameters_agree_with_the_true_ones(noisy):
     # noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
-    # 54 means of axes in 18 positions less 45 unknowns (directions, scale, bias, M) determine the
-    # mounting sd to 24 %.
+    # 54 means less 45 unknowns (directions, scale, bias, M) determine the mounting sd to 24 %.
     assert 0.5 < prior.offset_sd / truth.offset_sd < 1.7
 
 
@@ -229,8 +228,8 @@ def test_true_parameters_of_a_table_agree_with_the_fit_within_the_claimed_sd(noi
 
 
 def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_removed():
-    # The Savage-Dickey ratio is the loss of evidence in a linear problem; only directions are not
-    # linear here.
+    # In a linear problem the Savage-Dickey ratio is the loss of evidence; directions are
+    # nonlinear.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)

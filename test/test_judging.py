@@ -266,8 +266,7 @@ class TestVerdict:
         assert '100 ug tolerated' in judgement.reason
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
-        # WHY: the verdict stated 61 ug, the error in attitudes of the fit; in an attitude that was
-        # not fitted the error was 1091 ug.
+        # WHY: the verdict stated 61 ug, the error in fitted attitudes; in others it was 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -278,8 +277,7 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # Without a tolerance the in-sample error is judged by the claimed sd. With a tolerance the
-        # error of left-out positions is judged.
+        # The in-sample error is judged by the claimed sd, the left-out error by a tolerance.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
@@ -296,8 +294,7 @@ class TestVerdict:
             assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_a_calibration_without_covariance_gets_the_verdict_no_claim(self):
-        # WHY: for a calibration without covariance only the noise was claimed, so that its verdict
-        # was 'recalibrate'.
+        # WHY: without a covariance only noise was claimed, so the verdict was 'recalibrate'.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
         judgement = judge(windows, imported)
@@ -314,8 +311,7 @@ class TestVerdict:
         worse = windows.force.copy()
         worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
         windows = dataclasses.replace(windows, force=worse)
-        # The residuals are 150 ug in the dynamic regime and 84 ug RMS in all windows; 60 ug is
-        # claimed.
+        # Residuals: 150 ug in the dynamic regime, 84 ug RMS in all windows. Claimed sd: 60 ug.
         judgement = judge(windows, CLAIMING)
         assert judgement.sections['all'].ratio < 2.0
         assert judgement.verdict == 'recalibrate'
@@ -330,8 +326,7 @@ class TestVerdict:
         assert found.sections['all'].n == 30
         assert found.sections['outside'].n == 10
         assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
-        # The residuals of windows inside the ranges decide the verdict; without such windows there
-        # is no verdict.
+        # Only windows inside the ranges decide the verdict; without them there is no verdict.
         bad = windows.force.copy()
         bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
         found = judge(dataclasses.replace(windows, force=bad), CLAIMING)
