@@ -199,7 +199,7 @@ def test_a_calibration_outside_the_calibration_directory_is_refused(peer, unit, 
 
 
 def test_a_calibration_reader_that_ends_is_restarted(unit):
-    # WHY: a file may crash or hang the process that reads it, but not the node.
+    # A separate process reads the file, so a file that crashes the reader does not end the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process = reader._process
@@ -214,7 +214,7 @@ def test_a_calibration_reader_that_ends_is_restarted(unit):
 
 
 def test_a_calibration_reader_that_hangs_is_ended(unit):
-    # WHY: a lost network drive blocked every request, and also the end of the node.
+    # WHY: a file on a lost network drive blocked all parameter requests and the end of the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process, reader._limit_s = reader._process, 0.3
@@ -296,7 +296,7 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 
 
 def test_a_node_that_hangs_at_the_start_ends_with_one_signal():
-    # WHY: SIGTERM was stored but not handled; a second SIGTERM was needed.
+    # WHY: the first SIGTERM had no effect; a second SIGTERM was necessary.
     with subprocess.Popen(
         [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -307,7 +307,7 @@ def test_a_node_that_hangs_at_the_start_ends_with_one_signal():
         assert time.monotonic() - began < 2.0
 
 
-def test_what_param_dump_writes_param_load_sets(peer, unit):
+def test_parameters_written_by_param_dump_are_set_by_param_load(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
         names = [parameter for parameter in node.node._parameters]  # noqa: C416
         request = GetParameters.Request(names=names)
