@@ -192,15 +192,15 @@ def simulated(kind: str, n_units: int, days: int) -> None:
             for key in ('after', 'best')
         )
         print(
-            f'  {name:4} before {a:6.1f} ug  after {b:6.1f}  best {c:6.1f}  ratio {b / c:.2f}  '
-            f'units with a larger error after {n_worse} (best: {n_best})'
+            f'  {name:4} before {a:6.1f} ug  after {b:6.1f}  filter {c:6.1f}  ratio {b / c:.2f}  '
+            f'units with a larger error after {n_worse} (filter: {n_best})'
         )
     ratio = root_mean(joined['missed']) / root_mean(joined['claimed'])
     print(f'  error / claimed sd of |f| {ratio:.2f} (goal 0.7 .. 1.4)')
     days_after = np.array([pair for result in results for pair in result[1]])
     print(
         f'  day after an update: {len(days_after)} days, error larger than without the update by '
-        f'the standard error {days_after[:, 0].sum()} (best: {days_after[:, 1].sum()})'
+        f'the standard error {days_after[:, 0].sum()} (filter: {days_after[:, 1].sum()})'
     )
     print(f'  time of an update: {max(result[2] for result in results):.1f} s at most')
 

@@ -111,8 +111,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument(
         '--floor', action='store_true', help='also measure a relay that only copies bytes'
     )
-    parser.add_argument('--core', type=int, default=-1, help='number of the core for relays')
-    parser.add_argument('--depth', type=int, default=100, help='samples kept by the source')
+    parser.add_argument('--core', type=int, default=-1, help='core of the relays (default any)')
+    parser.add_argument('--depth', type=int, default=100, help='queue of the source (default 100)')
     parser.add_argument('--sleep', action='store_true', help='let idle cores sleep')
     parser.add_argument('--json', help='file for the figures')
     arguments = parser.parse_args()

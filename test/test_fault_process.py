@@ -218,8 +218,7 @@ def test_the_slope_of_the_soak_benchmark_has_the_claimed_standard_error(rng):
     # `slope` leaves out the first 10 % of the run, here 360 s.
     values[:300] += 50.0
     slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
-    # Sd of the slope: sd of a mean over 60 s / root of the sum of the 54 squared times about their
-    # mean.
+    # Sd of the slope: sd of a mean over 60 s / root of the sum of squares of the 54 centred times.
     assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
     assert abs(slope - 7.0) < 4.0 * sd
     assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

@@ -257,8 +257,7 @@ def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slo
     for bias, scale in zip(layout.bias, layout.scale, strict=True):
         assert sd[bias.static + 1] == pytest.approx(5e-3, rel=0.02)
         assert sd[scale.static + 1] == pytest.approx(2e-4, rel=0.02)
-    # Without a thermometer the temperature is taken as uncertain by 10 K (1 sd) about the
-    # reference.
+    # Without a thermometer the temperature is assumed to be the reference, with an sd of 10 K.
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
@@ -280,8 +279,7 @@ def test_a_fit_that_cannot_determine_the_repeatability_of_mountings_reports_its_
 
 
 def test_counts_of_32_bits_are_fitted(rng):
-    # WHY: a full scale above 1e7 counts was refused after the fit, by a limit for samples in
-    # m/s^2.
+    # WHY: a full scale above 1e7 counts was refused, by a limit for samples in m/s^2.
     source = turned(rng, positions(9, 3))
     K = 2.0**31 / (12.0 * GRAVITY)
     options = FitOptions(gravity=GRAVITY, input='counts', full_scale=2.0**31)
@@ -352,8 +350,7 @@ def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
         ]
         return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
 
-    # The second bag begins in the fifth position, so a cut adds a mounting unless it is
-    # recognised.
+    # The second bag begins in the fifth position, so a cut that is not recognised adds a mounting.
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
@@ -414,9 +411,9 @@ def test_an_update_by_three_positions_has_errors_within_the_claimed_sd(rng):
 
 @pytest.mark.parametrize('size', [1, 6])
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
-    # WHY: for a turn-on (sd 1 mg) at each of six faces, the fit found misalignments of 20 mrad.
-    # WHY: for three turn-ons of six faces each, the fit assumed 18 independent offsets, and the
-    # claimed sd of the misalignments was 5 to 12 mrad.
+    # WHY: with a turn-on (sd 1 mg) in each of six faces, the fit found misalignments of 20 mrad;
+    # with three turn-ons of six faces each, the fit assumed 18 independent offsets, and claimed an
+    # sd of the misalignments of 5 to 12 mrad.
     M = np.array([[1.0, 0.0, 0.0], [2e-3, 1.0, 0.0], [-2e-3, 1e-3, 1.0]])
     sensed = np.linalg.inv(M)
     faces = np.vstack((np.eye(3), -np.eye(3)))
@@ -487,8 +484,7 @@ def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
 
 
 def test_rests_of_5_s_determine_the_white_noise(rng):
-    # WHY: rests of 5 s were one window each; the fitted attitude left no residual, and the noise
-    # was estimated as 0.
+    # WHY: with rests of one window of 5 s no residual was left, and the noise was estimated as 0.
     calibration = fit([turned(rng, positions(12, 3), rest_s=5.0)], OPTIONS).calibration
     # A noise of 0.02 m/s^2 per sample at 100 Hz has a density of 0.002 m/s^2/sqrt(Hz).
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)

@@ -146,8 +146,7 @@ def test_estimated_noise_parameters_agree_with_the_true_ones(noisy):
     assert {'curve', 'board'} <= chosen_groups(chosen)
     # 1080 windows per axis determine the sd of white noise to 3 %, with slow noise less well.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
-    # A position lasts six correlation times of the slow noise, and the curves fit part of the
-    # noise.
+    # A position lasts six correlation times of the noise, and the curves fit part of the noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
     # 54 means less 45 unknowns (directions, scale, bias, M) determine the mounting sd to 24 %.
@@ -177,8 +176,7 @@ def test_flicker_noise_has_several_correlation_times():
 
 
 def test_rounding_removes_no_correlation_time_from_the_search():
-    # WHY: 10**log10(180) is rounded to less than 180, so the search left out 180 s, the shortest
-    # candidate.
+    # WHY: 10**log10(180) is rounded to less than 180, so the search left out a candidate, 180 s.
     whitener = Whitener(np.zeros(300, np.int64), 60.0 * np.arange(300))
     assert whitener.times_s[0] == 180.0
     for time_s in whitener.times_s:
@@ -228,8 +226,7 @@ def test_true_parameters_of_a_table_agree_with_the_fit_within_the_claimed_sd(noi
 
 
 def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_removed():
-    # In a linear problem the Savage-Dickey ratio is the loss of evidence; directions are
-    # nonlinear.
+    # In linear problems the Savage-Dickey ratio is the loss of evidence; directions are nonlinear.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -394,8 +391,7 @@ def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
     chosen, left = drift_left(windows)
     # 12 positions with 2 angles and 2 columns each determine the sd of tilts to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes a level axis by 5 ug; 720 windows leave a noise of 0.1 ug per
-    # weight.
+    # A tilt of 5 urad changes a level axis by 5 ug; 720 windows give weights to 0.1 ug.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
@@ -425,8 +421,7 @@ def test_the_claimed_bias_sd_of_nine_positions_includes_undetermined_mounting_of
     for n in (9, 24):
         claim, fitted = claimed(n)
         assert np.linalg.eigvalsh(claim).min() > 0.0
-        # The covariance has for each axis a block of k rows: kappa (relative scale), bias,
-        # weights.
+        # Each axis has k rows in the covariance: kappa (relative scale), bias, and weights.
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))

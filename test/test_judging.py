@@ -199,8 +199,7 @@ class TestWindows:
         ]
         evaluation = evaluate(bags, [('it', CLAIMING)])
         whole = evaluation.judgements['it'].sections['all']
-        # The bags have equal numbers of windows, with residuals of +102 and -102 ug: the mean is
-        # 0.
+        # Two bags with equal numbers of windows have residuals of +102 and -102 ug: the mean is 0.
         assert whole.n == sum(judged(bag, CLAIMING).sections['all'].n for bag in bags)
         assert whole.mean / MICRO_G == pytest.approx(0.0, abs=0.5)
         assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)
@@ -236,8 +235,7 @@ class TestVerdict:
             (121.0, 1000.0, 60.0, 'recalibrate'),
             (1100.0, 9000.0, 1500.0, 'valid, but it only claims 1.5 mg'),
             (50.0, 100.0, 60.0, 'valid, but it only claims 60 ug'),
-            # A residual that is not below the raw residual is never valid, however large the
-            # claimed sd.
+            # A residual not below the raw one is never valid, even with a large claimed sd.
             (1100.0, 1000.0, 1500.0, 'no better than raw'),
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
@@ -420,8 +418,7 @@ def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
     noisy = dataclasses.replace(noisy, unit=dataclasses.replace(noisy.unit, cycle_time_s=0.1))
     with pytest.raises(RecordingError, match=r'dead\.mcap: y reads 0 to the bit for 0\.'):
         judged(bag, noisy)
-    # An axis is not reported if its noise is below the step of the converter: it may repeat
-    # values.
+    # An axis whose noise is below the step of the converter may repeat values: it is not reported.
     assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))
 
 

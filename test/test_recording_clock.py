@@ -45,8 +45,7 @@ def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path, jump_ns):
     blocks = blocks_of(
         tmp_path / 'bag.mcap', true_ns + jump_ns * after, (true_ns + jump_ns * after)[::100]
     )
-    # At equal log times a reading precedes the sample: the first message after the jump is the
-    # sixth reading.
+    # At equal log times readings precede samples: the sixth reading is the first after the jump.
     hour = LONGEST_PAUSE_NS * after
     offsets = joined(blocks, 'accel') - true_ns
     assert offsets[:500].tolist() == [0] * 500
