@@ -55,7 +55,7 @@ def convert(converter, *messages):
     frame=frames,
     values=st.lists(floats, min_size=3, max_size=3),
 )
-def test_counts_become_an_imu(order, sec, nanosec, frame, values):
+def test_counts_are_converted_to_an_imu_message(order, sec, nanosec, frame, values):
     converter = SampleConverter(Vector3Stamped)
     written = convert(converter, *[cdr(order, (sec, nanosec), frame, values)] * 2)
     assert written[0] == written[1]

@@ -59,7 +59,7 @@ def test_a_command_on_a_page_gives_the_output_shown(page, command, output, desk)
         assert is_alike(finished.stdout, output), finished.stdout
 
 
-def test_pages_have_commands_to_test():
+def test_commands_to_test_are_found_on_the_pages():
     assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
 
 

@@ -172,7 +172,7 @@ def test_of_two_writers_one_wins(tmp_path, kind):
     assert [path.name for path in tmp_path.iterdir()] == ['out']
 
 
-def test_of_two_writers_one_wins_without_hard_links(tmp_path, monkeypatch):
+def test_only_one_of_two_writers_writes_a_file_without_hard_links(tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError
 

@@ -65,7 +65,7 @@ def test_fleet_and_evaluate_give_the_same_verdict(fleet, brief, cli, tmp_path):
 
 class TestRow:
     @pytest.mark.usefixtures('no_figures')
-    def test_the_row_of_a_good_unit(self, fleet, brief):
+    def test_the_row_of_a_good_unit_contains_the_figures_of_its_fit(self, fleet, brief):
         outcome = processed(fleet, certificates=True)
         row = outcome.row
         assert (row['name'], row['serial'], row['lot']) == ('lot-A/unit1', 'mems-0001', 'lot-A')

@@ -124,7 +124,7 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
-def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
+def test_low_pass_filtered_noise_gives_one_rest_without_a_jump(rng, tau_s):
     # WHY: low-pass filtered samples were taken for independent: one rest became 8 to 37 rests.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
@@ -136,7 +136,7 @@ def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
 
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
-def test_a_jump_in_noise_behind_a_low_pass_is_found(rng, tau_s, sd):
+def test_a_jump_in_low_pass_filtered_noise_is_found(rng, tau_s, sd):
     # WHY: means over 10 s hardly reduce the correlated noise of 3 mg: jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)

@@ -130,7 +130,7 @@ def test_motion_is_not_taken_for_a_rest(rng):
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
-def test_the_user_sets_the_shortest_rest(rng):
+def test_the_user_can_set_the_length_of_the_shortest_rest(rng):
     accel = by_hand(rng, 10, 3.5, ())
     bag = reduce_bag(source(accel), FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=2.0))
     assert len(bag.intervals) == 10
