@@ -6,10 +6,10 @@ Owns the accuracy figures of docs/accuracy.md: the fit against the simulator's t
 Run ``python benchmarks/accuracy.py`` for everything, or a part with fewer units:
 ``python benchmarks/accuracy.py kinds --kinds own-lags,paper --seeds 1``.
 
-Every fit uses a whole thermal test in unknown attitudes. With the fitted calibration the
-compensator corrects the plan 'held-out' (other ramps, soaks and attitudes). Errors are differences
-of means over 60 s from the simulated truth [ug]. The floor is the error of a correction by the
-true thermal model: noise alone.
+Every fit uses all bags of a thermal test; the fit is not given the attitudes. With the fitted
+calibration the compensator corrects the bags of the plan 'held-out', whose ramps, soaks and
+attitudes differ from those of the test. Errors are means over 60 s of the corrected force less the
+simulated force [ug]. The floor is the error of a correction by the true thermal model: noise only.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from thermo_comp.unit.calibration import Calibration, parameter_layout
 from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
-N_SIBLINGS = 10  # number of siblings that make the prior
+N_SIBLINGS = 10  # number of units of the same type whose calibrations give the prior
 
 
 @dataclass(frozen=True)
 class Goal:
     """
-    Limits for the worst unit: RMS of |f| - g and of the error vector, in ug, or as multiples of
-    the floor if `is_relative`.
+    Limits of a unit's RMS of |f| - g (`norm`) and of the error vector (`vector`), in ug, or as
+    multiples of the floor if `is_relative`.
     """
 
     norm: float
@@ -66,8 +66,8 @@ GOALS = {
     'slow-noise': Goal(1.15, 1.15, is_relative=True),
     'plain': Goal(1.05, 1.05, is_relative=True, plan='chamber-9'),
 }
-# Limits for tests with little time in the chamber: without a prior, and with the prior of
-# siblings.
+# Limits for three plans of a thermal test: of a fit without a prior, and of a fit with the prior
+# from siblings.
 PLAN_GOALS = {
     'chamber-9': (None, None),
     'tumble-3': (Goal(1.5, 2.5), Goal(1.2, 2.1)),
@@ -76,7 +76,7 @@ PLAN_GOALS = {
 
 
 def block(record: SimulatedRun) -> Block:
-    """Return a simulated run as a block."""
+    """Return samples and readings of a simulated run as a block for the compensator."""
     stamps, counts = record.accel_stamp_ns, record.counts.astype(np.float64)
     readings = {
         'board': (record.board_stamp_ns, record.board),
@@ -138,7 +138,7 @@ def fit_and_correct(
         columns = np.column_stack((corrected.specific_force, corrected.covariance[:, [0, 4, 8]]))
         size = np.diff(first, append=len(slots))
         mean = np.add.reduceat(columns, first, axis=0)[size == size.max()] / size.max()
-        # In means over 60 s white noise and rounding average out, other errors do not.
+        # A mean over 60 s reduces white noise and rounding; the other errors stay as they are.
         white = np.array(compensator.thermal.correction.noise)
         forces.append(mean[:, :3])
         sds.append(np.sqrt(np.maximum(mean[:, 3:] - white, 0.0) + density**2 / WINDOW_S))
@@ -204,7 +204,7 @@ def floor(tests: Sequence[SimulatedRun]) -> Errors:
 
 
 def judged(result: Errors, goal: Goal | None, least: Errors) -> str:
-    """Return RMS of |f| - g and of the error vector as a table cell; mark values above limits."""
+    """Return RMS of |f| - g and of the error vector [ug] as a cell, with (!) above the goal."""
     cell = f'{result.norm:.2f} / {result.vector:.2f}'
     if goal is None:
         return cell
@@ -218,7 +218,7 @@ def _rms(values: Floats) -> float:
 
 
 def part_kinds(options: argparse.Namespace) -> None:
-    """Print the errors of units of every kind of physics on held-out runs."""
+    """Print a table of errors on held-out runs, with a row for each kind and seed of a unit."""
     print(
         '| unit | seed | floor: norm / vector | golovach | fit | peak | error / claimed sd '
         '| fit s |'
@@ -247,7 +247,7 @@ def part_kinds(options: argparse.Namespace) -> None:
 
 def part_plans(options: argparse.Namespace) -> None:
     """Print the errors of short chamber tests, without and with the prior of ten siblings."""
-    print('| test | unit | seed | floor | alone | with siblings | error / claimed sd, both |')
+    print('| test | unit | seed | floor | no prior | with siblings | error / claimed sd of each |')
     print('|---|---|---|---|---|---|---|')
     for kind in options.kinds or ('own-lags', 'between', 'products'):
         for seed in range(1, options.seeds + 1):
@@ -291,7 +291,7 @@ def main() -> int:
     parser.add_argument('--seeds', type=int, default=3, help='units per kind')
     parser.add_argument('--rate-hz', type=float, default=4.0, help='cycles per second')
     parser.add_argument(
-        '--kinds', type=lambda text: text.split(','), help='kinds of units, by commas'
+        '--kinds', type=lambda text: text.split(','), help='kinds of units, separated by commas'
     )
     options = parser.parse_args()
     for name in options.parts or parts:

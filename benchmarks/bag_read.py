@@ -3,10 +3,10 @@
 """
 Owns the measurement of reading a bag into columns, by thermo_comp, rosbags and mcap in one run.
 
-All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap get shorter bags.
-`rosbags` reads and deserializes each message; `mcap` reads each message and does not decode it at
-all. Rates are messages with counts per second of wall time, the best of the repeats; only their
-ratios hold on other machines.
+All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap get shorter bags
+(`--peer-samples`). `rosbags` reads and deserializes each message; `mcap` only reads each message.
+Rates are messages with counts per second of wall time, from the fastest of the repeats; on another
+machine the ratios of the rates hold, the rates do not.
 
     python benchmarks/bag_read.py --samples 1000000
 """
@@ -38,7 +38,7 @@ COMPRESSIONS = ('none', 'lz4', 'zstd')
 
 
 def write_bag(path: Path, n: int, compression: str, chunk_bytes: int) -> None:
-    """Write n messages of counts, and temperatures."""
+    """Write a bag of n messages of counts at 400 Hz, and of temperatures at 10 Hz."""
     rng = np.random.default_rng(1)
     block = 1 << 17
     with BagWriter(path, compression=compression, chunk_bytes=chunk_bytes) as bag:
@@ -102,9 +102,7 @@ def timed(read: Callable[[Path], int], path: Path, n: int) -> tuple[float, float
 def measure(
     folder: Path, n: int, n_peers: int, repeats: int, chunk_bytes: int
 ) -> Iterator[dict[str, Any]]:
-    """
-    Yield a row per compression: the best result of each reader. The readers run in turn.
-    """
+    """Yield a row per compression: for each reader the shortest time of all repeats."""
     for compression in COMPRESSIONS:
         ours, peers = folder / f'{compression}.mcap', folder / f'{compression}_peers.mcap'
         write_bag(ours, n, compression, chunk_bytes)
@@ -134,12 +132,12 @@ def measure(
 
 def main() -> None:
     """Measure all readers and print the table."""
-    parser = argparse.ArgumentParser(description='Reading a bag, against rosbags and mcap.')
+    parser = argparse.ArgumentParser(description='Times reading by thermo_comp, rosbags, mcap.')
     parser.add_argument(
         '--samples', type=int, default=2_000_000, help='messages that thermo_comp reads'
     )
     parser.add_argument(
-        '--peer-samples', type=int, default=200_000, help='messages that the peers read'
+        '--peer-samples', type=int, default=200_000, help='messages that rosbags and mcap read'
     )
     parser.add_argument('--repeats', type=int, default=3)
     parser.add_argument('--chunk-bytes', type=int, default=CHUNK_BYTES)

@@ -36,7 +36,7 @@ def flip(file: Path, place: float = 0.5) -> None:
 
 
 def wipe(file: Path) -> None:
-    """Overwrite some kB in the middle of a file."""
+    """Overwrite 4096 bytes in the middle of a file by zeros."""
     data = bytearray(file.read_bytes())
     half = len(data) // 2
     data[half : half + 4096] = bytes(4096)
@@ -50,19 +50,19 @@ def cut(file: Path) -> None:
 
 
 def delete_rows(file: Path) -> None:
-    """Delete rows of a database."""
+    """Delete the rows 100 to 265 of the table of messages of a .db3 file."""
     with sqlite3.connect(file) as database:
         database.execute('delete from messages where id between 100 and 265')
 
 
 def flip_message(file: Path) -> None:
-    """Flip a bit in the topic number of a message, so that it belongs to no topic."""
+    """Add 64 to the number of the first topic in each message, so that no topic has the number."""
     with sqlite3.connect(file) as database:
         database.execute('update messages set topic_id = topic_id + 64 where topic_id = 1')
 
 
 def bomb(file: Path) -> None:
-    """Compress 8 GB of zeros to some hundred kB."""
+    """Replace a file by 8 GB of zeros, which zstd compresses to some hundred kB."""
     with file.open('wb') as out, zstandard.ZstdCompressor(19).stream_writer(out) as packed:
         for _ in range(1 << 13):
             packed.write(bytes(1 << 20))

@@ -3,9 +3,9 @@
 """
 Owns the table of every command on every degenerate input: exit code, seconds, peak memory.
 
-For any recording or table a command must end within a time limit, in bounded memory, and with a
-sentence instead of a traceback. The exit code may be 0 only if no data are lost. A run that
-breaks a rule is marked ``!``, and the exit code of the benchmark is then 1.
+For any recording or table a command must end within 60 s, use at most 300 MB, and print no
+traceback. Exit code 0 is allowed only if all data of the input can be read. A run that breaks one
+of these rules is marked ``!``, and the exit code of the benchmark is then 1.
 
     python benchmarks/degenerate.py --only jump --json degenerate.json
 """
@@ -63,7 +63,7 @@ TABLES = {'convert'}
 
 @dataclass(frozen=True)
 class Run:
-    """Result of a command with an input."""
+    """Exit code, time, peak memory and last output of a command with an input."""
 
     input: str
     command: str
@@ -100,7 +100,7 @@ def run(name: str, command: str, path: Path, out: Path) -> Run:
     pid = 0
     megabytes = 0.0
     while not pid and time.monotonic() - began < LIMIT_S:
-        # Read the peak from /proc: the peak of wait4 includes the parent's memory at the fork.
+        # Use /proc, because the peak memory from wait4 includes the parent's memory at the fork.
         megabytes = max(megabytes, _peak_megabytes(process.pid))
         pid, status, _ = os.wait4(process.pid, os.WNOHANG)
         time.sleep(0.01)
@@ -156,7 +156,7 @@ def main() -> int:
     bad = [result for result in runs if result.is_bad]
     for result in bad:
         print(f'{result.command} on {result.input}: {result.code}: {result.said[:300]}')
-    print(f'{len(runs)} runs, {len(bad)} break a promise')
+    print(f'{len(runs)} runs, {len(bad)} break a rule')
     if arguments.json:
         arguments.json.write_text(json.dumps([asdict(result) for result in runs], indent=1))
     return 1 if bad else 0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the degenerate inputs: a recording or table, with a different defect for each name."""
+"""Owns the degenerate inputs: recordings and tables, each with the defect that its name states."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RATE_HZ, POSITIONS, POSITION_S = 20, 10, 40
 
 @dataclass
 class Columns:
-    """A thermal test in a single recording: the positions follow each other during a ramp."""
+    """A recording during one temperature ramp, with a rest in each of several attitudes."""
 
     stamp_ns: np.ndarray
     counts: np.ndarray
@@ -39,7 +39,7 @@ class Columns:
 
 
 def whole() -> Columns:
-    """Make the recording from which all degenerate inputs are derived."""
+    """Make a recording without a defect, from which the degenerate inputs are derived."""
     rng = np.random.default_rng(20)
     n = RATE_HZ * POSITIONS * POSITION_S
     row = np.arange(n)
@@ -53,7 +53,7 @@ def whole() -> Columns:
 
 
 def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = False) -> Path:
-    """Write a bag; with `log` the log times rise, whatever the stamps are."""
+    """Write a bag; with `log` the log times rise steadily and do not depend on the stamps."""
     path = folder / name
     rising = START_NS + np.arange(len(columns.stamp_ns)) * (SECOND // RATE_HZ) if log else None
     slow = None if rising is None else rising[:: RATE_HZ // 2][: len(columns.reading_ns)]
@@ -67,7 +67,7 @@ def write(folder: Path, columns: Columns, name: str = 'bag.mcap', log: bool = Fa
 
 
 def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]:
-    """Apply a defect to the stamps."""
+    """Return a function that writes the recording with a defect in all stamps."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -79,7 +79,7 @@ def stamps(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], Path]
 
 
 def spoilt(change: Callable[[Columns], object]) -> Callable[[Path], Path]:
-    """Apply a defect to samples, readings or topics."""
+    """Return a function that writes the recording with a defect in its samples or readings."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -93,8 +93,8 @@ def imu(
     change: Callable[[np.ndarray], np.ndarray], claimed: float = 0.0
 ) -> Callable[[Path], Path]:
     """
-    Write sensor_msgs/Imu with changed samples [m/s^2]; `covariance` is the first element of
-    linear_acceleration_covariance.
+    Return a function that writes sensor_msgs/Imu with changed samples [m/s^2]; `claimed` is the
+    first element of linear_acceleration_covariance.
     """
 
     def make(folder: Path) -> Path:
@@ -109,7 +109,7 @@ def imu(
 
 
 def _by_turns(force: np.ndarray) -> np.ndarray:
-    """Make every second row exactly zero, like a driver that alternates with gyroscope rows."""
+    """Set every second sample to zero, as drivers do whose rows alternate with gyroscope rows."""
     return force * (np.arange(len(force)) % 2)[:, None]
 
 
@@ -131,12 +131,12 @@ def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _leaning(force: np.ndarray) -> np.ndarray:
-    """Add a large part of axis x to axis y: a misalignment that no real triad has."""
+    """Add 0.6 of axis x to 0.9 of axis y: a misalignment that no real triad has."""
     return force @ np.array([[1.0, 0.6, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
-    """Let the clock jump in the middle of the recording, or after every `every` messages."""
+    """Add a clock jump [ns] in the middle of a recording or, if given, every `every` messages."""
 
     def change(stamp_ns: np.ndarray) -> np.ndarray:
         row = np.arange(len(stamp_ns))
@@ -147,7 +147,7 @@ def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def rosbag2(storage: StoragePlugin, mode: CompressionMode | None) -> Callable[[Path], Path]:
-    """Write the whole recording as rosbag2 with a given storage plugin and compression."""
+    """Return a function that writes the recording without a defect as rosbag2."""
 
     def make(folder: Path) -> Path:
         bare = write(folder, whole())
@@ -173,7 +173,7 @@ ZSTD = rosbag2(StoragePlugin.MCAP, CompressionMode.FILE)
 
 
 def with_pipe(folder: Path) -> Path:
-    """Put a FIFO beside the files of a bag, and another in place of its metadata."""
+    """Put a FIFO beside the files of a bag, and replace the bag's metadata by a second FIFO."""
     bag = DB3(folder)
     (bag / 'metadata.yaml').unlink()
     os.mkfifo(bag / 'metadata.yaml')
@@ -190,7 +190,7 @@ def pipe_as_file(folder: Path) -> Path:
 
 
 def device_as_file(folder: Path) -> Path:
-    """Replace the file of a bag by a link to an endless device."""
+    """Make a bag whose file is a link to /dev/zero, a device without an end."""
     bag = folder / 'bag'
     bag.mkdir()
     (bag / 'bag_0.db3').symlink_to('/dev/zero')
@@ -204,7 +204,7 @@ def other_name(folder: Path) -> Path:
 
 
 def table(change: Callable[[np.ndarray], np.ndarray], kind: str) -> Callable[[Path], Path]:
-    """Write a table with a defect in its stamps."""
+    """Return a function that writes the recording as a table with a defect in its stamps."""
 
     def make(folder: Path) -> Path:
         columns = whole()
@@ -248,7 +248,8 @@ def _samples(columns: Columns, n: int) -> None:
 @dataclass(frozen=True)
 class Input:
     """
-    A degenerate input; `is_lost`: data of the input cannot be read, so that exit code 0 is wrong.
+    A degenerate input; `is_lost`: some data of the input cannot be read, so that a command that
+    ends with exit code 0 is wrong.
     """
 
     make: Callable[[Path], Path]

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Fits the sample bags, plays another bag through the live node, and judges the output.
+Fits the sample bags, plays a held-out bag through the live node, and judges the node's output.
 
     python benchmarks/demo.py [--bags bags] [--out out]
 
-The bag that the fit did not use goes through player, DDS, the node, DDS and a recorder.
+The player publishes the held-out bag over DDS, and a recorder receives the node's output over DDS.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from thermo_comp.unit.calibration_file import save_calibration
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 # Sd of the sample unit's bias from turn-on to turn-on [m/s^2]. The norms of nine positions do not
-# determine this sd, so it is given to the fit.
+# determine this sd, so the fit gets this value as an option.
 MOUNTING_SD = 1e-6 * STANDARD_GRAVITY
 
-# Groups of columns of each fit, by heading in the table: a curve for both regimes; a curve per
-# regime; all groups that the fit selects, which is the calibration for the node.
+# Groups of columns of each fit, by the name in the table: a curve for both regimes; a curve per
+# regime; the groups that the fit selects. The node uses the calibration of the third fit.
 MODELS = {'one set': ('curve',), 'two sets': ('curve', 'set'), 'node': None}
 
 
 def demo(folder: Path, output: Path) -> bool:
-    """Fit, play, judge, draw; return whether the node lost no message and equals the replay."""
+    """Run all steps; return whether the node lost no message and its output equals the replay."""
     out = Output()
     output.mkdir(parents=True, exist_ok=True)
     held_out, recorded, unit = folder / 'held_out.mcap', output / 'out.mcap', output / 'unit.yaml'
@@ -89,7 +89,7 @@ def demo(folder: Path, output: Path) -> bool:
 
 
 def messages(path: Path) -> list[tuple[int, bytes]]:
-    """Return log time and bytes of each message of corrected samples in a bag."""
+    """Return the log time [ns] and the bytes of each Imu message in a bag."""
     with open_recording(path, Topics(imu=IMU_OUT.name, input='imu'), require=['accel']) as bag:
         return [
             pair
@@ -99,13 +99,13 @@ def messages(path: Path) -> list[tuple[int, bytes]]:
 
 
 def main() -> int:
-    """Run the demonstration; return 1 if the node lost messages or differs from the replay."""
+    """Run the demonstration; return 1 if messages are lost or the output is not the replay's."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('--bags', default='bags', help='folder of the sample bags')
     parser.add_argument('--out', default='out', help='folder for the results')
     arguments = parser.parse_args()
     if not Path(arguments.bags, 'held_out.mcap').is_file():
-        parser.error(f'no sample bags in {arguments.bags}: run it in a clone of thermo_comp')
+        parser.error(f'no sample bags in {arguments.bags}: run it in a clone of the repository')
     return 0 if demo(Path(arguments.bags), Path(arguments.out)) else 1
 
 

@@ -28,8 +28,8 @@ def exact_unit(seed: int) -> UnitModel:
     """
     Make a unit whose bias and scale are quadratics of the board's temperature alone.
 
-    The unit has no self-heating, so that its bags contain the reference state, in which no heat
-    flows. A bound on constants in a state outside the bags would not be meaningful.
+    The constants are those at the reference temperature without heat flow. The unit has no
+    self-heating, so that its bags contain this state, and the bound is not an extrapolation.
     """
     rng = np.random.default_rng(seed)
 
@@ -89,8 +89,8 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 
     columns = []
     for j in range(len(start)):
-        # Steps of the numerical derivatives: 1e-6 for direction and M; 1e-3 for bias and scale,
-        # smaller for the coefficients of t and t^2.
+        # Steps of the numerical derivatives: 1e-3 for the bias, 1e-6 for scale, M and directions;
+        # coefficients of t and t^2 have steps smaller by factors of 10 and 1000.
         step = np.zeros(len(start))
         step[j] = 1e-6 if j >= 9 else 1e-3
         step[j] *= 1e-3 if j < 18 and j % 3 == 2 else 1e-1 if j < 18 and j % 3 == 1 else 1.0
@@ -105,8 +105,8 @@ def bound(unit: UnitModel, program: str, directions: Floats, window_s: float) ->
 def efficiency(n_units: int) -> None:
     """Compare bias and scale at the reference temperature with the Cramer-Rao bound."""
     print(
-        '| positions | units | bias: RMS error / bound | scale | bias: error / claimed sd | scale '
-        '| 95 % intervals, bias | scale |'
+        '| positions | units | bias: RMS error / bound | scale | bias: RMS error / claimed sd '
+        '| scale | errors within 1.96 claimed sd: bias | scale |'
     )
     print('|---|---|---|---|---|---|---|---|')
     for n_positions in (18, 24):
@@ -131,11 +131,11 @@ def efficiency(n_units: int) -> None:
 
 
 def main() -> int:
-    """Print the table of the efficiency."""
+    """Print errors of bias and scale relative to the Cramer-Rao bound and to the claimed sd."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('--units', type=int, default=100, help='Monte-Carlo units')
+    parser.add_argument('--units', type=int, default=100, help='number of random units')
     efficiency(parser.parse_args().units)
     return 0
 

@@ -5,13 +5,13 @@ Measures updates in the field against an optimal filter, on units that age (`fie
 
     python benchmarks/field.py [--units 10] [--days 60] [--recordings ../shared/data]
 
-The platforms are vehicles, level within 10 deg, and drones that are carried. Units age for 60
-days: bias walk 15 ug and scale walk 10 ppm per root day, turn-on 20 ug, one shock of 300 ug per
-unit. On several days the calibration is updated with all rests so far, as in `thermo_comp update`,
-and judged on the rests of the next day. At the end the errors of the calibration are compared with
-those of a Kalman filter that is given the process and the time of the shock. With --recordings
-FOLDER, the real recordings in FOLDER are cut into parts, and an update with all parts so far is
-judged on the next part.
+Half of the units are in vehicles, level within 10 deg, half are carried in any attitude. Units age
+for 60 days: random walks of the bias (15 ug per root day) and scale (10 ppm per root day), bias
+offsets at turn-on (sd 20 ug) and one shock (sd 300 ug). On six days the calibration is updated
+with all earlier rests, as in `thermo_comp update`, and judged on the rests of the next day. After
+the last day its errors are compared with those of a Kalman filter that is given these sd and the
+time of the shock. With --recordings FOLDER, the real recordings in FOLDER are cut into parts, and
+an update with all earlier parts is judged on the next part.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ LABORATORY = calibration()
 
 def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, Floats]:
     """
-    Build noise-free rests in attitudes of use; return the rests, their counts / `K`, their board
-    temperatures less the reference [K], and the true forces [m/s^2].
+    Build noise-free rests in random attitudes of a kind of platform; return the rests, their
+    counts / `K`, board temperatures less the reference [K], and true forces [m/s^2].
     """
     rng = np.random.default_rng(seed)
     force = G * np.array([attitude(kind, rng) for _ in range(N_PROBES)])
@@ -78,17 +78,17 @@ def errors_of(series: Series, calibrated: Calibration, force: Floats) -> Floats:
 
 
 def root_mean(values: Floats) -> float:
-    """Return the root of the mean square."""
+    """Return the RMS of an array."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
     """
-    Return whether the update, and whether the best filter, has a larger error on the rests of a
-    day than the old calibration.
+    Return whether the updated calibration, and whether the Kalman filter, has a larger RMS of
+    |f| - g on the rests of a day than the calibration before the update.
 
-    The excess of the error must be above the standard error of an RMS over n turn-ons, which is
-    the claimed sd / sqrt(2 n).
+    A difference counts if it exceeds the standard error of an RMS over n turn-ons, which is the
+    claimed sd / sqrt(2 n).
     """
     old, updated = (series_of(after, given) for given in (LABORATORY, new))
     counts = np.array([rest.mean for _, rest in after]) / K
@@ -109,14 +109,14 @@ def worse(after: list, new: Calibration, kalman: Floats) -> tuple[bool, bool]:
 
 
 def filtered(history: History, process: Process, days: int) -> Floats:
-    """Return the best filter's state after `days` days, without the offset of the last turn-on."""
+    """Return the Kalman filter's state after `days` days, with the turn-on offset set to zero."""
     state = best(history, process, days).state.copy()
     state[21:] = 0.0
     return state
 
 
 def best(history: History, process: Process, days: int) -> BestFilter:
-    """Run the best filter over the rests of the first `days` days, a measurement for each rest."""
+    """Run the Kalman filter over all rests of the first `days` days; a rest is a measurement."""
     found = BestFilter(process)
     rests: dict[tuple, list[Rest]] = defaultdict(list)
     for (_, rest), day, start in zip(history.rests, history.day, history.start, strict=True):
@@ -132,7 +132,8 @@ def best(history: History, process: Process, days: int) -> BestFilter:
 
 def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, float]:
     """
-    Age and update a unit: squared errors at the end, comparisons by day, time of the last update.
+    Age and update a unit; return the errors after the last day, the comparisons of `worse` by day,
+    and the time of the last update [s].
     """
     shock_day = np.random.default_rng([seed, 7]).uniform(0.2, 0.8) * days
     process = Process(shock_day=float(shock_day))
@@ -155,8 +156,8 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
     kalman = filtered(history, process, days)
     f = corrected(counts, warmth, kalman)
     of_best = np.column_stack((np.linalg.norm(f, axis=1) - G, f - force))
-    # The claimed sd is that of a window a day later, after another turn-on: add a turn-on offset,
-    # noise and a random walk of a day to the error.
+    # The claimed sd is that of |f| in a window one day after the update and after a further
+    # turn-on: add a turn-on offset, noise and a random walk over a day to the error.
     rng = np.random.default_rng([seed, 9])
     of_bias = np.hypot(process.turn_on, process.bias)
     more = (series.direction * rng.normal(0.0, of_bias, (N_PROBES, 3))).sum(axis=1)
@@ -177,7 +178,7 @@ def unit(kind: str, seed: int, days: int) -> tuple[dict[str, Floats], list, floa
 
 
 def simulated(kind: str, n_units: int, days: int) -> None:
-    """Print the figures of a kind of platform."""
+    """Print the errors on a kind of platform before and after updates, and of the filter."""
     results = [unit(kind, seed, days) for seed in range(n_units)]
     joined = {name: np.array([result[0][name] for result in results]) for name in results[0][0]}
     print(f'\n{kind}: {n_units} units, {days} days, one shock each')
@@ -191,17 +192,17 @@ def simulated(kind: str, n_units: int, days: int) -> None:
             for key in ('after', 'best')
         )
         print(
-            f'  {name:4} before {a:6.1f} ug  after {b:6.1f}  best {c:6.1f}  ratio {b / c:.2f}  '
-            f'units worse than before {n_worse} (the best filter: {n_best})'
+            f'  {name:4} before {a:6.1f} ug  after {b:6.1f}  filter {c:6.1f}  ratio {b / c:.2f}  '
+            f'units with a larger error after {n_worse} (filter: {n_best})'
         )
     ratio = root_mean(joined['missed']) / root_mean(joined['claimed'])
-    print(f'  error / claimed sd of |f| {ratio:.2f} (0.7 .. 1.4)')
+    print(f'  error / claimed sd of |f| {ratio:.2f} (goal 0.7 .. 1.4)')
     days_after = np.array([pair for result in results for pair in result[1]])
     print(
-        f'  day after an update: {len(days_after)} days, worse than the old file beyond the '
-        f'standard error {days_after[:, 0].sum()} (the best filter: {days_after[:, 1].sum()})'
+        f'  day after an update: {len(days_after)} days, error larger than without the update by '
+        f'the standard error {days_after[:, 0].sum()} (filter: {days_after[:, 1].sum()})'
     )
-    print(f'  update of {days} days: {max(result[2] for result in results):.1f} s at most')
+    print(f'  time of an update: {max(result[2] for result in results):.1f} s at most')
 
 
 def log_size() -> None:

@@ -3,9 +3,9 @@
 """
 Owns updates on real recordings, for the benchmark `field.py`.
 
-No recording spans days, so each is cut into parts: a fit of the first part replaces the
-calibration of a laboratory, and each further part counts as a start of the node. On each part, an
-update with all earlier parts is compared with the fit of the first part.
+No recording spans days, so each recording is cut into parts: a fit of the first part replaces the
+calibration of a laboratory, and each further part is taken as the recording of a separate turn-on.
+On each part, an update with all earlier parts is compared with the fit of the first part.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def part(of: Columns, begin: float, end: float) -> Columns:
 
 
 def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple[Start, Rest]]:
-    """Return the rests that a node, started at the begin of a recording, would log."""
+    """Return the rests that a node would log if the node started with the recording."""
     compensator = Compensator(calibration)
     correction = compensator.thermal.correction
     start = Start(
@@ -83,7 +83,7 @@ def rests_of(of: Columns, calibration: Calibration, start_ns: int) -> list[tuple
 
 
 def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], float]]:
-    """Yield name, bag, begins of the parts and end of the last [s], length of a window [s]."""
+    """Yield name, bag, edges of the parts [s] and length of a window [s] of each recording."""
     # Use the time from the last jump (docs/real_data.md) until the sensor leaves the freezer.
     yield 'freezer', freezer_bag(folder, work), [518.5, *np.arange(900.0, 1941.0, 104.0)], 10.0
     for unit in range(3):
@@ -91,8 +91,8 @@ def cases(folder: Path, work: Path) -> Iterator[tuple[str, Path, list[float], fl
 
 
 def judge_recordings(folder: Path) -> None:
-    """Print for each recording the residual before and after updates, on the next part."""
-    print('\nreal recordings, an update by the parts so far judged on the next part')
+    """Print for each recording the RMS of |f| - g, before and after updates by earlier parts."""
+    print('\nreal recordings: an update with all earlier parts, judged on the next part')
     with tempfile.TemporaryDirectory() as work:
         for name, bag, edges, window in cases(folder, Path(work)):
             gather.SECONDS = int(window)

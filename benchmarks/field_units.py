@@ -4,10 +4,10 @@
 Owns the units of the benchmark `field.py`, which age: physics, rests, reference filter.
 
 A unit leaves the laboratory with a calibration whose error is drawn from the covariance that the
-calibration states. In the field bias and scale follow random walks, each turn-on has another bias
+calibration states. In the field bias and scale follow random walks, each turn-on has a random bias
 offset, and a shock changes the biases once. The forward model and the Kalman filter are written
-here in numpy and share no code with the update; the filter is given the true variances and the
-time of the shock.
+here in numpy and share no code with `thermo_comp update`; the filter is given the true variances
+and the time of the shock.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ KINDS = ('level', 'carried', 'fixed', 'up and down', 'faces')
 
 @dataclass(frozen=True)
 class Process:
-    """The ageing process: random walks per root day, sd of turn-on offsets and of the shock."""
+    """Sd of the random walks of bias and scale per root day, of turn-on offsets, of the shock."""
 
     bias: float = 15 * UG
     scale: float = 10e-6
@@ -64,17 +64,17 @@ class Process:
 
 @dataclass
 class History:
-    """Rests of a unit, and its true deviations from the calibration after each day."""
+    """Rests of a unit, and the unit's true deviations from its calibration after each day."""
 
     rests: list[tuple[Start, Rest]] = field(default_factory=list)
-    #: Day, and number of the turn-on, of each window.
+    #: For each window of `rests`: number of the day, and number of the turn-on.
     day: list[int] = field(default_factory=list)
     start: list[int] = field(default_factory=list)
     states: list[Floats] = field(default_factory=list)
 
 
 def calibration() -> Calibration:
-    """Build the calibration of the laboratory, with the covariance of its errors."""
+    """Build a calibration with the sd `PRIOR`, as from a laboratory before the ageing."""
     axis = AxisSet(
         Polynomial((0.0, K * SLOPE)), Polynomial((1.0, SCALE_SLOPE)), residual_sd_m_s2=20 * UG
     )
@@ -131,7 +131,7 @@ def corrected(counts: Floats, warmth: Floats, state: Floats) -> Floats:
 
 
 def attitude(kind: str, rng: np.random.Generator) -> Floats:
-    """Draw a direction of f for a kind of platform, see `KINDS`; level is up within 10 deg."""
+    """Draw a direction of f in a kind of `KINDS`; 'level': within 10 deg of the z axis."""
     if kind == 'carried':
         u = rng.standard_normal(3)
         return np.asarray(u / np.linalg.norm(u))
@@ -143,14 +143,14 @@ def attitude(kind: str, rng: np.random.Generator) -> Floats:
 
 
 def temperature(day: float, rng: np.random.Generator) -> float:
-    """Draw the board's temperature on a day [degC]: a yearly cycle and random weather."""
+    """Draw the board's temperature on a day [degC]: a cycle of 60 days plus noise of 2 K."""
     return float(REFERENCE_C + 10.0 * np.sin(2.0 * np.pi * day / 60.0) + rng.normal(0.0, 2.0))
 
 
 def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[float]:
     """
-    Split a rest into times of constant attitude [s]: 20 to 90 s each if the unit is carried, else
-    the whole rest.
+    Split a rest into times of constant attitude [s]: the whole rest in the kinds 'level' and
+    'fixed', 20 to 90 s each in the other kinds.
     """
     while seconds >= WINDOW_S:
         rest = seconds if kind in ('level', 'fixed') else min(seconds, rng.uniform(20.0, 90.0))
@@ -159,7 +159,7 @@ def lasting(kind: str, seconds: float, rng: np.random.Generator) -> Iterator[flo
 
 
 def live(kind: str, seed: int, days: int, process: Process) -> History:
-    """Let a unit age: three turn-ons a day, each with a rest of two to ten minutes."""
+    """Simulate the ageing of a unit: three turn-ons a day, a rest of 2 to 10 min in each."""
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     state = np.concatenate((PRIOR * rng.standard_normal(15), np.zeros(9)))
     history, before, is_shocked, n_starts = History(), 0.0, False, 0
@@ -195,7 +195,7 @@ def live(kind: str, seed: int, days: int, process: Process) -> History:
 
 
 class BestFilter:
-    """A Kalman filter that knows the variances of the ageing and the time of the shock."""
+    """A Kalman filter that is given the variances of the ageing and the time of the shock."""
 
     def __init__(self, process: Process) -> None:
         self.process = process
@@ -208,6 +208,7 @@ class BestFilter:
         Update the filter with a rest.
 
         now: time [days]; counts: mean of the rest [counts / `K`]; variance: of the mean's norm
+        [m^2/s^4]; warmth: board temperature less the reference temperature [K]
         """
         process = self.process
         if start != self._start:

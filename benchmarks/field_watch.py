@@ -6,10 +6,10 @@ Measures verdicts and forecasts of the drift watch on simulated units (`field_un
     python benchmarks/field_watch.py [--units 20] [--days 30]
 
 Units with attitudes of five kinds age by random walks of known sd and log rests. For each unit 200
-futures are drawn: the random walk goes on until the RMS of |f| - g over the attitudes of use, with
-the scatter of the turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast are the share
-of the drawn times within the forecast's 10 to 90 % interval, and the forecast's median divided by
-the median drawn time.
+continuations of the random walk are drawn, until the RMS of |f| - g over random attitudes of the
+kind, with the scatter of the turn-ons, exceeds a tolerance of 200 ug. The figures of a forecast
+are the percentage of the drawn times in the forecast's 10 to 90 % interval, and the forecast's
+median divided by the median drawn time.
 In a second part, a verdict is taken every five days on level and on carried units, half of which
 do not age; the figures are the number of verdicts "outside", by classes of the true RMS of |f| - g
 divided by the limit.
@@ -34,7 +34,7 @@ LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
 
 def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generator) -> Floats:
-    """Draw the days until the RMS of |f| - g exceeds a bound, for 200 futures, in steps of 8 h."""
+    """Draw 200 times [days] after which the RMS of |f| - g exceeds a bound, in steps of 8 h."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))
     # The norm of `root @ (1, levels)` is the RMS of |f| - g over the rests of `probe`.
@@ -52,10 +52,11 @@ def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generat
 
 def forecasts(kind: str, n_units: int, days: int) -> dict[str, Floats]:
     """
-    Compare forecasts and recalibration intervals with simulated times to the tolerance [days].
+    Compare forecasts and recalibration intervals with simulated times [days] after which the error
+    exceeds the tolerance.
 
     Each row has the share of simulated times in the forecast's 10 to 90 % interval, the median of
-    the simulated times [days], and the forecast's quantiles [days].
+    the simulated times [days], and the forecast's quantiles 10, 50 and 90 % [days].
     """
     rng, process = np.random.default_rng(3), Process()
     found: dict[str, list[tuple[float, ...]]] = {'forecast': [], 'interval': []}

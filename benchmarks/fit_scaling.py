@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of a fit: CPU time and peak memory over the number of bags, compared with reading
-alone, and the exponent of the number of samples in the CPU time.
+Owns the cost of a fit: CPU time and peak memory of fitting n bags, compared with those of reading
+the bags, and the exponent p in CPU time ~ (number of samples)^p.
 
 Bags of four hours are simulated once and written to disk. Reading and fitting run in separate
-processes, so that each has its own peak of memory.
+processes, so that the peak memory of each is measured.
 
     python benchmarks/fit_scaling.py --bags 6 12 24 --rate-hz 100
 """
@@ -50,7 +50,7 @@ def write_bags(folder: Path, n_bags: int, rate_hz: float) -> list[Path]:
 
 
 def measure(task: str, paths: list[Path]) -> dict[str, float]:
-    """Run a task in a separate process."""
+    """Run a task ('read' or 'fit') in a separate process; return its figures."""
     done = subprocess.run(
         [sys.executable, __file__, '--task', task, *map(str, paths)],
         check=False,

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cost of a fleet: scaling with workers, overhead of the scheduler, network, lost results.
+Owns the cost of fitting a fleet: speed-up by workers, overhead of the scheduler, network traffic,
+and results lost when workers are killed.
 
-Units are simulated and written to bags once (``--folder`` keeps them), and fitted as in
-the command `fleet fit`. Workers are processes of one thread, as in `fleet fit`.
-
+Units are simulated and written to bags once (``--folder`` keeps the bags), and fitted as in the
+command `fleet fit`, whose workers are processes of one thread.
     python benchmarks/fleet.py scaling              strong and weak scaling, 1 and 2 workers
     python benchmarks/fleet.py overhead             500 small units; estimate for 100 workers
     python benchmarks/fleet.py kill --units 200     200 units of 12 bags, two workers killed
@@ -43,14 +43,14 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: Program over 35 K with a sample per second, so that hundreds of units are simulated in minutes.
 PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
-#: The smallest thermal test that can be fitted: it gives the scheduler the highest load.
+#: The shortest thermal test that can be fitted: with short fits the scheduler's load is highest.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
 N_LOTS = 4
 _REST_S = 4.0
 
 
 def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
-    """Simulate units, one bag per position; existing bags are kept."""
+    """Simulate units and write a bag per position; units whose bags exist are left out."""
     chamber = parse_cyclogram(program)
     for seed in range(1, n_units + 1):
         unit = unit_preset('mems', seed)
@@ -82,7 +82,7 @@ def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
 
 
 def units_of(folder: Path, n_units: int) -> list[FoundUnit]:
-    """Find the units of a fleet, and repeat them if there are fewer than `n_units`."""
+    """Return `n_units` units of a fleet; a smaller fleet is repeated."""
     units = find_units(Storage(str(folder)))
     return [units[i % len(units)] for i in range(n_units)]
 
@@ -101,7 +101,7 @@ class Measured:
     own_cpu_s : float
         Processor time of the benchmark's process, which is client and scheduler [s].
     rest_cpu : float
-        Share of a processor that the benchmark's process uses without tasks, as for heartbeats.
+        Processor time per second of the benchmark's process while no task runs, as for heartbeats.
     n_bytes : int
         Number of bytes that all processes wrote to their connections.
     cpu_s : float
@@ -122,7 +122,7 @@ class Measured:
         return max(self.own_cpu_s - self.rest_cpu * self.seconds, 0.0) / len(self.tasks)
 
     def busy(self, n_workers: int) -> float:
-        """Return the share of time in which the workers were busy."""
+        """Return the time of all tasks / (number of workers times the time of the run)."""
         return sum(self.tasks) / (n_workers * self.seconds)
 
 
@@ -186,12 +186,13 @@ def bytes_written() -> int:
 
 
 def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
-    """Compare one worker with two workers, for equal units and for twice as many units."""
+    """Compare two workers with one worker: all units (strong), half of the units (weak)."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fit = FitOptions(gravity=STANDARD_GRAVITY, model=model)
     options = FleetOptions(fit, certificates=False)
     print(f'{n_units} units x 12 bags, model {model}; load {loads()}')
-    print('| run | strong: 1 worker s | 2 workers s | x | free cores x | weak, half: 1 s | x |')
+    print('| run | 1 worker s | 2 workers s | speed-up | with free cores | 1 worker, half of the '
+          'units s | throughput of 2 workers / of 1 |')  # fmt: skip
     print('|---|---|---|---|---|---|---|')
     collected: list[tuple[float, float, float]] = []
     for number in range(repeats):
@@ -199,8 +200,8 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             measure(folder / 'fleet', units, workers, options)
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
-        # Other programs on the processors slow two workers more than one worker. With a free core
-        # each, two workers lose time only by waiting and by shared caches and memory.
+        # Other programs on the cores slow two workers more than one worker. `free` is the speed-up
+        # if each worker had a free core: less than 2 by waiting and by shared caches and memory.
         free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
         collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(
@@ -210,8 +211,8 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
         )
     strong, free, weak = (statistics.median(column) for column in zip(*collected, strict=True))
     print(
-        f'median: strong {strong:.2f} x, with a free core each {free:.2f} x; weak {weak:.2f} x '
-        f'the throughput; load {loads()}'
+        f'medians: speed-up {strong:.2f}, with a free core per worker {free:.2f}; throughput of 2 '
+        f'workers / of 1 worker {weak:.2f}; load {loads()}'
     )
 
 
@@ -227,14 +228,14 @@ def overhead(folder: Path, n_units: int) -> None:
     print(
         f"scheduler and client: {100.0 * cost.own_cpu_s / busy:.2f} % of the tasks' processor "
         f'time; {1e3 * cost.per_task_s:.2f} ms per unit, and {100.0 * cost.rest_cpu:.1f} % of a '
-        'processor at rest'
+        'processor while no task runs'
     )
     print(f'network: {cost.n_bytes / n_units / 1e3:.1f} kB per unit, all connections together')
     paper(cost)
 
 
 def kill(folder: Path, n_units: int, model: str) -> int:
-    """Kill two workers in a run, while they fit a unit; return the number of lost results."""
+    """Kill a worker twice during a run of two workers; return the number of lost results."""
     write_fleet(folder / 'fleet', n_units, 12, PROGRAM)
     fleet = Path(tempfile.mkdtemp(prefix='fleet-', dir=folder))
     for unit in find_units(Storage(str(folder / 'fleet')))[:n_units]:
@@ -269,7 +270,7 @@ def kill(folder: Path, n_units: int, model: str) -> int:
 
 
 def paper(found: Measured) -> None:
-    """Estimate runs with 100 and 1000 workers if a scheduler sends the tasks one by one."""
+    """Estimate times of runs with 100 and 1000 workers from the scheduler's time per task."""
     kilobytes = found.n_bytes / len(found.tasks) / 1e3
     print('\n| unit takes s | units | workers | elapsed s | efficiency | scheduler busy | MB/s |')
     print('|---|---|---|---|---|---|---|')
@@ -293,7 +294,7 @@ def paper(found: Measured) -> None:
 
 
 def makespan(tasks: Sequence[float] | np.ndarray, n_workers: int, per_task: float) -> float:
-    """Return the duration of a run [s]: a free worker gets the next task from a free scheduler."""
+    """Return the duration of a run [s] in which one scheduler sends `per_task` s per task."""
     free = [0.0] * n_workers
     scheduler = end = 0.0
     for task in tasks:

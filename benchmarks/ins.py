@@ -4,14 +4,14 @@
 Owns the position errors of an inertial navigator due to accelerometer drift, raw and compensated.
 
 The unit of the held-out bag stands still in the chamber, so any computed motion is an error. The
-navigator levels for five minutes, then navigates freely for half an hour; or it gets a
-zero-velocity update (ZUPT) every minute for 25 minutes, and then coasts for five minutes. A flight
-of each kind begins in every minute of the bag, with raw samples, with samples corrected by a cubic
-for both regimes, and with samples compensated as in the node.
+navigator levels for five minutes, then navigates without aiding for half an hour; or it gets a
+zero-velocity update (ZUPT) every minute for 25 minutes, and no aiding in the next five minutes. A
+flight of each kind begins in every minute of the bag, with raw samples, with samples corrected by
+a cubic for both regimes ('one set'), and with samples compensated as in the node.
 
-The gyroscopes are ideal and the Earth does not rotate, so that all errors are of the
-accelerometer; the height is kept constant, as with a barometer. The filter estimates four errors
-per level axis, of position p, velocity v, tilt a and accelerometer b, as in [1]_ chapter 12::
+The simulated gyroscopes are ideal and the Earth does not rotate, so that the accelerometer causes
+all errors; the height is kept constant, as with a barometer. The filter estimates for each of the
+two level axes the errors of position p, velocity v, tilt a and accelerometer b, [1]_ chapter 12::
 
     p' = v      v' = b - g a      a' = v / R      b' = -b / tau + noise
 
@@ -42,9 +42,9 @@ BAGS = Path(__file__).resolve().parent.parent / 'bags'
 #: Mean radius of the Earth [m]: IUGG, R_1.
 EARTH_RADIUS = 6.371009e6
 ALIGN_S, FREE_S, COAST_S, STANDING_S = 300.0, 1800.0, 300.0, 1500.0
-#: Interval of zero-velocity updates [s], their sd [m/s], interval between starts of flights [s].
+#: Interval of zero-velocity updates [s], sd of an update [m/s], interval of flight starts [s].
 ZUPT_S, ZUPT_SD, EVERY_S = 60.0, 1e-3, 60.0
-#: Correlation time of the accelerometer's error in the filter [s]: a few lags of a board.
+#: Correlation time of the accelerometer's error in the filter [s]: a few board time constants.
 BIAS_S = 1800.0
 COLOURS = {'raw': '#b2182b', 'one set': '#e08214', 'compensated': '#2166ac'}
 
@@ -58,7 +58,7 @@ def turned(angles: Floats) -> Floats:
 
 
 def levelled(force: Floats) -> Floats:
-    """Return the attitude, body to east-north-up, that makes a mean force (..., 3) vertical."""
+    """Return the attitude, body to east-north-up, in which a mean force (..., 3) is vertical."""
     up = force / np.linalg.norm(force, axis=-1, keepdims=True)
     east = np.array([1.0, 0.0, 0.0]) - up[..., :1] * up
     east /= np.linalg.norm(east, axis=-1, keepdims=True)
@@ -106,7 +106,7 @@ class Navigator:
 
 @dataclass(frozen=True)
 class Model:
-    """Samples of the bag (n, 3) [m/s^2], raw or corrected, with noise density and bias sd."""
+    """Samples (n, 3) [m/s^2] with noise density [m/s^2/sqrt(Hz)] and sd of the bias [m/s^2]."""
 
     force: Floats
     noise_density: float
@@ -125,7 +125,7 @@ class Flights:
 
 
 def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> Flights:
-    """Fly from each minute on: levelling, zero-velocity updates for `zupts_s`, free navigation."""
+    """Compute flights: levelling, zero-velocity updates for `zupts_s`, then no aiding."""
     n_align = round(ALIGN_S / dt)
     n = round((zupts_s + (COAST_S if zupts_s else FREE_S)) / dt)
     starts = np.arange(0, len(model.force) - n_align - n, round(EVERY_S / dt))
@@ -137,7 +137,7 @@ def fly(model: Model, dt: float, up: Floats, gravity: float, zupts_s: float) -> 
     )  # fmt: skip
     F = np.eye(4) + A * dt + 0.5 * A @ A * dt * dt
     Q = np.diag([0.0, model.noise_density**2, 0.0, 2.0 * model.bias_sd**2 / BIAS_S]) * dt
-    # After levelling an error of the accelerometer is compensated by a tilt.
+    # Levelling turns an accelerometer error b into a tilt b / g, which cancels the error at first.
     tilt = np.array([0.0, 0.0, 1.0 / gravity, 1.0])
     P = np.outer(tilt, tilt) * model.bias_sd**2
     P[2, 2] += model.noise_density**2 / ALIGN_S / gravity**2
@@ -178,7 +178,7 @@ def models() -> tuple[dict[str, Model], float, Floats, float]:
     bias = np.array([axis.bias for axis in axes])
     scale = np.array([axis.scale_factor for axis in axes])
     raw = (recording.counts - bias) / scale @ np.array(full.misalignment).T
-    # Raw samples have no claimed sd: the filter uses the sd of the compensated samples.
+    # Raw samples have no stated sd: for them the filter uses the sd of the compensated samples.
     ours = collected['compensated']
     truth = json.loads(inspect_recording(held_out).metadata['truth'])
     return (
@@ -190,7 +190,7 @@ def models() -> tuple[dict[str, Model], float, Floats, float]:
 
 
 def draw(path: Path, results: dict[str, dict[str, Flights]]) -> None:
-    """Draw the position error over time: free flights, and flights with zero-velocity updates."""
+    """Draw the RMS position error over time, without and with zero-velocity updates."""
     mpl.use('Agg')
     from matplotlib import pyplot as plt
 

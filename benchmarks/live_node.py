@@ -30,10 +30,10 @@ from thermo_comp.ros.waitloop import WaitLoop, separate_node, wait_until
 from thermo_comp.topics import FLAGS, IMU_OUT, OUTPUTS, SAMPLES, thermometer
 from thermo_comp.unit.calibration_file import load_calibration
 
-#: Largest number of samples that the node may be behind the player; the middleware holds 5000.
+#: Largest number of published samples that the node has not yet taken; the middleware stores 5000.
 IN_FLIGHT = 2000
-#: Time limit for discovery, and for the last messages [s]: Fast DDS sends a lost message again
-#: after 3 s, on a busy machine several times.
+#: Time limit for discovery, and for the arrival of the last messages [s]: Fast DDS sends a lost
+#: message again after 3 s, and on a busy machine must do so several times.
 PATIENCE_S = 30.0
 EVERYTHING = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 STAMP = Struct('<iI')
@@ -59,7 +59,7 @@ def node_in_thread(*ros_args: str) -> Iterator[CompensationNode]:
 
 
 def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> list[str]:
-    """Return ROS arguments with which a node loses no message, but has a larger latency."""
+    """Return ROS arguments for reliable QoS, with which a node loses no message."""
     inputs = [*(sample.name for sample in SAMPLES.values()), *map(thermometer, thermometers)]
     overrides = [
         *(f'{topic}.subscription.reliability:=reliable' for topic in inputs),
@@ -71,7 +71,7 @@ def lossless(namespace: str = '', thermometers: Iterable[str] = ROLES[1:]) -> li
 
 
 class Recorder:
-    """Records the node's outputs into a rosbag2 bag, which is written at the end."""
+    """Keeps the node's outputs in memory, and writes a rosbag2 bag when the recorder is closed."""
 
     def __init__(self, path: Path, ros_args: Sequence[str]) -> None:
         self._writer, self._ros_args = BagWriter(path, overwrite=path.exists()), ros_args
@@ -191,6 +191,6 @@ def through_the_node(
             return n_in == n_sent and [*recorder.counts.values()] == [n_out, n_flags, n_flags]
 
         wait_until(is_complete, PATIENCE_S)
-    # The node does not count temperature readings: the flag of a reading after the last sample may
-    # arrive until the recorder is closed.
+    # The node does not count temperature readings, so the wait above does not include the regime
+    # flag of a reading after the last sample: this flag may arrive until the recorder is closed.
     return played, recorder.counts

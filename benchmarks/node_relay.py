@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measures the node against a naive relay: CPU time per sample, loss and latency, in one run.
+Compares the node with a naive relay: CPU time per sample, lost samples and latency.
 
     python benchmarks/node_relay.py [--quick] [--floor] [--core 1] [--sleep] [--rates 400]
 
@@ -14,23 +14,23 @@ sink's middleware, before any Python code of the sink runs. Ratios of the node t
 hold on other machines, times do not. The node uses its profile for Fast DDS; source, sink and
 naive relay use the default profile. At the last rate the node is measured once more while the
 parameter `calibration_file` is set twice a second. `--core` binds each relay to a core. `--floor`
-also measures a third relay, which copies bytes with a wait set, a subscription and the node's
-profile, and computes nothing.
+also measures a third relay, which copies the bytes of each message to Imu in a loop over a wait
+set, with the node's profile, and computes nothing.
 
 The source keeps `--depth` samples to send lost samples again. With a reliable relay Fast DDS
 removes samples from the source's store 859 at a time; with 2000 kept samples the removal delays
-the source by 1 to 3 ms, whatever the relay.
+the source by 1 to 3 ms, with the node and with the naive relay.
 
 Processes that missed each other's first DDS announcements discover each other at the next
-announcements, 3 s later. A process that opens another's shared memory may stand still for a third
-of a second, as Fast DDS waits for a reader. The measurement begins when all processes have been
-discovered.
+announcements, 3 s later. A process that opens the shared memory of another process may stand still
+for a third of a second, because Fast DDS waits for a reader. The measurement begins when all
+processes have discovered each other.
 
 An idle core sleeps and needs time to wake up, and the host may use an idle virtual core for other
-machines. If the system allows it (Linux, as root) all cores are kept awake for all relays alike,
-by a request for no latency in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the cores may
-sleep. The host may stop a virtual machine with all its processes. The share of stolen time is at
-the end of each row ("stolen"): latencies are meaningful if this share is small.
+machines. If the system allows this (Linux, as root), all cores are kept awake for all relays, by a
+request for a wake-up time of 0 us in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the
+cores may sleep. The host may stop a virtual machine with all its processes. The percentage of this
+stolen time is at the end of each row ("stolen"): latencies are meaningful if it is small.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ import thermo_comp
 ROOT = Path(__file__).resolve().parent.parent
 RATES = (100, 400, 1000, 2000, 5000, 10000)
 ROLES = ROOT / 'benchmarks' / 'relay_roles.py'
-# Wait for discovery [s]: the interval of DDS announcements, 3 s, and a third of a second for each
-# of three processes.
+# Wait for discovery [s]: the 3 s between DDS announcements, and a third of a second for each of
+# source, relay and sink.
 MEETING_S = 4.0
-# File that limits the wake-up time of the cores while open: a native 32-bit number [us].
+# While this file is open, the 32-bit number in it limits the wake-up time of the cores [us].
 LATENCY_REQUEST = Path('/dev/cpu_dma_latency')
 CALIBRATION = ROOT / 'config' / 'calibration.example.yaml'
 
@@ -109,10 +109,10 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument('--repeats', type=int, help='runs of each case (default 3)')
     parser.add_argument('--rates', type=int, nargs='+', help=f'default {RATES}')
     parser.add_argument(
-        '--floor', action='store_true', help='also measure a loop that only copies'
+        '--floor', action='store_true', help='also measure a relay that only copies bytes'
     )
-    parser.add_argument('--core', type=int, default=-1, help='core for the relays (default any)')
-    parser.add_argument('--depth', type=int, default=100, help="source's queue (default 100)")
+    parser.add_argument('--core', type=int, default=-1, help='core of the relays (default any)')
+    parser.add_argument('--depth', type=int, default=100, help='queue of the source (default 100)')
     parser.add_argument('--sleep', action='store_true', help='let idle cores sleep')
     parser.add_argument('--json', help='file for the figures')
     arguments = parser.parse_args()
@@ -179,9 +179,9 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     """
-    Divide each run's CPU time by that of the naive relay in the run before; return the median.
+    Return the median ratio of CPU times: a run of a relay / the neighbouring run of the naive one.
 
-    The speed of a machine changes over minutes by more than the differences to be measured.
+    Neighbouring runs are compared, because the speed of a shared machine changes over minutes.
     """
     return statistics.median(
         run['cpu_us'] / other['cpu_us'] for run, other in zip(runs, naive, strict=True)
@@ -221,7 +221,7 @@ def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
 @contextmanager
 def _process(role: str, options: list[str]) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, str(ROLES), role, *options]
-    # Use the package of this interpreter, installed or not.
+    # Give the processes the package imported here, even if the package is not installed.
     environment = {**os.environ, 'PYTHONPATH': str(Path(thermo_comp.__file__).parents[1])}
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the figures of docs/beyond_1g.md: fitted nonlinear terms from centrifuge runs against truth.
+Owns the figures of docs/beyond_1g.md: errors of K2 and K3 that are fitted to centrifuge runs.
 
 Run ``python benchmarks/nonlinearity.py``, or with fewer units: ``--units 4``. The runs come from
 a generator in this file, not from `thermo_comp.simulation`. A test has 12 mountings, each in three
-soaks at 1 g and at 2, 4, 7 and 10 g. |f| is stated with 1 ppm (1 sd), the samples in m/s^2 have a
-noise of 5 ug/sqrt(Hz), and bias and scale are quadratic in the board's temperature.
+soaks at 1 g and at 2, 4, 7 and 10 g. The stated |f| has an error of 1 ppm (1 sd), the samples in
+m/s^2 have a noise of 5 ug/sqrt(Hz), and bias and scale are quadratic in the board's temperature.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 @dataclass(frozen=True)
 class Unit:
-    """True constants of a unit; K2 [g/g^2] and K3 [g/g^3] change by the factor `share` per K."""
+    """True constants of a unit; K2 [g/g^2] and K3 [g/g^3] grow by 100 * `share` % per K."""
 
     scale: Floats
     scale_slope: Floats
@@ -143,7 +143,7 @@ def run(
 
 
 def mountings(rng: np.random.Generator) -> Floats:
-    """Draw 12 directions towards the axis of the centrifuge: an icosahedron, turned at random."""
+    """Return the 12 corners of a randomly turned icosahedron as directions of the force."""
     golden = (1.0 + 5.0**0.5) / 2.0
     quad = np.array([(0.0, a, b * golden) for a in (1.0, -1.0) for b in (1.0, -1.0)])
     corners = np.concatenate([np.roll(quad, turn, axis=1) for turn in range(3)])
@@ -177,7 +177,7 @@ def residual_ug(calibration: Calibration, record: Run, level: float) -> float:
 
 
 def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
-    """Fit a unit; return errors and error / claimed sd of its terms, and the residual at 5 g."""
+    """Fit a unit; return errors and error / claimed sd of K2 and K3, and the residual at 5 g."""
     rng = np.random.default_rng(seed)
     unit = Unit.drawn(rng, k2, k3)
     runs = [run(unit, inward, rng) for inward in mountings(rng)]
@@ -188,7 +188,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
     of_terms = sd[layout.nonlinear : layout.misalignment].reshape(3, 2, -1)
     result = {'kinds': np.array([term.kind for term in nonlinearity.terms])}
     if not k2:
-        # Repeat the fit with K2 and K3 fixed at 0, to see whether bias and scale change.
+        # Repeat the fit with K2 and K3 fixed at 0; record how much bias and scale differ.
         without = fitted(runs, k2_sd=1e-12, k3_sd=1e-13)
         values = [
             np.array([[a.bias / a.scale_factor, np.log(a.scale_factor)] for a in used.axes])
@@ -206,7 +206,7 @@ def figures(seed: int, k2: float, k3: float) -> dict[str, Floats]:
         result[f'{term.kind} ratio'] = (np.array(term.coefficient) - true) / of_terms[:, 0, k]
         slope = np.array(term.per_kelvin) - unit.share * true
         result[f'{term.kind} slope ratio'] = slope / of_terms[:, 1, k]
-    # The new mounting is nearly along an axis, where the nonlinear terms are largest.
+    # The held-out mounting is nearly along an axis, where the nonlinear terms are largest.
     direction = np.eye(3)[seed % 3] * rng.choice((-1.0, 1.0)) + 0.1 * rng.standard_normal(3)
     new = run(unit, direction / np.linalg.norm(direction), rng, (5.0,))
     result['after'] = np.array([residual_ug(calibration, new, 5.0)])
@@ -238,11 +238,11 @@ def main() -> int:
         print(
             seed,
             *result['kinds'],
-            f'before {result["before"][0]:.0f} after {result["after"][0]:.2f} ug',
+            f'without terms {result["before"][0]:.0f} ug, with terms {result["after"][0]:.2f} ug',
         )
     for kind in ('square', 'cube'):
         has = [unit for unit in results if kind in unit]
-        say(f'{kind}: share of units that have it', len(has) / len(results), 1.0, 1.0)
+        say(f'{kind}: share of files with the term', len(has) / len(results), 1.0, 1.0)
         each = np.array([unit[kind] for unit in has])
         say(f'{kind}: RMS relative error', float(np.sqrt(np.mean(each**2))), 0.0, 0.02)
         say(f'{kind}: largest relative error', float(np.abs(each).max()), 0.0, 0.02)
@@ -250,7 +250,7 @@ def main() -> int:
             ratio = np.array([unit[name] for unit in has])
             say(f'{name}: RMS error / claim', float(np.sqrt(np.mean(ratio**2))), 0.7, 1.4)
     say(
-        'all terms are square and cube',
+        'every file has exactly two terms (1: yes)',
         float(all(len(result['kinds']) == 2 for result in results)),
         1,
         1,
@@ -259,17 +259,17 @@ def main() -> int:
         k: float(np.sqrt(np.mean([result[k] ** 2 for result in results])))
         for k in ('before', 'after')
     }
-    say('5 g in a new mounting without the terms, RMS [ug]', rms['before'], 200.0, 700.0)
-    say('5 g in a new mounting, RMS [ug]', rms['after'], 0.0, 3.0)
+    say('RMS error at 5 g in a new mounting, no terms [ug]', rms['before'], 200.0, 700.0)
+    say('RMS error at 5 g in a new mounting, with terms [ug]', rms['after'], 0.0, 3.0)
     if plain:
         say(
-            'units without such terms: terms in the file',
+            'units without nonlinearity: number of terms in all files',
             sum(len(unit['kinds']) for unit in plain),
             0,
             0,
         )
         moved = float(np.abs([unit['moved'] for unit in plain]).max())
-        say('units without nonlinearity: largest move of bias, scale / sd', moved, 0.0, 1.0)
+        say('units without nonlinearity: change of bias, scale / sd', moved, 0.0, 1.0)
     return int(wrong > 0)
 
 

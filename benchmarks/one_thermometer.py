@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the table of the benefit of a second thermometer: fits with and without the case thermometer,
-judged on held-out bags.
+Owns the table of errors of fits with and without the case thermometer, on held-out bags.
 
 python benchmarks/one_thermometer.py
 """
@@ -21,7 +20,7 @@ from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Units, each with its options of the fit.
+#: Kind of each unit ('sample': the unit of the sample bags), and options of its fit.
 UNITS: dict[str, tuple[str, ...]] = {
     'thermostatted': (), 'bare-quartz': (), 'mems': ('--mounting-sd', '30ug'), 'sample': (),
 }  # fmt: skip
@@ -30,7 +29,7 @@ MICRO_G = 9.80665e-6
 
 
 def command(*arguments: object) -> dict[str, Any]:
-    """Run a command and return its JSON output; exit code 1, for a bad verdict, is accepted."""
+    """Run thermo_comp; return its JSON output. Exit code 1 (bad verdict) raises no error."""
     line = [sys.executable, '-m', 'thermo_comp', *map(str, arguments), '--json']
     done = subprocess.run(line, capture_output=True, text=True, check=False, cwd=ROOT)
     if done.returncode not in {0, 1} or not done.stdout:
@@ -53,7 +52,7 @@ def without_case(bag: Path, target: Path) -> Path:
 
 
 def bags_of(unit: str, folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the bags of a fit and held-out bags: sample bags, or simulated bags."""
+    """Return the bags of a fit and held-out bags; they are simulated except for 'sample'."""
     if unit == 'sample':
         return sorted((ROOT / 'bags' / 'fit').glob('*.mcap')), [ROOT / 'bags' / 'held_out.mcap']
     common = ('simulate', '--unit', unit, '--rate-hz', RATE_HZ)
@@ -70,7 +69,7 @@ def left(bags: list[Path], held: list[Path], calibration: Path, *options: str) -
 
 
 def main() -> None:
-    """Print a row for each unit."""
+    """Print RMS of |f| - g for each unit: raw, and fits with two and with one thermometer."""
     parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
     parser.add_argument('units', nargs='*', default=list(UNITS))
     print(f'{"unit":16}{"raw ug":>8}{"two":>8}{"one":>8}')

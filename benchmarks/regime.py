@@ -3,10 +3,11 @@
 """
 Owns the figures of docs/regime.md: the regime detector in simulated ramps and soaks.
 
-A chamber's ramp, with ripple of the chamber and a self-heating drift, changes the temperatures of
-a case (first-order lag) and of a board (second lag, behind the case). Sensors of several noises,
-quanta and rates read these temperatures. The detector has its default settings. All runs are
-seeded: the command always prints the same figures.
+A ramp of a chamber, with control ripple and a drift by self-heating, changes the temperatures of a
+case (first-order lag of the chamber) and of a board (first-order lag of the case). Sensors of
+several noises, quanta and rates read these temperatures. The detector's settings are the defaults
+except for noise, quantum, lags and ripple, which are those of the scene. All runs are seeded, so
+the command always prints the same figures, except for CPU times.
 
     python benchmarks/regime.py --quick            # seconds
     python benchmarks/regime.py --workers 2        # some minutes
@@ -29,7 +30,7 @@ from regime_scenes import SENSORS, Scene, known_signature_delays, read, temperat
 from thermo_comp.thermal.regime import Regime
 
 SOAK_H = 5.0
-# Ramps per scene, by the rate of the readings [Hz]; the work is proportional to the rate.
+# Number of ramps per scene, by the rate of the readings [Hz], to which run time is proportional.
 RAMPS = {10.0: 1, 1.0: 6, 0.1: 10}
 
 Rows = list[list[str]]
@@ -37,14 +38,14 @@ Matrix = list[tuple[Scene, Outcome]]
 
 
 def quantiles(delays: list[float]) -> tuple[float, float]:
-    """Return median and 95 % quantile of the delays; infinite if there is no delay."""
+    """Return median and 95 % quantile of the delays [s]; infinite if the list is empty."""
     if not delays:
         return np.inf, np.inf
     return float(np.median(delays)), float(np.percentile(delays, 95))
 
 
 def cost_table() -> Rows:
-    """Return the rows of CPU times of a reading, compared with a numpy call on a scalar."""
+    """Return rows of CPU times per reading, in us and relative to a numpy call on a scalar."""
     measured = cost()
     unit = measured['numpy scalar call']
     rows = [['per reading', 'CPU us', 'numpy scalar calls']]
@@ -53,7 +54,7 @@ def cost_table() -> Rows:
 
 
 def table(title: str, rows: Rows) -> None:
-    """Print a Markdown table, the first row its head."""
+    """Print a Markdown table whose first row is the head."""
     print(f'## {title}\n')
     for k, row in enumerate(rows):
         print('| ' + ' | '.join(each.replace('|', '\\|') for each in row) + ' |')
@@ -63,7 +64,7 @@ def table(title: str, rows: Rows) -> None:
 
 
 def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
-    """Return rows of onset delays [s] by sensor: detector, and CUSUM test that knows the ramp."""
+    """Return rows of onset delays [s]: detector, and CUSUM test that is given the true ramp."""
     n, hours = (6, 20.0) if is_quick else (200, 400.0)
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, n, seed, rippled) for scene in scenes for rippled in (False, True)]
@@ -125,7 +126,7 @@ def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
 def run_matrix(
     pool: Pool, is_quick: bool, seed: int, rates: Sequence[float], n_ramps: int | None
 ) -> Matrix:
-    """Run the detector of the dynamic regime over all simulated scenes."""
+    """Run the detector over the ramps of all scenes; return the results by scene."""
     ramps = (0.1, 0.5, 3.0) if is_quick else (0.1, 0.2, 0.5, 1.0, 3.0)
     lags = (180.0, 900.0) if is_quick else (180.0, 900.0, 1200.0)
     jobs: list[Job] = [
@@ -144,7 +145,7 @@ def run_matrix(
 
 
 def rate_table(matrix: Matrix) -> Rows:
-    """Count all ramps, missed ramps and ramps whose flag flips, by the rate of the readings."""
+    """Count ramps, missed ramps, and ramps in which the flag returns to static, by rate."""
     rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]
@@ -161,7 +162,7 @@ def rate_table(matrix: Matrix) -> Rows:
 
 
 def scene_table(matrix: Matrix, lag: float) -> Rows:
-    """Return rows of median delay and flagged share of the ramp, in each scene with a lag."""
+    """Return the median delay and the flagged share of the ramp for each scene with a case lag."""
     rows = [['sensor', 'Hz', 'K/min', 'median, s', 'share flagged']]
     for scene, result in matrix:
         if scene.lag_s == lag:
@@ -193,7 +194,7 @@ def part_onset(pool: Pool, arguments: argparse.Namespace) -> Tables:
 def part_soak(pool: Pool, arguments: argparse.Namespace) -> Tables:
     """Count switches of the regime in soaks."""
     hours = 25.0 if arguments.quick else arguments.soak_hours
-    yield 'Switches in soak with ripple and drift, 1 Hz', soak_table(pool, hours, arguments.seed)
+    yield 'False switches in soaks with ripple and drift', soak_table(pool, hours, arguments.seed)
 
 
 def part_matrix(pool: Pool, arguments: argparse.Namespace) -> Tables:

@@ -15,7 +15,7 @@ BLUE, RED, GREEN = '#0072b2', '#d55e00', '#009e73'
 
 
 def plot_ramp(t: Floats, case: Floats, board: Floats, is_dynamic: Bools, folder: Path) -> None:
-    """Draw a ramp and its relaxation: temperatures, derivatives of the case temperature, flag."""
+    """Draw temperatures, derivatives of the case temperature and flag in a ramp and after it."""
     minutes = t / 60.0
     rate = np.gradient(case, t) * 60.0
     bend = np.gradient(rate, t) * 60.0
@@ -39,6 +39,6 @@ def plot_ramp(t: Floats, case: Floats, board: Floats, is_dynamic: Bools, folder:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure; the same numbers give the same file."""
+    """Write a figure without date and version, so that equal figures give equal files."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={'Software': None})

@@ -25,7 +25,7 @@ Job = tuple[Scene, int, int, bool]
 
 @dataclass
 class Outcome:
-    """Result of the detector for the ramps of a scene."""
+    """Delays [s] and counts of the detector's results for the ramps of a scene."""
 
     delays: list[float]
     missed: int
@@ -36,14 +36,14 @@ class Outcome:
 
 
 def settings(scene: Scene) -> DetectorSettings:
-    """Return the default settings with the sensor and the lags of the unit."""
+    """Return the default settings with the scene's noise, quantum, lags and chamber ripple."""
     case = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s)
     board = ThermometerSettings(scene.noise_sd, scene.quantum, lag_s=scene.lag_s + BOARD_LAG_S)
     return DetectorSettings(ripple_c=RIPPLE_C, case=case, board=board)
 
 
 def rng_of(seed: int, purpose: int, scene: Scene) -> np.random.Generator:
-    """Return the random generator of a scene, whatever the order of scenes."""
+    """Return the random generator of a scene; its seed does not depend on the other scenes."""
     return np.random.default_rng([seed, purpose, *(round(1e6 * v) for v in vars(scene).values())])
 
 
@@ -65,7 +65,7 @@ def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
 
 
 def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
-    """Return onset delays, flips of the flag and flagged share of ramps from 0 to `duration` s."""
+    """Return onset delays, counts of ramps and flagged share, for ramps from 0 to `duration` s."""
     outcome = Outcome([], 0, 0, 0, 0.0, 0)
     for t, flag in flags:
         outcome.n += 1
@@ -89,7 +89,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     """Run the detector over ramps of a scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
-    # The ramp lasts for four quanta of the sensor and two lags, but 40 min at least, 2 h at most.
+    # A ramp lasts 40 min to 2 h: until it has changed by four quanta of the sensor, plus two lags.
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)
@@ -102,7 +102,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
 
 
 def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
-    """Count switches to dynamic, and all switches, in a soak; share of readings with a flag."""
+    """Return for a soak: switches to dynamic, all switches, share of readings with a flag."""
     scene, hours, seed = job
     rng = rng_of(seed, 7, scene)
     t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)
@@ -114,7 +114,7 @@ def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
 
 
 def cost() -> dict[str, float]:
-    """Return CPU times [us], best of three: per reading, and per numpy call on a scalar."""
+    """Return CPU times [us] per reading and per numpy call on a scalar; smallest of 3 runs."""
     scene = Scene(0.5, 900.0, 0.001, 0.0, 1.0)
     rng = np.random.default_rng(0)
     t = np.arange(-7200.0, 7200.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulated ramps and sensors of benchmarks/regime.py, and the CUSUM bound."""
+"""Owns simulated ramps and sensors of benchmarks/regime.py, and delays of a CUSUM test."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SENSORS = ((0.001, 0.0), (0.01, 0.0), (0.001, 0.0625), (0.01, 0.0625), (0.01, 1.
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene of the benchmark: a ramp, the lag of the case, a sensor."""
+    """A scene: ramp rate [K/min], case lag [s], sensor noise [K], quantum [K] and rate [Hz]."""
 
     ramp_k_min: float
     lag_s: float
@@ -50,7 +50,7 @@ def second_order(t: Floats, lag: float, other: float) -> Floats:
 def temperatures(
     scene: Scene, t: Floats, duration: float, rng: np.random.Generator, ripple: float = RIPPLE_C
 ) -> tuple[Floats, Floats]:
-    """Return case and board temperatures in a ramp from time 0 to `duration`, or in a soak."""
+    """Return case and board temperatures [degC]: a ramp from time 0 to `duration`; 0: a soak."""
     rate = scene.ramp_k_min / 60.0 * rng.choice((-1.0, 1.0))
     start = 20.0 + rng.uniform(-0.5, 0.5) * max(scene.quantum, 0.1)
     board_lag = BOARD_LAG_S if abs(BOARD_LAG_S - scene.lag_s) > 1.0 else 1.01 * scene.lag_s
@@ -81,15 +81,15 @@ def known_signature_delays(
     """
     Return median and 95 % delay [s] of a CUSUM with known ramp, baseline and noise.
 
-    Page's statistic with the signature of the true ramp: the largest log likelihood ratio over the
-    onset times. The threshold of the statistic follows from the exceedances counted in noise
-    alone, whose logarithm falls linearly with the level.
+    The test is Page's: the largest log likelihood ratio over the onset times, with the true ramp
+    as signature. The threshold for `per_hour` false alarms is found in noise without a ramp: the
+    logarithm of the number of exceedances falls linearly with the threshold.
     """
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz
     bend = scene.ramp_k_min / 60.0 / scene.lag_s
-    # Half of `longest` readings of a ramp have a signal of 4.5 sigma, so that `longest` readings
-    # detect the ramp reliably.
+    # After half of `longest` readings the ramp has a signal-to-noise ratio of 4.5, so that
+    # `longest` readings detect the ramp reliably.
     longest = round(2.0 * (20.0 * dt * (4.5 * scene.noise_sd / bend) ** 2) ** 0.2 / dt)
     signature = scene.ramp_k_min / 60.0 * first_order(np.arange(1, longest + 1) * dt, scene.lag_s)
 
@@ -98,7 +98,7 @@ def known_signature_delays(
         energy = np.cumsum(signature**2)
         sums = np.zeros(len(x))
         for length in range(1, longest + 1):
-            # `signature[length - 1]` is for the newest reading, `signature[0]` for the oldest
+            # `signature[length - 1]` multiplies the newest reading, `signature[0]` the oldest.
             sums = np.convolve(x, signature[:length][::-1])[: len(x)]
             np.maximum(best, (sums - 0.5 * energy[length - 1]) / scene.noise_sd**2, out=best)
         return best

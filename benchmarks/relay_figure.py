@@ -3,9 +3,9 @@
 """
 Draws the results of `node_relay.py --json`: CPU time per sample and latency over the rate.
 
-python benchmarks/relay_figure.py relay.json docs/figures/node_relay.png
+python benchmarks/relay_figure.py relay.json relay.png
 
-Several runs at different rates make one figure.
+Files of several runs at different rates are drawn in one figure.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STYLES = {'reliable': ('-', 'o'), 'best_effort': ('--', 's')}
 
 
 def draw(measured: list[dict[str, Any]], path: Path) -> None:
-    """Draw a panel of CPU time and a panel of latency into one file."""
+    """Draw CPU time per sample and 99th percentile of the latency over the sample rate."""
     figure, (cpu, latency) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout='constrained')
     for reliability, (line, marker) in STYLES.items():
         cases = [case for case in measured if case['reliability'] == reliability]
@@ -55,7 +55,7 @@ def draw(measured: list[dict[str, Any]], path: Path) -> None:
 def main() -> None:
     """Read the results of `node_relay.py` and draw the figure."""
     parser = argparse.ArgumentParser(description='Draw the figures of node_relay.py.')
-    parser.add_argument('figures', type=Path, nargs='+', help='what `node_relay.py --json` wrote')
+    parser.add_argument('figures', type=Path, nargs='+', help='files of `node_relay.py --json`')
     parser.add_argument('picture', type=Path, help='PNG file to write')
     options = parser.parse_args()
     documents = [json.loads(path.read_text(encoding='utf-8')) for path in options.figures]

@@ -34,7 +34,7 @@ SINK_REST_S = 2e-3
 
 COUNTS = struct.Struct('<4siII7s5x3d')
 ENCAPSULATION = b'\0\1\0\0'
-#: frame_id of the samples that are counted; every relay passes the frame_id on.
+#: frame_id of uncounted and of counted samples; every relay copies it to the Imu message.
 WARM_UP, SAMPLE = b'warmup\0', b'sensor\0'
 
 
@@ -45,7 +45,7 @@ def _qos(reliability: str, depth: int = DEPTH) -> Any:
 
 
 def _source(arguments: argparse.Namespace) -> None:
-    """Publish samples at the given rate, temperatures at 10 Hz."""
+    """Publish samples at the rate of the options, and temperatures at 10 Hz."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.serialization import serialize_message
@@ -53,7 +53,7 @@ def _source(arguments: argparse.Namespace) -> None:
 
     rclpy.init()
     node = rclpy.create_node('source')
-    # The publisher is reliable, so that it matches reliable and best-effort subscriptions.
+    # A reliable publisher matches reliable and best-effort subscriptions.
     qos = _qos('reliable', arguments.depth)
     counts = node.create_publisher(Vector3Stamped, 'accel/counts', qos)
     temperatures = [
@@ -70,7 +70,7 @@ def _source(arguments: argparse.Namespace) -> None:
 
     def publish(index: int, frame: bytes) -> None:
         sec, nanosec = divmod(time.time_ns(), 1_000_000_000)
-        # Samples of a unit at rest, with noise of some counts, as the node rejects equal samples.
+        # The samples vary by some counts, because the node rejects samples that stay constant.
         x, y, z = 5.0 + index % 3, -3.0 + index % 2, 2950.0 + index % 5
         counts.publish(COUNTS.pack(ENCAPSULATION, sec, nanosec, 7, frame, x, y, z))
 
@@ -89,7 +89,7 @@ def _source(arguments: argparse.Namespace) -> None:
             if wait > 0:
                 time.sleep(wait * 1e-9)
 
-    # Warm up at the same rate until the sink has received a sample.
+    # Publish uncounted samples at the same rate until the sink has received an Imu message.
     run(sys.maxsize, WARM_UP, lambda: bool(select.select([sys.stdin], [], [], 0)[0]))
     time.sleep(0.5)
     print('start', flush=True)
@@ -100,11 +100,11 @@ def _source(arguments: argparse.Namespace) -> None:
 
 def _sink(arguments: argparse.Namespace) -> None:
     """
-    Receive Imu messages until all have arrived or no more come; print the number of messages and
-    percentiles of the latency.
+    Receive Imu messages until all have arrived or none arrives for `SILENCE_S`; print the number
+    of messages and percentiles of the latency.
 
-    The middleware stores the time of arrival of each message, so messages may wait in the sink; a
-    sink that wakes up for each message would disturb the relay.
+    The middleware stores the time of arrival of each message, so the sink may take messages later;
+    a sink that wakes up for each message would disturb the relay.
     """
     import numpy as np
     import rclpy
@@ -168,7 +168,7 @@ def _naive(arguments: argparse.Namespace) -> None:
 
 
 def _floor(arguments: argparse.Namespace) -> None:
-    """Copy the bytes of one subscription to a publisher, in a loop over a bare wait set."""
+    """Copy the bytes of each message to an Imu message, in a loop over an rclpy wait set."""
     import rclpy
     from geometry_msgs.msg import Vector3Stamped
     from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -184,7 +184,7 @@ def _floor(arguments: argparse.Namespace) -> None:
         Vector3Stamped, 'accel/counts', print, _qos(arguments.reliability), raw=True
     )
     take, publish = subscription.handle.take_message, publisher.handle.publish_raw
-    # All frame_ids have the same length, so the values have the same position in every message.
+    # Both frame_ids have 7 bytes, so the three values are at the same offset in every message.
     head, frame = COUNTS.size - 24, bytearray(COUNTS.size - 24 + 37 * 8)
     with subscription.handle, node.context.handle:
         wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
@@ -212,8 +212,8 @@ def _node(arguments: argparse.Namespace) -> None:
 
 def _reloader(arguments: argparse.Namespace) -> None:
     """
-    Set `calibration_file` again and again, to the calibration and to the largest file that the
-    node reads before it refuses the file; print the time of each answer.
+    Set `calibration_file` twice a second, in turn to a calibration and to the largest file that
+    the node parses before it refuses the file; print the time until each answer [ms].
     """
     import rclpy
     from rcl_interfaces.srv import SetParameters

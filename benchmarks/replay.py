@@ -4,10 +4,10 @@
 Owns the measurement of `replay`: reading, compensating and writing bags, by thermo_comp and
 rosbags.
 
-The library of thermo_comp is measured as `thermo_comp replay` uses it. The peer is a script with
-rosbags that reads and deserializes each message, corrects the message with the same compensator,
-serializes and writes it. thermo_comp and the peer write chunks packed with zstd. All bags hold
-400 Hz of counts and two temperatures at 1 Hz.
+thermo_comp is measured by the function that the command `thermo_comp replay` calls. rosbags is
+measured by a script that deserializes each message, corrects it with the compensator of
+thermo_comp, serializes and writes it. thermo_comp and the script write chunks packed with zstd.
+All bags hold counts at 400 Hz and two temperatures at 1 Hz.
 
     python benchmarks/replay.py --hours 24        # time of reading and compensating a day
     python benchmarks/replay.py --gigabytes 10    # peak memory of a replay of a large bag
@@ -50,7 +50,7 @@ def calibration() -> Calibration:
 
 
 def write_bag(path: Path, n: int, compression: str = 'zstd') -> None:
-    """Write n messages of counts with temperatures."""
+    """Write a bag of n messages of counts at 400 Hz, and of two temperatures at 1 Hz."""
     rng = np.random.default_rng(1)
     noise = np.round(rng.normal(0.0, 8.0, (BLOCK, 3)))
     with BagWriter(path, compression=compression) as bag:
@@ -81,13 +81,13 @@ def read_and_compensate(path: Path) -> int:
 
 
 def compensate(path: Path) -> tuple[int, float]:
-    """Correct the columns of a bag; return number of samples and CPU time of correcting [s]."""
+    """Correct a bag; return the number of samples, and the CPU time without reading [s]."""
     compensator = Compensator(calibration())
     spent = 0.0
     n = 0
     with open_recording(path) as reader:
         for block in reader.blocks():
-            # Measure this thread's CPU time in the correction, without the time of reading.
+            # Measure the CPU time of correcting a block, without the time of reading the block.
             begin = time.thread_time()
             n += len(process_block(compensator, block).index)
             spent += time.thread_time() - begin
@@ -95,7 +95,7 @@ def compensate(path: Path) -> tuple[int, float]:
 
 
 def ours(path: Path, output: Path) -> int:
-    """Replay a bag as `thermo_comp replay` does."""
+    """Replay a bag with the example calibration; return the number of samples."""
     return replay_bag(path, calibration(), output, overwrite=True).counters.n_out
 
 
@@ -143,7 +143,7 @@ def rosbags_pipeline(path: Path, output: Path) -> int:
 
 
 def seconds(run: Callable[[], object], repeats: int = 1) -> tuple[float, float]:
-    """Return the smallest wall time and CPU time of all threads over some repeats [s]."""
+    """Return the smallest wall time and the smallest CPU time of `repeats` runs [s]."""
     wall = cpu = float('inf')
     for _ in range(repeats):
         begin, begin_cpu = time.perf_counter(), time.process_time()
@@ -175,7 +175,7 @@ def pipelines(folder: Path, n: int, repeats: int) -> None:
 
 
 def day(folder: Path, hours: float, compression: str, repeats: int) -> None:
-    """Time the reading of bags of rising length, without and with compensation."""
+    """Print the time of reading bags of three lengths, without and with compensation."""
     print(
         f'{compression}: wall (CPU) seconds; alone = compensation only, million samples per CPU s'
     )
@@ -226,10 +226,10 @@ def memory(folder: Path, gigabytes: float) -> None:
 
 
 def main() -> None:
-    """Measure the offline run and print the tables."""
-    parser = argparse.ArgumentParser(description='The offline run, against rosbags.')
-    parser.add_argument('--samples', type=int, default=1_000_000, help='samples of the pipelines')
-    parser.add_argument('--hours', type=float, default=2.0, help='length of the bag for reading')
+    """Measure reading, compensating and writing, and print the tables."""
+    parser = argparse.ArgumentParser(description='Times `replay` and a script with rosbags.')
+    parser.add_argument('--samples', type=int, default=1_000_000, help='samples of the bags')
+    parser.add_argument('--hours', type=float, default=2.0, help='length of the bag to read')
     parser.add_argument('--compression', default='zstd', choices=('none', 'lz4', 'zstd'))
     parser.add_argument('--gigabytes', type=float, default=0.0, help='size of the large bag')
     parser.add_argument('--repeats', type=int, default=2)

@@ -6,11 +6,11 @@ log.
 
     python benchmarks/rest_log.py [--rates 400 1000 10000] [--seconds 60]
 
-The node runs in this process, source and sink of samples in two others; the rest log is on in even
-seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because the speed
-of a shared machine changes. The latency is the time from the source's publish call to the arrival
-in the sink's middleware. Summing a block of samples delays the next sample by at most the wall
-time of the sum, which is printed.
+The node runs in this process, source and sink of samples in two other processes; the rest log is
+on in even seconds of the clock and off in odd seconds. Neighbouring seconds are compared, because
+the speed of a shared machine changes. The latency is the time from the source's publish call to
+the arrival in the sink's middleware. The rest log sums samples in blocks; the printed time of the
+sum over a block is the longest delay of the next sample.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def cost(
 
 
 def tail_latencies(file: Path) -> tuple[Floats, Floats]:
-    """Return the p99 latency [ms] of each even second (log on) and odd second (log off)."""
+    """Return the 99th percentile of the latency [ms] in each even and in each odd second."""
     stamp_ns, latency_ns = np.load(file)
     second = stamp_ns // 1_000_000_000
     # Exclude the first and the last second, which are incomplete.
@@ -106,16 +106,16 @@ def measure(rate: int, seconds: int, folder: Path) -> None:
     print(
         f'{rate:6d} Hz: CPU {_compared(with_log, without, "us")}, '
         f'p99 {_compared(*tail_latencies(latencies), "ms")}; '
-        f'a block takes {np.median(blocks):.2f} ms (median)',
+        f'summing a block takes {np.median(blocks):.2f} ms (median)',
         flush=True,
     )
 
 
 def _compared(with_log: Floats, without: Floats, unit: str) -> str:
-    """Describe the difference between neighbouring seconds and its standard error."""
+    """Format the median without the log, the relative change with the log, its standard error."""
     n = min(len(with_log), len(without))
     more, usual = with_log[:n] - without[:n], float(np.median(without))
-    # The median excludes seconds with large latencies, in which the host stops the machine.
+    # Medians, because the host may stop the machine and so make some seconds outliers.
     sd = 1.2533 * 1.4826 * float(np.median(np.abs(more - np.median(more)))) / np.sqrt(n)
     change = float(np.median(more))
     return f'{usual:.3g} {unit} without, {change / usual:+.1%} +- {sd / usual:.1%} with the log'

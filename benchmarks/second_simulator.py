@@ -1,16 +1,17 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns a second simulator, which shares no code with thermo_comp, of physics that the fit lacks.
+Owns a second simulator, which shares no code with that of thermo_comp, of units whose physics the
+fit does not model exactly.
 
 Run ``python benchmarks/second_simulator.py`` for the table of docs/accuracy.md, or a part of it:
 ``python benchmarks/second_simulator.py --kinds own,even --plans wide --seeds 1``.
 
 Air, case, board, three heads and their pendulums are nodes of a thermal network, integrated in
 steps of 2 s; self-heating makes the board warmer than the case. Bias and scale are functions
-of the pendulums' temperatures. Samples have 1 Hz and 5 ug of noise, thermometer readings 0.5 Hz
-and 5 mK. Three runs are held out, with attitudes, ramps, order of ramps and temperature of the
-first soak other than in the runs of the fit.
+of the pendulums' temperatures. Samples at 1 Hz have noise of 5 ug (1 sd), thermometer readings at
+0.5 Hz noise of 5 mK. Three runs are held out; attitudes, ramps, order of ramps and temperature of
+the first soak differ from those in the runs of the fit.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ STEP_S, SAMPLE_S, READING_S = 2.0, 1.0, 2.0
 NOISE_UG, READING_SD, READING_STEP = 5.0, 0.005, 0.001
 REFERENCE_C, AIR_S, FULL_SCALE = 20.0, 90.0, 8388607.0
 Program = tuple[float, float, list[tuple[float, float, float]]]
-#: For each plan: the program of the test, its duration [s], and the held-out programs: start
-#: [degC], first soak [min], then target [degC], rate [K/min] and soak [min] of each ramp.
+#: For each plan: seed text and program of the test, duration [s], seed text and held-out programs.
+#: A program: start [degC], soak [min], then target [degC], rate [K/min] and soak [min] per ramp.
 PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
     'wide': (
         'P18',
@@ -61,7 +62,7 @@ PLANS: dict[str, tuple[str, Program, float, str, list[Program]]] = {
         ],
     ),
 }  # fmt: skip
-# The bags of the fit are from 5 to 35 degC, the held-out runs 5 to 20 K beyond.
+# The bags of the fit are from 5 to 35 degC; the held-out runs exceed this range by 5 to 20 K.
 PLANS['beyond'] = (
     *PLANS['mild'][:3],
     'HB',
@@ -74,12 +75,12 @@ KINDS = ('own', 'products', 'hyst', 'hystm', 'even', 'convection', 'slow', 'plai
 
 
 def seed_of(text: str) -> int:
-    """Return a seed for random numbers that follows from a text."""
+    """Return a hash of a text as a seed for random numbers."""
     return int(hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()[:12], 16)
 
 
 def unit_of(kind: str, seed: int) -> SimpleNamespace:
-    """Draw a unit: coefficients in ug and ppm per K^n, time constants in s."""
+    """Draw the parameters of a unit: coefficients [ug/K^n] and [ppm/K^n], time constants [s]."""
     draw = np.random.default_rng(seed_of(f'{kind}-{seed}'))
 
     def normal(sd: float) -> Floats:
@@ -88,7 +89,7 @@ def unit_of(kind: str, seed: int) -> SimpleNamespace:
     def signed(low: float, high: float) -> Floats:
         return np.asarray(draw.uniform(low, high, 3) * draw.choice([-1, 1], 3))
 
-    # The order of the random draws defines the units, so it must not change.
+    # Keep the order of the random draws: another order gives other units for the same seeds.
     unit = SimpleNamespace(
         scale_factor=4e5 * (1.0 + 0.01 * draw.standard_normal(3)),
         constant=normal(1500.0),
@@ -140,7 +141,7 @@ def directions(n: int, seed: int) -> Floats:
 
 
 def program_of(program: Program) -> tuple[Floats, Floats]:
-    """Return times [s] and temperatures [degC] of the corners of a chamber program."""
+    """Return the times [s] and temperatures [degC] at which ramps begin and end."""
     start, first_min, ramps = program
     corners = [(0.0, start), (60.0 * first_min, start)]
     for target, rate, soak_min in ramps:
@@ -172,7 +173,7 @@ def states_of(unit: SimpleNamespace, air_c: Floats) -> tuple[Floats, Floats, Flo
         flow = case - board
         carries = 1.0
         if unit.gas:
-            # A gas conducts better at higher temperatures and larger temperature differences.
+            # The conductance of gas rises with temperature and with the temperature difference.
             warm = 0.5 + 0.5 * (1.0 + 0.006 * (board - REFERENCE_C))
             carries = warm * (0.7 + 0.3 * (np.abs(flow) / 3.0) ** 0.25)
         case = case + STEP_S * (air - case + 0.3 * heat - 0.1 * flow) / unit.case_s
@@ -203,7 +204,7 @@ def runs_of(
     lasts_s = lasts_s or float(seconds[-1])
     t = np.arange(round((soaked_s + lasts_s) / STEP_S) + 1) * STEP_S - soaked_s
     first = celsius[0]
-    # Before the recording the unit comes from another temperature at 2 K/min, then soaks.
+    # Before the recording the air goes from `before` to the first temperature at 2 K/min.
     before = first + draw.uniform(-5, 5, n_bags) if soaked_c is None else np.full(n_bags, soaked_c)
     coming = np.minimum(np.abs(first - before), (t + soaked_s)[:, None] / 30.0)
     coming = before + np.sign(first - before) * coming
@@ -258,7 +259,7 @@ def runs_of(
 
 
 def plan_of(kind: str, seed: int, plan: str) -> tuple[list[Any], list[Any]]:
-    """Record the test of a unit, and the held-out runs."""
+    """Simulate the runs of a test of a unit, and the held-out runs."""
     test, program, lasts_s, held, programs = PLANS[plan]
     unit, first = unit_of(kind, seed), seed_of(f'{kind}{seed}{test}') % 2**31
     records = runs_of(unit, program, directions(18, seed), first, lasts_s=lasts_s)
@@ -273,7 +274,7 @@ def plan_of(kind: str, seed: int, plan: str) -> tuple[list[Any], list[Any]]:
 
 
 def floor_of(tests: Sequence[Any]) -> tuple[float, float]:
-    """Return the noise of means over a minute, of |f| and of the vector [ug]."""
+    """Return the RMS noise of means over 60 s: of |f|, and of the force vector [ug]."""
     means = [test.noise[: len(test.noise) // 60 * 60].reshape(-1, 60, 3).mean(1) for test in tests]
     norms = [
         mean @ test.truth.specific_force / STANDARD_GRAVITY

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Tests the node for hours at full rate with reloads and regime changes, and counts every sample.
+Runs the node for hours with reloads and regime changes, and checks that no sample is lost.
 
     python benchmarks/soak.py [--minutes 60] [--rate 2000] [--json FILE]
 
@@ -9,8 +9,8 @@ The node runs in a separate process, with settings under which no message is los
 ramp up, rest, ramp down and rest every three minutes, so the regime changes; `calibration_file` is
 set every two seconds. The resident memory of the node is read every second, the latency of the
 samples (from before the publish call to after the take) every ten seconds. The slopes of memory
-and latency are fitted by least squares, without the first tenth of the run, with standard errors
-from means over a minute. The exit code is 1 if a sample is missing.
+and latency over time are fitted to means over a minute, without the first tenth of the run. The
+exit code is 1 if a sample is missing or out of order.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SECOND_NS = 1_000_000_000
 READINGS_HZ = 10
 RELOAD_S, LATENCY_S, REPORT_S = 2.0, 10.0, 0.25
 #: Lengths of ramps and rests [s], which alternate, rate of a ramp [K/s], and lags of case and
-#: board [s], which are short enough for the regime to follow.
+#: board [s], which are so short that the regime becomes static in each rest.
 RAMP_S, REST_S, RAMP_K_S, CASE_LAG_S, BOARD_LAG_S = 30.0, 60.0, 0.1, 5.0, 10.0
 TIMEOUT_S = 30.0
 
@@ -60,7 +60,7 @@ class Temperatures:
         dt = 1.0 / READINGS_HZ
         self.case += dt / CASE_LAG_S * (20.0 + RAMP_K_S * up - self.case)
         self.board += dt / BOARD_LAG_S * (self.case - self.board)
-        # Noise of a few mK, as constant readings are rejected.
+        # The readings vary by 3 mK, because the node rejects readings that stay constant.
         ripple = 0.003 * ((int(seconds * READINGS_HZ) * 7) % 11 - 5) / 5.0
         return self.board + ripple, self.case - ripple
 
@@ -84,7 +84,7 @@ class Soak:
         self.process = node
         self.rate = rate
         self.node = rclpy.create_node('soak', context=context)
-        # The client has another node, as the loop that takes samples does not serve clients.
+        # The client has a separate ROS node: the loop that takes samples does not serve clients.
         self._operator = rclpy.create_node('operator', context=context)
         self.client = self._operator.create_client(SetParameters, 'thermo_comp/set_parameters')
         self._executor = SingleThreadedExecutor(context=context)
@@ -160,7 +160,7 @@ class Soak:
         self.n_sent += n
 
     def wait_for(self, condition: Any, what: str, timeout: float = TIMEOUT_S) -> None:
-        """Wait for a condition on the received data, or end with the output of the node."""
+        """Wait for a condition; after `timeout` [s], end the program with the node's output."""
         with self._news:
             if not self._news.wait_for(condition, timeout) or not self.process.is_alive:
                 raise SystemExit(f'{what} did not come; {self.account}; {self.process.said}')
@@ -171,8 +171,8 @@ class Soak:
         while not self.n_heard and time.monotonic() < deadline:
             self.send(self.rate // READINGS_HZ)
             time.sleep(1.0 / READINGS_HZ)
-        # Samples before discovery are lost. Wait until two reports, at least one period apart,
-        # have the same number of samples.
+        # Samples before discovery are lost. Wait until two diagnostics reports, at least a report
+        # period apart, state the same number of samples: then no sample is under way.
         self.wait_for(lambda: int(self.account.get('samples in', 0)) > 0, 'a report')
         n_in = -1
         while n_in != int(self.account['samples in']):
@@ -255,7 +255,7 @@ def _resident_kib(pid: int) -> float:
 def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, float] | None:
     """
     Return the slope per hour and the slope's standard error, from means over windows; None for
-    too few windows.
+    fewer than four windows.
     """
     table = np.array(rows)
     table = table[table[:, 0] >= 0.1 * table[-1, 0]]
@@ -273,8 +273,8 @@ def slope(rows: list[tuple[float, float]], window_s: float) -> tuple[float, floa
 
 def calibrations(rate: int, folder: Path) -> list[str]:
     """
-    Write two calibrations between which the running node switches: the example with another
-    sample rate and short lags.
+    Write two calibrations between which the running node switches: the example calibration with
+    the sample rate of the run and short lags.
     """
     from thermo_comp.thermal.settings import DetectorSettings, ThermometerSettings
     from thermo_comp.unit.calibration_file import load_calibration, save_calibration

@@ -1,19 +1,19 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the accuracy of fits to bags of units whose physics the package does not model, compared with
-the accuracy of curves that scipy fits.
+Owns the errors of fits to bags of units whose physics the package does not model, compared with
+the errors of curves that scipy fits.
 
-Run ``python benchmarks/strangers.py`` for every case (many hours), or a part with fewer units:
+Run ``python benchmarks/strangers.py`` for every case (many hours), or some cases with fewer units:
 ``python benchmarks/strangers.py --cases kink,soaks --units 2 --json strangers.json``. A colon
 selects one study of a case: ``--cases 'turn-on:9 at 30 ug'``.
 
 Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
-with the package; the package is used only through its fit and its correction of arrays. Every row
-is measured on recordings that were not fitted, unless the row states otherwise. Errors are RMS of
+with the package; the package is used only through `thermo_comp.fit` and `Calibration.correct`.
+Every row is measured on held-out recordings, unless the row states otherwise. Errors are RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
 is the RMS of error / claimed sd. Figures are RMS over the units. MISS marks a limit of
-`strangers_limits.py` that a row exceeds; the exit code is then 1. The baselines fitted by the
+`strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted by the
 package take most of the time; ``--baselines strangers.json`` reads the scores of the baselines
 from an earlier run.
 """
@@ -43,16 +43,15 @@ from thermo_comp.fitting import FitOptions
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.posterior import Posterior
 
-#: Options of the three models that the package fits: the evaluated fit, and two of the four
-#: baselines.
+#: Fit options of the evaluated model, 'fit', and of the two baselines that the package fits.
 PACKAGE: dict[str, dict[str, Any]] = {
     'fit': {},
     'golovach': {'model': 'golovach'},
     'sets': {'groups': ('curve', 'set')},
 }
 BASELINES = ('constants', 'cubic', 'golovach', 'sets')
-#: Smallest share of the minutes of which all samples must be corrected; below 1, because samples
-#: before the first reading of a thermometer are not corrected.
+#: A fit fails below this share of minutes in which all samples are corrected; below 1, because
+#: samples before the first reading of a thermometer are not corrected.
 LEAST_PUBLISHED = 0.98
 #: Cases of recorded bags, each with a single unit.
 RECORDED = ('sample-bags', 'no-case', 'board-twice', 'cats')
@@ -70,7 +69,7 @@ class Corrected:
     claim : ndarray, shape (w, 3, 3)
         Published covariance of the means [m^2/s^4].
     white : ndarray, shape (3,)
-        The part of the variance that is independent between means [m^2/s^4].
+        Variance of the mean by white noise, which is independent between means [m^2/s^4].
 
     """
 
@@ -82,7 +81,7 @@ class Corrected:
 def fitted(
     study: Study, prior: thermo_comp.Calibration | None = None, **model: Any
 ) -> thermo_comp.Calibration:
-    """Fit the bags of a study; `model` holds further options of the fit."""
+    """Fit the bags of a study with its options and the options `model`."""
     # Leave out the option `gravity_sd` for versions of the package without this option.
     known = {option.name for option in fields(FitOptions)}
     options = {name: value for name, value in study.options.items() if name in known}
@@ -96,7 +95,7 @@ def fitted(
 
 
 def chosen_by(calibration: thermo_comp.Calibration) -> str:
-    """List the groups of a calibration, each with its number of columns."""
+    """List the groups of a calibration; groups of the response with their number of columns."""
     columns = Counter(term.group for term in calibration.response)
     others = {entry.group for entry in calibration.evidence} - set(columns)
     return ' '.join([*sorted(others), *(f'{group}:{n}' for group, n in columns.items())])
@@ -111,9 +110,8 @@ def corrected(
     out = calibration.correct(bag.time_s, bag.samples, config=config, **given)
     first, size = slots(bag)
     force, claim = means(out.specific_force, first, size), means(out.covariance, first, size)
-    # The published covariance is that of one sample, not of a mean over a minute. White noise and
-    # the rounding of the converter average down over a minute; the other errors are common to all
-    # samples of a minute.
+    # The published covariance is that of a sample. A mean over a minute reduces white noise and
+    # the rounding of the converter; the other errors are equal in all samples of a minute.
     density = np.square(calibration.noise_density_m_s2_sqrt_hz)
     scale = np.array([axis.scale_factor for axis in calibration.axes])
     rounding = 1.0 / 6.0 if calibration.unit.input == 'counts' else 0.0
@@ -164,7 +162,7 @@ def score(outs: Sequence[Corrected], bags: Sequence[Minutes], *, is_drift: bool)
 
 
 def error_of(forces: Sequence[Floats], bags: Sequence[Minutes], *, is_drift: bool) -> Score:
-    """Compare forces without a claimed sd with the truth."""
+    """Compare forces, for which no sd is claimed, with the true forces."""
     if is_drift:
         return Score(vector=rms(_drift(forces, bags)) / UG)
     force, truth = np.concatenate(forces), np.concatenate([bag.force for bag in bags])
@@ -179,23 +177,23 @@ def _drift(forces: Sequence[Floats], bags: Sequence[Minutes]) -> Floats:
 
 
 def scipy_baselines(study: Study) -> dict[str, Callable[[Minutes], Floats]]:
-    """Return the corrections by constants, and by a cubic per axis, which scipy fits."""
+    """Return the two corrections that scipy fits: constants, and a cubic per axis."""
     bags = [minutes(bag) for bag in study.baseline_bags or study.bags]
     orders = {'constants': 0, 'cubic': 3}
     if study.is_drift:
-        # A pose does not determine the scale factors: take the norm of the samples / gravity.
+        # One pose does not determine the scale factors: all are set to |mean sample| / gravity.
         scale = rms(np.linalg.norm(bags[0].samples, axis=1)) / GRAVITY
         return {name: by_drift(bags, scale, order=order) for name, order in orders.items()}
     return {name: by_norm(bags, study.gravity, order=order) for name, order in orders.items()}
 
 
 def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
-    """Correct an hour at the reference temperature and zero force: this gives the bias error."""
+    """Return the bias error: correct simulated samples at the reference temperature and f = 0."""
     assert study.bound is not None
     unit, cycle_s = study.bound.unit, calibration.unit.cycle_time_s
     time_s = cycle_s * np.arange(1.0, 3600.0 / cycle_s)
     zero = np.broadcast_to(unit.counts * study.bound.bias, (len(time_s), 3))
-    # Readings have noise, as constant readings are taken for those of a broken thermometer.
+    # Readings have noise, because the correction rejects a thermometer with constant readings.
     rng, read_s = rng_of('rest'), np.arange(0.0, 3600.0, 5.0)
     rest = {'board': REFERENCE_C, 'case': REFERENCE_C - unit.heat_k}
     temperatures = {
@@ -207,8 +205,8 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
     bag = Bag('zero', time_s, zero, temperatures)
     out = corrected(calibration, bag, config)
     error = out.force[len(out.force) // 2 :].mean(axis=0)
-    # The Cramer-Rao bound is that of the parameters: subtract the claimed variance for the noise
-    # of the thermometers and another turn-on, which a calibration without a posterior claims.
+    # The Cramer-Rao bound is that of the parameters alone: subtract the claimed variance of a
+    # calibration without a posterior, which is that of thermometer noise and of a turn-on.
     exact = corrected(replace(calibration, posterior=None), bag, config)
     sd = np.sqrt(np.maximum(np.diag(out.claim[-1] - exact.claim[-1]), 0.0))
     return Score(
@@ -221,9 +219,9 @@ def bias_score(calibration: thermo_comp.Calibration, study: Study) -> Score:
 
 def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calibration:
     """
-    Return a calibration whose covariance has no constants: bias, scale and misalignment.
+    Return a calibration in whose posterior bias, scale and misalignment have no variance.
 
-    A single pose determines the constants to 50 mg only. The drift in a pose does not depend on
+    A single pose determines these constants to 50 mg only. The drift in a pose does not depend on
     the constants, but the difference of two claimed variances does: an acceleration `a`, which has
     noise, contributes ``a^2`` times the variance of the scale factor.
     """
@@ -241,7 +239,7 @@ def without_constants(calibration: thermo_comp.Calibration) -> thermo_comp.Calib
 def scored(
     study: Study, model: thermo_comp.Calibration, tests: dict[str, list[Minutes]]
 ) -> dict[str, Score]:
-    """Score a calibration on each set of held-out bags."""
+    """Return the score of a calibration for each set of held-out bags."""
     if study.bound is not None:
         return {'': bias_score(model, study)}
     if study.is_drift:
@@ -270,7 +268,7 @@ def run(
     done : dict of str to Calibration
         Fits of this unit by study, for studies with a prior; the new fit is added.
     earlier : mapping of (str, int) to mapping of str to Score
-        Scores of the baselines by title and unit, from an earlier run; if missing, computed.
+        Scores of the baselines by title and unit, from an earlier run; others are computed.
 
     Returns
     -------
@@ -327,7 +325,7 @@ def run_case(
     path: Path | None,
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Run all studies of a case or, with a label, only the studies with this label."""
+    """Run all studies of a case or, with a label, the study with this label and its prior's."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}
@@ -336,8 +334,7 @@ def run_case(
         seen = Counter[str]()
         for study in studies:
             if not label or study.label == label or study.label in needed:
-                # Studies with the same label, which leave out different bags, are numbered as
-                # units.
+                # Studies with equal labels hold out different bags; each is counted as a unit.
                 number = unit + seen[study.label]
                 seen[study.label] += 1
                 print(f'{case} {study.label}, unit {number}', file=sys.stderr, flush=True)
@@ -346,7 +343,7 @@ def run_case(
 
 
 def baselines_in(path: Path) -> dict[tuple[str, int], dict[str, Score]]:
-    """Read the scores of the baselines from the figures of an earlier run."""
+    """Read the scores of the baselines from a JSON file of an earlier run."""
     scores: dict[tuple[str, int], dict[str, Score]] = {}
     for unit in json.loads(path.read_text(encoding='utf-8'))['units']:
         scores[unit['title'], unit['unit']] = {
@@ -365,7 +362,7 @@ HEAD = (
 
 
 def pair(score: Score | None) -> str:
-    """Format the errors of a model [ug], of the norm and of the vector."""
+    """Format the errors of the norm and of the vector [ug] of a model."""
     if score is None:
         return '-'
     return ' / '.join('-' if np.isnan(x) else f'{x:.3g}' for x in (score.norm, score.vector))
@@ -393,10 +390,10 @@ def main() -> int:
     names = (*RECORDED, *CASES)
     parser.add_argument('--cases', type=lambda text: text.split(','), default=list(names),
                         help=f'default: all of {", ".join(names)}')  # fmt: skip
-    parser.add_argument('--units', type=int, default=0, help='units; default: 3 to 100, by case')
+    parser.add_argument('--units', type=int, default=0, help='units per case; default: 3 to 100')
     parser.add_argument('--cats', type=Path, help='cats_temperature_calib.nc (needs h5py)')
     parser.add_argument('--baselines', type=Path, metavar='JSON',
-                        help='scores of the baselines, from an earlier --json')  # fmt: skip
+                        help='reads scores of the baselines from a --json file')  # fmt: skip
     parser.add_argument('--json', type=Path, help='file for all figures')
     options = parser.parse_args()
     wanted = [name.partition(':')[::2] for name in options.cases]
@@ -430,7 +427,7 @@ def main() -> int:
             }
             options.json.write_text(json.dumps(figures, indent=1), encoding='utf-8')
     n_missed = sum(bool(row['missed']) for row in printed)
-    print(f'\n{n_missed} of {len(printed)} rows miss a limit')
+    print(f'\n{n_missed} of {len(printed)} rows violate a limit')
     return int(n_missed > 0)
 
 

@@ -4,8 +4,8 @@
 Owns the baselines that scipy fits to means over a minute, for the benchmark `strangers.py`.
 
 The baseline 'constants' has nine numbers: bias, scale and misalignment. The baseline 'cubic' has
-in addition, for each axis, a cubic of the bias and a line of the scale over board temperature.
-Both baselines are fitted by scipy's least squares on ``|f| - g``.
+these nine and, for each axis, a cubic of the bias and a line of the scale over board temperature.
+Both are fitted by least squares on ``|f| - g`` or, in a single pose, on the samples of each axis.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ WINDOW_S = 60.0  # length of the means whose errors are evaluated [s]
 #: few attitudes finds scale factors that make the forces of all attitudes equal.
 LARGEST = 0.2
 SPAN_K = (
-    15.0  # unit of the temperatures of a cubic, so that its powers have similar magnitudes [K]
+    15.0  # temperatures are divided by this unit [K], so that their powers have equal magnitudes
 )
 
 
 @dataclass(frozen=True)
 class Minutes:
-    """Means of a bag: samples (w, 3), board (w,) [degC], force (w, 3) [m/s^2] or NaN."""
+    """Means over 60 s: samples (w, 3), board (w,) [degC], true force (w, 3) [m/s^2] or NaN."""
 
     samples: Floats
     board: Floats
@@ -84,7 +84,7 @@ def by_norm(
     """Fit constants, and curves if `order` is above 0, to ``|f| - g``; return the correction."""
     samples = np.concatenate([bag.samples for bag in bags])
     board = np.concatenate([bag.board for bag in bags])
-    # The RMS norm of the samples is taken as counts per g; the scale factors correct this number.
+    # The RMS norm of the samples is a first value of the counts per g for the three axes.
     size = np.sqrt(np.mean(np.sum(samples**2, axis=1)))
 
     def missed(p: Floats, order: int) -> Floats:
@@ -101,7 +101,7 @@ def by_norm(
 def by_drift(
     bags: Sequence[Minutes], scale: float, *, order: int = 0
 ) -> Callable[[Minutes], Floats]:
-    """Fit a polynomial in board temperature to each axis in a pose; `scale`: units per m/s^2."""
+    """Fit each axis in a pose by a polynomial of board temperature; `scale`: counts per m/s^2."""
     t = np.concatenate([bag.board for bag in bags])
     y = np.concatenate([bag.samples for bag in bags]) / scale
     powers = np.vander((t - REFERENCE_C) / SPAN_K, order + 1, increasing=True)

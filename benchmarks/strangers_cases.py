@@ -52,10 +52,10 @@ HELD = (
 )
 FROST = program(5, 10, (12, 0.5, 60), (28, 0.8, 30))
 ROOM = program(21, 20)
-#: The range of the program SHORT is 2 K smaller than that of the programs USE, at both ends.
+#: SHORT is from 7 to 33 degC, the programs USE of the held-out bags are from 5 to 35 degC.
 SHORT = program(20, 20, (33, 1, 50), (7, 1, 60), (20, 1, 12))
 USE = (program(20, 20, (35, 0.7, 45), (15, 1.5, 40)), program(20, 20, (5, 1.2, 50), (24, 0.6, 40)))
-#: Programs of the tests of MEMS units, as in a simple oven.
+#: Programs for MEMS units: of the fit, and of the held-out bags.
 WARM = program(22, 15, (45, 1, 30), (12, 1, 40), (22, 1, 20))
 WARM_HELD = (program(15, 15, (40, 0.8, 40)), program(40, 15, (18, 1.2, 40)))
 
@@ -80,8 +80,8 @@ class Study:
     prior_of : str
         Label of an earlier study whose calibration is the prior; empty without a prior.
     is_drift : bool
-        Whether the error of each axis less the mean error over the bag is evaluated, as for a
-        single pose.
+        Whether the mean error over a bag is subtracted from the errors of each axis, because a
+        single pose does not determine the constants.
     baseline_bags : tuple of Bag
         Bags at rest for the curves by scipy; if empty, the bags of the fit are used.
     bound : Bound or None
@@ -116,12 +116,12 @@ FULL_SCALE = {'full_scale': 8388607.0}
 
 
 def one_test(bags: tuple[Bag, ...]) -> dict[str, tuple[Bag, ...]]:
-    """Return held-out bags that are evaluated together."""
+    """Return bags as the only set of held-out bags of a study."""
     return {'': bags}
 
 
 def plain(number: int) -> Iterator[Study]:
-    """Record a long test in a chamber with two thermometers: the usual case."""
+    """Record 18 positions over the program LONG with a case and a board thermometer."""
     rng = rng_of('plain', number)
     unit = navigation(rng)
     fit = positions(unit, LONG, spread(18, rng), rng)
@@ -150,7 +150,7 @@ def returned(number: int) -> Iterator[Study]:
         for celsius in (-15.0, 22.0, 45.0, 5.0):
             for number_of_pose, up in enumerate(ups, 1):
                 turned = up + np.cross(2e-4 * rng.standard_normal(3), up)
-                # At 10 Hz the noise of a sample is as large as a count: means resolve fractions.
+                # At 10 Hz the noise of a sample is about a count, so rounding averages out.
                 fit += (record(unit, program(celsius, 30), turned / np.linalg.norm(turned), rng,
                                name=f'{celsius:g} degC, pose {number_of_pose}', rate_hz=10.0,
                                is_cold=True),)  # fmt: skip
@@ -159,7 +159,7 @@ def returned(number: int) -> Iterator[Study]:
 
 
 def soaks(number: int) -> Iterator[Study]:
-    """Record the classic test: six faces for 20 min at each of three temperatures."""
+    """Record rests of 20 min on six faces at each of three temperatures, without ramps."""
     rng = rng_of('soaks', number)
     unit = navigation(rng)
     faces = np.concatenate((np.eye(3), -np.eye(3)))
@@ -174,7 +174,7 @@ def soaks(number: int) -> Iterator[Study]:
 
 
 def turn_on(number: int) -> Iterator[Study]:
-    """Record few positions with a bias that differs by a random amount in each bag."""
+    """Record 9 to 18 positions; each bag has a random bias offset (sd 0, 30 or 300 ug)."""
     for n in (9, 10, 12, 18):
         for sd in (0, 30, 300):
             rng = rng_of('turn-on', n, sd, number)
@@ -185,12 +185,12 @@ def turn_on(number: int) -> Iterator[Study]:
 
 
 def mems(number: int) -> Iterator[Study]:
-    """Record a MEMS sensor: large quanta and noise, one thermometer, turn-on of 0.1 to 1 mg."""
+    """Record a MEMS unit with random bias offsets at turn-on (sd 0.1, 0.3 or 1 mg)."""
     for n in (9, 12, 18):
         for sd in (100, 300, 1000):
             rng = rng_of('mems', n, sd, number)
             unit = consumer_grade(rng)
-            # At 10 Hz the noise of a sample is as large as a count, so rounding leaves no bias.
+            # At 10 Hz the noise of a sample is about a count, so rounding averages out.
             fit, held = (
                 positions(
                     unit,
@@ -207,8 +207,8 @@ def mems(number: int) -> Iterator[Study]:
 
 def sessions(number: int) -> Iterator[Study]:
     """
-    Turn a MEMS unit by hand every 8 min in two recordings, each with a turn-on of 0.3 mg. Fit the
-    first recording, both together, and the second with the fit of the first as a prior.
+    Turn a MEMS unit by hand every 8 min in two recordings, each with a random bias offset of
+    0.3 mg. Fit the first, both recordings, and the second with the fit of the first as prior.
     """
     rng, hold_s, rate_hz = rng_of('sessions', number), 480.0, 10.0
     unit, up = consumer_grade(rng), spread(12, rng)
@@ -228,7 +228,7 @@ def sessions(number: int) -> Iterator[Study]:
 
 
 def ageing(number: int) -> Iterator[Study]:
-    """Add a random walk of the bias, 12 ug from bag to bag, and turn-ons of 15 ug."""
+    """Add a random walk of the bias (12 ug per bag) and random turn-on offsets (15 ug)."""
     rng = rng_of('ageing', number)
     unit = navigation(rng)
     shifts = 15.0 * rng.standard_normal((16, 3))
@@ -239,7 +239,7 @@ def ageing(number: int) -> Iterator[Study]:
 
 
 def kink(number: int) -> Iterator[Study]:
-    """Change the slope of the bias by 8 to 20 ug/K at some temperature."""
+    """Change the slope of the bias by 8 to 20 ug/K at a random temperature of 12 to 30 degC."""
     rng = rng_of('kink', number)
     unit = navigation(rng, kink=signed(rng, 8, 20), kink_c=rng.uniform(12, 30))
     fit = positions(unit, HALF, spread(12, rng), rng)
@@ -247,7 +247,7 @@ def kink(number: int) -> Iterator[Study]:
 
 
 def gradient(number: int) -> Iterator[Study]:
-    """Add a bias proportional to the gradient of the case; bags of 40 min with fast ramps."""
+    """Add a bias proportional to case less board temperature; bags of 40 min, fast ramps."""
     rng = rng_of('gradient', number)
     unit = navigation(
         rng,
@@ -261,7 +261,7 @@ def gradient(number: int) -> Iterator[Study]:
 
 
 def bump(number: int) -> Iterator[Study]:
-    """Add a bump of 300 to 600 ug to the bias, 2 K wide."""
+    """Add a bell curve over temperature, 300 to 600 ug high and 2 K wide, to the bias."""
     rng = rng_of('bump', number)
     unit = navigation(rng, bump=signed(rng, 300, 600), bump_c=rng.uniform(12, 28))
     fit = positions(unit, HALF, spread(12, rng), rng)
@@ -269,7 +269,7 @@ def bump(number: int) -> Iterator[Study]:
 
 
 def carry(number: int) -> Iterator[Study]:
-    """Change the bias by 50 to 150 ug after half of the bags, as carrying a unit can do."""
+    """Change the bias by 50 to 150 ug after half of the fit's bags, as a shock may do."""
     rng = rng_of('carry', number)
     unit = navigation(rng)
     step = signed(rng, 50, 150)
@@ -279,7 +279,7 @@ def carry(number: int) -> Iterator[Study]:
 
 
 def support(number: int) -> Iterator[Study]:
-    """Tilt the support with the square of temperature; in held-out bags the support is rigid."""
+    """Tilt the support by 1 urad/K^2 of the case; in held-out bags the support is rigid."""
     rng = rng_of('support', number)
     unit = navigation(rng)
     up = spread(12, rng)
@@ -294,7 +294,7 @@ def support(number: int) -> Iterator[Study]:
 
 
 def gravity(number: int) -> Iterator[Study]:
-    """State a gravity for the fit that is wrong by its stated sd, 50 ug."""
+    """Give the fit a gravity that is 50 ug too large, and 50 ug as the sd of gravity."""
     rng = rng_of('gravity', number)
     unit = navigation(rng)
     fit = positions(unit, HALF, spread(12, rng), rng)
@@ -305,7 +305,7 @@ def gravity(number: int) -> Iterator[Study]:
 
 
 def cold_start(number: int) -> Iterator[Study]:
-    """Hold out bags that begin with a cold switch-on; the bags of the fit begin warm."""
+    """Hold out bags with a cold switch-on; in the bags of the fit the unit is already warm."""
     rng = rng_of('cold-start', number)
     unit = navigation(rng)
     fit = positions(unit, HALF, spread(12, rng), rng)
@@ -314,7 +314,7 @@ def cold_start(number: int) -> Iterator[Study]:
 
 
 def slow_thermometer(number: int) -> Iterator[Study]:
-    """Record with a board thermometer that lags by 30 to 90 s; the fit has the program FROST."""
+    """Record with a board thermometer that lags by 30 to 90 s, and no case thermometer."""
     rng = rng_of('slow-thermometer', number)
     unit = navigation(rng, thermometer_s=rng.uniform(30, 90), sensors=('board',))
     fit = positions(unit, FROST, spread(12, rng), rng)
@@ -323,7 +323,7 @@ def slow_thermometer(number: int) -> Iterator[Study]:
 
 def coarse_thermometer(number: int) -> Iterator[Study]:
     """
-    Record a MEMS unit whose thermometer has coarse steps, is read once per minute, or is noisy.
+    Record a MEMS unit whose thermometer has steps of 0.1 to 1 K or a noise of 1 K.
     """
     for label, step_k, interval_s, sd_k in (
         ('1 K each second', 1.0, 1.0, 0.02),
@@ -342,7 +342,7 @@ def coarse_thermometer(number: int) -> Iterator[Study]:
 
 
 def slow_drift(number: int) -> Iterator[Study]:
-    """Add a random walk of the bias, tilts of the support, or a bias of 1 mg that decays."""
+    """Add a random walk of the bias, slow tilts, or a bias of 1 mg (1 sd) that decays."""
     for kind, grade, full_scale, rate_hz, ways in (
         ('bias', navigation, 8388607.0, 0.5, (HALF, HELD)),
         ('support', navigation, 8388607.0, 0.5, (HALF, HELD)),
@@ -358,13 +358,13 @@ def slow_drift(number: int) -> Iterator[Study]:
 
 
 def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
-    """Add a random walk of the bias, 20 ug per root hour, or slow tilts of 60 urad in 4 h."""
+    """Add a bias walk of 20 ug per root hour, and a tilt or a decaying bias if `kind` says so."""
     force = np.ones((len(bag.samples), 1)) * bag.force
     if kind == 'power-on':
         decay = 1e3 * UG * rng_of('decay', unit.bias.tolist()).standard_normal(3)
         change = np.exp(-bag.time_s[:, None] / 600.0) * decay
         return replace(bag, samples=np.rint(bag.samples + unit.counts * change))
-    step = 20.0 * UG * np.sqrt(2.0 / 3600.0)  # in the 2 s from one sample to the next
+    step = 20.0 * UG * np.sqrt(2.0 / 3600.0)  # sd of the walk in 2 s, the sample interval
     change = np.cumsum(step * rng.standard_normal(force.shape), axis=0)
     if kind == 'support':
         phase = 2.0 * np.pi * (bag.time_s[:, None] / 14400.0 + rng.uniform())
@@ -374,7 +374,7 @@ def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
 
 
 def flicker(number: int) -> Iterator[Study]:
-    """Add flicker noise (bias instability) of 3 ug, or of 60 ug in a MEMS unit."""
+    """Add flicker noise (bias instability): 3 ug in a navigation unit, 60 ug in a MEMS unit."""
     for label, floor, grade, full_scale, rate_hz in (
         ('navigation', 3.0, navigation, 8388607.0, 0.5),
         ('MEMS', 60.0, consumer_grade, 32767.0, 10.0),
@@ -387,7 +387,7 @@ def flicker(number: int) -> Iterator[Study]:
 
 
 def third_node(number: int) -> Iterator[Study]:
-    """Add a node of unknown temperature; fit a bag in still air jointly or with a prior."""
+    """Let the bias depend on a node without a thermometer; chamber bags and a still-air bag."""
     rng = rng_of('third-node', number)
     unit = navigation(rng, hidden_bias=signed(rng, 20, 60), hidden_s=rng.uniform(900, 2500))
     fit = positions(unit, HALF, spread(12, rng), rng)
@@ -408,7 +408,7 @@ def third_node(number: int) -> Iterator[Study]:
 
 
 def bench3(number: int) -> Iterator[Study]:
-    """Record 18 positions on a bench, and 3 in a chamber over a range smaller than that of use."""
+    """Record 18 positions at room temperature, and 3 in a chamber over 7 to 33 degC."""
     rng = rng_of('bench3', number)
     unit = navigation(rng)
     bench = positions(unit, ROOM, spread(18, rng), rng)
@@ -418,7 +418,7 @@ def bench3(number: int) -> Iterator[Study]:
 
 
 def quadratic(number: int) -> Iterator[Study]:
-    """Draw bias and scale as parabolas of the board's temperature, with white noise."""
+    """Record units with bias and scale quadratic in board temperature; evaluate the bias."""
     for n in (18, 24):
         rng = rng_of('quadratic', n, number)
         unit = navigation(rng, part_s=np.zeros(3))
@@ -433,7 +433,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     Return the Cramer-Rao bound of the bias at the reference temperature, shape (3,), for a unit
     whose bias and scale factor are parabolas. The unknowns are the constants, the parabolas of
     bias and scale, and the direction of each position; the data are means of the three axes over
-    windows that are short compared with the program.
+    windows of `window_s`, in which the temperature is taken as constant.
     """
     n = len(up)
     tangents = np.array([np.linalg.svd(attitude[None])[2][1:] for attitude in up])
@@ -450,7 +450,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     ))  # fmt: skip
 
     def modelled(p: Any) -> Any:
-        """Model of the samples in g, analytic in all unknowns."""
+        """Return the samples in g for complex `p`, whose imaginary step gives derivatives."""
         a, b, c = p[6:9]
         u = up + np.einsum('pk,pki->pi', p[21:].reshape(n, 2), tangents)
         u = u / np.sqrt((u**2).sum(axis=1, keepdims=True))
@@ -473,7 +473,7 @@ def bias_bound(unit: Unit, up: Floats, bags: Sequence[Bag], window_s: float = 60
     return np.asarray(GRAVITY * sd[:3])
 
 
-#: The studies of each case for a unit with a number, and the default number of units.
+#: For each case: the function that yields the studies of a unit, and the default number of units.
 CASES: dict[str, tuple[Callable[[int], Iterator[Study]], int]] = {
     'plain': (plain, 3),
     'one-pose': (one_pose, 3),

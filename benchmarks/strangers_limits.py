@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the limits of the benchmark `strangers.py`: rows of figures over several units, and the
-limits that each row exceeds.
+limits that each row violates.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Score:
     norm, vector : float
         Error of ``|f| - g``, and length of the error vector (for drift: of an axis) [ug].
     norm_ratio, ratio : float
-        Error / claimed sd along the norm, and of the three axes together.
+        RMS of error / claimed sd: of ``|f|``, and of the three axes.
     claim : float
-        Claimed sd of the error whose length is `vector` [ug].
+        Claimed sd of the length of the error vector (for drift: of an axis) [ug].
     bound_ratio : float
         Error of the bias / its Cramer-Rao bound.
 
@@ -73,8 +73,8 @@ class Result:
 @dataclass(frozen=True)
 class Limit:
     """
-    The limits of a row; the defaults limit the error by that of the best baseline, and the ratio
-    of error to claimed sd.
+    The limits of a row. By default the error may be 1.05 times that of the best baseline, and
+    error / claimed sd 1.5.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class Limit:
     claim : float
         Largest claimed sd / error.
     than, times : str, float
-        A row of the same case, and the largest error as a multiple of that row's error.
+        End of the title of another row of the case, and largest error / error of that row.
     bound_ratio : float
         Largest error of the bias / its Cramer-Rao bound.
 
@@ -110,7 +110,7 @@ class Limit:
 _ONE_THERMOMETER = Limit(norm=25.0, low=0.7, high=1.4)
 _REAL_UNIT = Limit(norm=560.0, low=0.7, high=1.4)
 _TURN_ON = Limit(low=0.7, high=1.4, unit=2.0)
-#: Limits of the rows whose title begins with the key; the longest such key applies.
+#: Limits by the beginning of a row's title; the longest key that fits applies.
 LIMITS = {
     'sample-bags': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'no-case': _ONE_THERMOMETER,
@@ -121,8 +121,8 @@ LIMITS = {
     'plain': Limit(norm=1.3, vector=2.0, low=0.7, high=1.4),
     'one-pose: own bag': Limit(vector=2.0, low=0.7, high=1.4),
     'one-pose: other program': Limit(vector=5.0, low=0.7, high=1.4),
-    # In 'returned', `score` subtracts the variance at the reference temperature, which contains
-    # the variance of a slope: error / claimed sd has no limit.
+    # In 'returned', `score` subtracts the smallest claimed variance over temperature, which
+    # contains the variance of a slope: error / claimed sd is not meaningful and has no limit.
     'returned': Limit(high=np.inf),
     'soaks': Limit(low=0.5, high=1.5, claim=3.0),
     'turn-on': _TURN_ON,
@@ -130,7 +130,8 @@ LIMITS = {
     # A single recording does not show how well turn-ons repeat: error / claimed sd has no limit.
     'sessions one': Limit(high=np.inf),
     'sessions two': Limit(low=0.7, high=1.4),
-    # The error after an update is that of the joint fit, within the noise of the sd of turn-ons.
+    # The error after an update may exceed that of the joint fit by 5 %, as the sd of turn-ons is
+    # estimated from other data.
     'sessions update': Limit(than='two', times=1.05),
     'ageing': Limit(),
     'kink': Limit(norm=12.0),
@@ -138,18 +139,17 @@ LIMITS = {
     'bump': Limit(norm=60.0),
     'carry': Limit(),
     'support': Limit(vector=60.0),
-    # The baselines use the fit's wrong gravity, which no data show: limit only error / claimed sd.
+    # The baselines use the same wrong gravity, so only error / claimed sd is limited.
     'gravity': Limit(best=np.inf),
     'cold-start': Limit(),
-    # The claimed sd contains flicker noise over times that are longer than the recordings: the
-    # error may be half the claimed sd.
+    # The claimed sd includes flicker noise over times longer than the recordings, so the error
+    # may be as small as half of the claimed sd.
     'flicker': Limit(low=0.5, high=1.4, unit=2.0),
     'slow-thermometer': Limit(),
     'coarse-thermometer': Limit(),
     'slow-drift': Limit(),
     'third-node alone': Limit(),
-    # A further bag of another environment must not increase the error by more than the noise of
-    # the fit, 2 %.
+    # The still-air bag may increase the chamber bags' error by 2 % at most, the noise of a fit.
     'third-node joint: chamber': Limit(than='alone: chamber', times=1.02),
     'third-node joint: still air': Limit(than='alone: still air', times=1.02),
     'third-node joint: its attitude': Limit(than='alone: its attitude', times=0.5),
@@ -171,7 +171,7 @@ class Row:
     title : str
         Case, study and held-out bags.
     scores : dict of str to Score
-        By model, RMS over the units that the model did not refuse.
+        Scores by model: RMS over the units whose fit did not fail.
     worst : float
         Largest error / claimed sd of a single unit.
     fit_s : float
@@ -179,7 +179,7 @@ class Row:
     chosen : str
         Groups that the fit chose for the last unit.
     refused : str
-        The error message of a fit that refused its bags.
+        The message of the first fit that refused its bags; empty without such a fit.
 
     """
 
@@ -202,7 +202,7 @@ def judged_ratio(score: Score) -> float:
 
 
 def rows_of(results: Sequence[Result]) -> list[Row]:
-    """Average the figures of each row over its units; rows are in the order of the results."""
+    """Return a row per title with the RMS of the scores over the units, in order of results."""
     titles = list(dict.fromkeys(result.title for result in results))
     return [_row([result for result in results if result.title == title]) for title in titles]
 
@@ -233,13 +233,13 @@ def limit_of(title: str) -> Limit:
 
 
 def best_baseline(row: Row, name: str) -> float:
-    """Return the smallest error of the baselines; infinite without a baseline."""
+    """Return the smallest error of a row's baselines; infinite if the row has no baseline."""
     errors = [getattr(score, name) for model, score in row.scores.items() if model != 'fit']
     return min((error for error in errors if np.isfinite(error)), default=np.inf)
 
 
 def misses(row: Row, others: Sequence[Row]) -> list[str]:
-    """Describe the limits that a row exceeds; `others` are the rows of the same case."""
+    """Describe the limits that a row violates; `others` are all rows of the case."""
     exceeded = ['refused'] if row.refused else []
     if 'fit' not in row.scores:
         return exceeded
@@ -260,7 +260,7 @@ def misses(row: Row, others: Sequence[Row]) -> list[str]:
             if limit.than and other.title.endswith(limit.than) and 'fit' in other.scores:
                 share = getattr(fit, name) / getattr(other.scores['fit'], name)
                 checks.append((f'{name} / {limit.than}', share, limit.times))
-    # A figure that is not defined, such as the vector without a truth, is NaN: no limit applies.
+    # An undefined figure, such as the vector without a true force, is NaN and violates no limit.
     exceeded += [f'{name} {value:.3g} > {most:g}' for name, value, most in checks if value > most]
     if ratio < limit.low:
         exceeded.append(f'ratio {ratio:.2g} < {limit.low:g}')

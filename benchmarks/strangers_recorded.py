@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the cases of recorded bags of the benchmark `strangers.py`: the sample bags, with and without
-the case thermometer, and a recording of a real unit, which another package distributes.
+Owns the cases with recordings of the benchmark `strangers.py`: the sample bags, with and without
+the case thermometer, and a recording of a real unit, published with another package.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import thermo_comp
 from thermo_comp.recording.reader import read_recording
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Length of the blocks into which the recording of the real unit is cut, and of the means in which
-#: rests are searched [s].
+#: Length of the blocks into which the recording of the real unit is cut, and of the means by which
+#: rests are found [s].
 BLOCK_S, MINUTE_S = 10800.0, 60
 #: Largest change of the mean from one minute to the next at rest [m/s^2]. When the real unit was
 #: carried from one room to another its bias changed by 0.1 m/s^2 in a minute.
@@ -40,7 +40,7 @@ def sample_bag(path: Path) -> Bag:
 
 
 def samples(which: str) -> Iterator[Study]:
-    """Yield the sample bags with readings of board and case, board alone, or board for both."""
+    """Yield the sample bags with both thermometers, without case, or with board as case."""
     bags = [sample_bag(path) for path in sorted((ROOT / 'bags/fit').glob('*.mcap'))]
     bags.append(sample_bag(ROOT / 'bags/held_out.mcap'))
     if which != 'sample-bags':
@@ -60,7 +60,7 @@ def real_unit(path: Path) -> Bag:
     with h5py.File(path) as file:
         force = file['acceleration'][:]
         celsius = file['temperature'][:]
-    # The times in the file are rounded to whole seconds: use the numbers of the samples.
+    # The times in the file are rounded to whole seconds: use the sample's number as time.
     time_s = np.arange(1.0, len(force) + 1.0)
     return Bag('cats', time_s, force, {'board': (time_s, celsius)})
 
@@ -86,7 +86,7 @@ def part(bag: Bag, rows: slice, name: str) -> Bag:
 
 
 def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
-    """Cut a recording, or a rest of a recording, into blocks on a common grid of time."""
+    """Cut a recording, or a rest of it, at multiples of `BLOCK_S`; leave out short blocks."""
     number = (bag.time_s // BLOCK_S).astype(int)
     edges = np.flatnonzero(np.diff(number, prepend=-1, append=-1)).tolist()
     return {
@@ -97,7 +97,7 @@ def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
 
 
 def cats(path: Path) -> Iterator[Study]:
-    """Hold out every second block of the real unit's recording, then each of its rests."""
+    """Hold out the odd blocks of the real unit's recording, the even blocks, each of its rests."""
     whole = real_unit(path)
     rests = [part(whole, rows, f'rest{k}') for k, rows in enumerate(rests_of(whole))]
     still: tuple[list[Bag], list[Bag]] = ([], [])

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the units and recordings of the benchmark `strangers.py`: physics by numpy and scipy alone.
+Owns the units and recordings of the benchmark `strangers.py`, simulated by numpy and scipy.
 
 Case, board, the sensing part of each axis and a hidden node are the nodes of a linear thermal
 network. The input of the network is the air temperature of the chamber, which is linear in time
-between two steps, so the state at each step is exact. Bias and scale of an axis are functions of
+between two steps, so the integration is exact. Bias and scale of an axis are functions of
 the temperature of the axis's sensing part. This module shares no code with the package, so that an
 error of the package is not an error of the simulated truth.
 """
@@ -28,15 +28,15 @@ GRAVITY = 9.80665  # standard gravity [m/s^2]
 UG = 1e-6 * GRAVITY  # a micro-g [m/s^2]
 REFERENCE_C = 20.0  # temperature at which the curves of bias and scale are zero [degC]
 STEP_S = 5.0  # step of the thermal network; the air temperature is linear within a step [s]
-SOAK_S = 5400.0  # time for which the unit is in the chamber before a recording [s]
+SOAK_S = 5400.0  # time that the unit spends in the chamber before a recording [s]
 CASE, BOARD, PARTS, HIDDEN = 0, 1, slice(2, 5), 5
 
 
 @dataclass(frozen=True)
 class Environment:
     """
-    Thermal conductances relative to a chamber with a fan: air to case (`film`), case to hidden
-    node (`path`).
+    Thermal conductances relative to those in a chamber with a fan: air to case (`film`), case to
+    hidden node (`path`).
     """
 
     film: float = 1.0
@@ -173,7 +173,7 @@ class Bag:
 
 
 def rng_of(*words: object) -> np.random.Generator:
-    """Seed a generator by words and numbers."""
+    """Return a random generator whose seed is a hash of words and numbers."""
     return np.random.default_rng([zlib.crc32(str(word).encode()) for word in words])
 
 
@@ -183,7 +183,7 @@ def signed(rng: np.random.Generator, low: float, high: float) -> Floats:
 
 
 def spread(n: int, rng: np.random.Generator) -> Floats:
-    """Choose unit vectors (n, 3), each far from the earlier vectors, in a random frame."""
+    """Choose n unit vectors, each far from the vectors before it, in a random frame."""
     many = rng.standard_normal((2000, 3))
     many /= np.linalg.norm(many, axis=1)[:, None]
     chosen = [many[0], -many[0]][:n]
@@ -232,7 +232,7 @@ def consumer_grade(rng: np.random.Generator) -> Unit:
 def network(unit: Unit, environment: Environment = CHAMBER) -> tuple[Floats, Floats, Floats]:
     """Return A, b, h of ``x' = A x + b air + h``; x: case, board, parts, hidden node [degC]."""
     A, b, h = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    # The case is heavy: its relative conductance to the board is 0.1, to the air `film`.
+    # Conductances of the case per its heat capacity: 0.1 to the board, `film` to the air.
     A[CASE, CASE] = -environment.film - 0.1
     A[CASE, BOARD] = 0.1
     b[CASE] = environment.film
@@ -330,8 +330,8 @@ def record(
     lasts_s = float(corners[-1, 0])
     grid = np.arange(-SOAK_S, lasts_s + STEP_S, STEP_S)
     A, b, h = network(unit, environment)
-    # The air has a constant error of control and a control ripple, and begins at a temperature up
-    # to 5 K from that of the program.
+    # The chamber has a constant error and a ripple, and 5400 s before the recording a temperature
+    # that differs by up to 5 K from the program's first temperature.
     first_c = corners[0, 1]
     air = np.interp(grid, *corners.T) + 0.2 * rng.standard_normal()
     air += 0.03 * np.sin(2.0 * np.pi * grid / rng.uniform(200, 300) + rng.uniform(0, 2 * np.pi))
@@ -345,7 +345,7 @@ def record(
     states = integrate(A, b, h, air, STEP_S, x)
     n = int(lasts_s * rate_hz)
     stamps = (np.arange(n) + 1.0) / rate_hz
-    # A sample is the mean over a cycle, and has the stamp of the end of the cycle.
+    # A sample is the mean over a cycle and has the time of the cycle's end as its stamp.
     middle = stamps - 0.5 / rate_hz
     nodes = np.array([np.interp(middle, grid, node) for node in states.T]).T
     parts = np.where(unit.part_s > 0.0, nodes[:, PARTS], nodes[:, [BOARD]])
@@ -380,7 +380,7 @@ def positions(
     shifts: Floats | float = 0.0,
     **given: Any,
 ) -> tuple[Bag, ...]:
-    """Record a bag in each attitude, shape (n, 3); a tuple of programs is used in turn."""
+    """Record a bag in each attitude, shape (n, 3); bag k has program k of a tuple, cyclically."""
     shifts = np.broadcast_to(shifts, (len(up), 3))
     programs = corners if isinstance(corners, tuple) else (corners,)
     return tuple(
@@ -405,7 +405,7 @@ def turned(up: Floats, hold_s: float, n: int, rate_hz: float, rng: np.random.Gen
 
 
 def rests_of(bag: Bag, hold_s: float) -> tuple[Bag, ...]:
-    """Cut the rests out of a recording that is turned every `hold_s`, each as a bag."""
+    """Return each rest of a recording as a bag; the unit is turned every `hold_s` [s]."""
     result = []
     for begin_s in np.arange(0.0, bag.time_s.max(initial=0.0) - hold_s, hold_s):
         assert bag.force is not None
@@ -434,11 +434,11 @@ def flicker_noise(n: int, interval_s: float, floor: float, rng: np.random.Genera
 
 
 def lagged(node: Floats, tau_s: float) -> Floats:
-    """Lag a node of the network by a time constant; the node is linear in time between steps."""
+    """Return a node's temperature after a first-order lag; it is linear in time between steps."""
     if not tau_s:
         return node
     decay = np.exp(-STEP_S / tau_s)
-    # Late in a ramp the lagged temperature differs from the node's by the rate times `tau_s`.
+    # `behind`: node less lagged temperature; it tends to `tau_s` times the rate of a ramp.
     gain = tau_s / STEP_S * (1.0 - decay)
     behind = lfilter([gain], [1.0, -decay], np.diff(node, prepend=node[0]))
     return np.asarray(node - behind)

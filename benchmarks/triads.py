@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns simulated units for tests and benchmarks: triads with one kind of physics each, and siblings
-of a unit. docs/accuracy.md describes the kinds of physics.
+Owns simulated units for tests and benchmarks: triads of several kinds (docs/accuracy.md describes
+them), each with a thermal effect besides temperature coefficients, and siblings of a unit.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from thermo_comp.simulation.unit import Stream, SwitchedLoad, UnitModel, generat
 from thermo_comp.typing import Floats
 from thermo_comp.unit.gravity import MICRO_G
 
-#: Kinds of triads, each with a kind of physics besides temperature coefficients. The position of a
-#: kind in this list gives the number of its stream of random numbers, from `FIRST_KIND` on.
+#: Kinds of triads. The random numbers of a kind come from the stream with the number `FIRST_KIND`
+#: plus the kind's position in this list.
 TRIAD_NAMES = (
     *('own-lags', 'between', 'products', 'hysteresis', 'even', 'convection', 'switched-load'),
     *('paper', 'slow-noise', 'plain'),
@@ -38,7 +38,7 @@ FIRST_KIND = 3
 
 @dataclass(frozen=True)
 class LeakageEffect(Effect):
-    """Leakage of a junction: ``exp(d / growth) - 1`` with the part's deviation `d` [K]."""
+    """Leakage of a junction: ``exp(d / growth) - 1``, d: part's temperature less reference [K]."""
 
     part: str
     growth: float
@@ -50,9 +50,9 @@ class LeakageEffect(Effect):
 @dataclass(frozen=True)
 class SlipEffect(Effect):
     """
-    A joint that the temperature of a part strains, and that slips; the stress [K of free strain]
-    depends on the path, not on the time, and is 0 at the start. The joint slips abruptly at a
-    stress of `width` (Jenkins) or gradually up to this stress (Dahl, Bouc-Wen).
+    A joint that the temperature of a part strains, and that slips. Its stress [K of free strain]
+    depends on the path of the temperature, not on time, and is 0 at the start. The joint slips
+    abruptly at a stress of `width` [K] (Jenkins) or gradually up to it (Dahl, Bouc-Wen).
     """
 
     part: str
@@ -81,8 +81,8 @@ def _only(axis: int, value: float) -> Triple:
 
 def triad(kind: str, seed: int = 0) -> UnitModel:
     """
-    Return a triad of bare sensor heads on a board, with temperature coefficients of parts that
-    lag, and the physics of the given kind.
+    Return a triad of sensor heads that lag the board; bias and scale depend on the temperatures of
+    the heads (of the board in the kind 'paper') and on the effect of the kind.
     """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
@@ -90,14 +90,14 @@ def triad(kind: str, seed: int = 0) -> UnitModel:
     capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}
     links = [*draw.links((AIR, 'case', 4.0)), Link('case', 'board', 0.4)]
     for head, tau in zip(heads, taus, strict=True):
-        # A head has a small heat capacity, so that it hardly affects the board.
+        # A head has a small heat capacity, so that it hardly changes the board's temperature.
         to_case = draw.between(0.2, 0.8) if kind in _BETWEEN else 0.0
         capacity[head] = 0.02 * tau
         links.append(Link('board', head, 0.02 * (1.0 - to_case)))
         if to_case:
             links.append(Link('case', head, 0.02 * to_case))
     if kind == 'convection':
-        # Convection transports part of the heat between case and board.
+        # Part of the heat between case and board flows by convection: exponent 1.25.
         links[1] = Link('case', 'board', 0.15)
         links.append(Link('case', 'board', draw.between(0.15, 0.35), exponent=1.25))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
@@ -114,7 +114,7 @@ def triad(kind: str, seed: int = 0) -> UnitModel:
 
 
 def unit_of(kind: str, seed: int = 0) -> UnitModel:
-    """Return a triad of this module, or a unit of a kind of the package."""
+    """Return a triad of a kind of this module, or a unit of the package's presets."""
     return triad(kind, seed) if kind in TRIAD_NAMES else unit_preset(kind, seed)
 
 
@@ -139,12 +139,11 @@ def _slips(draw: Specimen) -> list[Effect]:
     return effects
 
 
-# Kinds of units with a thermal node for the head of each axis, and kinds whose heads are also
-# linked to the case.
+# Kinds of triads with a thermal node for each axis, and kinds with heads also linked to the case.
 _OWN_HEADS = ('own-lags', 'between', 'switched-load')
 _BETWEEN = ('between', 'switched-load')
 _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
-    # Quartz against metal: the difference of the expansion coefficients grows with temperature.
+    # Stress between quartz and metal: the expansion coefficients differ more at high temperature.
     'products': lambda draw: [
         PartEffect(
             'board', 'head', bias=draw.signed(3.0, 12.0), bias_curvature=draw.signed(0.1, 0.5),
@@ -158,7 +157,7 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
         FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ],
-    # Leakage doubles every 7 to 10 K; a few ug at the reference temperature.
+    # Leakage doubles every 7 to 10 K, and is a few ug at the reference temperature.
     'convection': lambda draw: [
         LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))
     ],
@@ -168,8 +167,8 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
 
 def sibling(unit: UnitModel, seed: int, spread: float = 0.15) -> UnitModel:
     """
-    Return another unit of the same type, with other constants and misalignment; coefficients,
-    widths and heat capacities each differ by a share of up to `spread`.
+    Return a unit of the type of `unit` with other constants and misalignment; thermal
+    coefficients, widths and heat capacities each differ by a factor of 1 +- `spread` at most.
     """
     rng = generator(seed, Stream.SIBLING)
 

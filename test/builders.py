@@ -34,7 +34,7 @@ def regime_set(x=None, y=None, z=None, **keys):
 
 
 def calibration(**keys):
-    """Make a unit of 300 counts per m/s^2, by default without bias and temperature functions."""
+    """Make a calibration of 300 counts per m/s^2; defaults: constant scale and bias."""
     values = {
         'format_version': 2, 'unit': Unit('T-1', 'counts', 32767.0, 0.01),
         'reference_temperature_c': 20.0, 'gravity_m_s2': GRAVITY,
@@ -45,12 +45,12 @@ def calibration(**keys):
 
 
 def thermal_calibration():
-    """Make a unit whose correction depends on temperature, but by a negligible amount."""
+    """Make a calibration that needs a thermometer: its temperature function is negligible."""
     return calibration(dynamic=regime_set(z=axis_set((0.0, 1e-12))))
 
 
 def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
-    """Make a term of the response, by default of the group of its kind and with a wide range."""
+    """Make a response term; defaults: the group of its kind, a wide range."""
     values = {'group': kind, 'range': (-50.0, 50.0), **keys}
     return ResponseTerm(kind=kind, bias=tuple(bias), scale=tuple(scale), **values)
 
@@ -138,7 +138,7 @@ class Columns:
 
 
 def columns_from_events(events):
-    """Return columns of events (kind, stamp_ns, value); kind: 'accel' or a thermometer's name."""
+    """Sort events (kind, stamp_ns, value) into columns; kind: 'accel' or a thermometer's name."""
     accel = [(s, v) for kind, s, v in events if kind == 'accel']
     readings = {}
     n_accel = 0
@@ -157,7 +157,7 @@ def columns_from_events(events):
 
 
 def stream(compensator, events):
-    """Process events one by one; a sample times 1e-3 is its angular rate; return rows, indices."""
+    """Process events one by one, with 1e-3 * sample as angular rate; return rows and indices."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:
@@ -200,13 +200,13 @@ def source_of(*arrays, name='bag', **keys):
 
 
 def arrays_of(run, every=1):
-    """Return samples and every `every`-th reading of a simulated run, as arrays of a block."""
+    """Return all samples and each `every`-th reading of a simulated run, as arrays for a block."""
     readings = (run.board_stamp_ns, run.board, run.case_stamp_ns, run.case)
     return (run.accel_stamp_ns, run.counts.astype(float), *(part[::every] for part in readings))
 
 
 def drawn(unit, layout, d):
-    """Add `d` to the parameters of a unit except the levels of scale curves, which are 1."""
+    """Add `d` to the parameters of a calibration; the levels of scale curves stay 1."""
 
     def moved_by(values, start):
         return tuple(value + d[start + k] for k, value in enumerate(values))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the common parts of all tests: a DDS domain per process, seeds, fixtures of commands."""
+"""Owns common parts of the tests: a DDS domain per process, seeds, fixtures to run commands."""
 
 import fcntl
 import gc
@@ -25,32 +25,32 @@ from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Use one BLAS thread: several BLAS threads wait for each other on a busy machine. OpenBLAS
-# reads OPENBLAS_NUM_THREADS when numpy is imported.
+# On a busy machine several BLAS threads wait for each other, so use one. OpenBLAS reads the
+# variable OPENBLAS_NUM_THREADS when numpy is imported.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-# Each worker of each test run on this machine uses a separate DDS domain, limited to this machine.
-# The DDS domain follows from the id of the run and the number of the worker. DDS domain 0 is the
-# user's, DDS domains from 81 are the benchmarks'.
+# Each worker of each test run uses a separate DDS domain, limited to this machine. Its number
+# follows from the id of the run and the number of the worker. Domain 0 is for users, domains from
+# 81 are for the benchmarks.
 _RUN = os.environ.get('PYTEST_XDIST_TESTRUNUID', str(os.getpid()))
 _WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
 os.environ['ROS_DOMAIN_ID'] = str(1 + (zlib.crc32(_RUN.encode()) % 20) * 4 + _WORKER % 4)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.pop('ROS_STATIC_PEERS', None)
 
-# Background processes of a shell, and their children, ignore SIGINT: restore its handler.
+# A process that a shell starts in the background ignores SIGINT: set the default handler.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# Examples of hypothesis have no deadline, because their duration depends on the machine.
+# Examples of hypothesis have no time limit, because their duration depends on the machine.
 settings.register_profile('usual', max_examples=50, deadline=None)
 settings.load_profile('usual')
-# `make nightly` uses the profile 'nightly'; tests that state a number of examples keep the number.
+# For `make nightly`; a test with a fixed number of examples keeps this number.
 settings.register_profile('nightly', max_examples=10_000, deadline=None)
 
 
-#: The longest test files, in order of duration, with which `make test` begins.
+#: Test files with the longest duration, longest first: `make test` begins with these files.
 _LONG = (
     *('fleet_run', 'faults', 'part_lags', 'priors', 'regime', 'fitting', 'few_positions'),
     *('cli_help', 'record', 'fault_process', 'drivers', 'degenerate', 'one_attitude', 'gyroscope'),
@@ -69,18 +69,18 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """Exclude imported objects from garbage collection, which would scan them repeatedly."""
+    """Exclude all imported objects from garbage collection, which saves time."""
     gc.freeze()
 
 
 def ran(*command, check=False, **keys):
-    """Run a program in the folder of the project; return its output."""
+    """Run a program in the project's folder; return the finished process with its output."""
     words = [*map(str, command)]
     return subprocess.run(words, cwd=ROOT, check=check, capture_output=True, text=True, **keys)
 
 
 def parsed(text):
-    """Parse the JSON that a command prints: one object, without NaN, which is not JSON."""
+    """Parse the JSON object that a command printed; NaN is refused, because it is not JSON."""
 
     def no_nan(text):
         raise AssertionError(f'{text} is not JSON')
@@ -104,7 +104,7 @@ def root():
 
 @pytest.fixture(scope='session')
 def real_data():
-    """Return the folder of real recordings, which this project may not distribute."""
+    """Return the folder of real recordings, which are not part of this project."""
     folder = Path(os.environ.get('THERMO_COMP_DATA', ROOT.parent / 'shared' / 'data'))
     if not folder.is_dir():
         pytest.skip(f'the real recordings are not in {folder} (set THERMO_COMP_DATA)')
@@ -133,7 +133,7 @@ def program():
 
 @contextmanager
 def _caught(name, descriptor):
-    """Redirect a standard stream to a file, including output of C libraries."""
+    """Redirect a standard stream to a file, also for output of C libraries."""
     before = getattr(sys, name)
     before.flush()
     kept = os.dup(descriptor)
@@ -158,7 +158,7 @@ def _caught(name, descriptor):
 
 @contextmanager
 def _as_a_process(cwd):
-    """Give a command the state of a new process; afterwards restore the state of this process."""
+    """Reset logging, signals and folder as in a new process; restore them afterwards."""
     folder, environment = Path.cwd(), dict(os.environ)
     log = logging.getLogger()
     handlers, log.handlers = log.handlers, []  # pytest's handlers keep log messages from stderr
@@ -182,7 +182,7 @@ def _as_a_process(cwd):
 
 @pytest.fixture(scope='session')
 def cli(program):
-    """Return a function that runs a command here or, with environment variables, in a process."""
+    """Return a function that runs a command in this process or, with `env`, in a new process."""
     from thermo_comp.cli.app import run as run_command
 
     def run(*args, code=0, cwd=None, **env):
@@ -215,7 +215,7 @@ def small_disk(tmp_path, request):
 
 @pytest.fixture
 def peer():
-    """Return a peer on DDS: the publishers, subscribers and clients of a node under test."""
+    """Return a ROS node with publishers, subscribers and clients for the node under test."""
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from ros_helpers import Peer
 
@@ -226,7 +226,7 @@ def peer():
 
 @pytest.fixture
 def unit(tmp_path):
-    """Write the calibration of a unit without temperature functions; return its path."""
+    """Write a calibration without temperature functions; return its path."""
     from builders import calibration
 
     from thermo_comp.unit.calibration_file import save_calibration
@@ -237,13 +237,13 @@ def unit(tmp_path):
 
 @pytest.fixture
 def no_figures(monkeypatch):
-    """Make pages without figures, whose drawing is slow; test_report.py draws them."""
+    """Write pages without figures, which saves time; test_report.py tests the figures."""
     monkeypatch.setattr('thermo_comp.report.page.figures_of', lambda _: [])
 
 
 @pytest.fixture(scope='session')
 def once(tmp_path_factory):
-    """Return a function that makes a folder once per run, in the first worker that requests it."""
+    """Return a function that fills a folder once per test run and shares it between workers."""
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if 'PYTEST_XDIST_WORKER' in os.environ else base) / 'once'
     shared.mkdir(exist_ok=True)
@@ -253,7 +253,7 @@ def once(tmp_path_factory):
         with (shared / f'.{name}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                # Remove the files of a failed attempt to make the folder.
+                # Remove files of an earlier attempt that failed.
                 shutil.rmtree(partial, ignore_errors=True)
                 partial.mkdir()
                 make(partial)
@@ -271,7 +271,7 @@ def desk(tmp_path_factory, cli, once):
 
 
 class _Pickler(pickle.Pickler):
-    """Pickle a fit without the functions that read its bags, which nothing needs after a fit."""
+    """Pickles a fit without the functions that read its bags: no test needs them after the fit."""
 
     def persistent_id(self, value):
         is_local = isinstance(value, FunctionType) and '<' in value.__qualname__
@@ -285,7 +285,7 @@ class _Unpickler(pickle.Unpickler):
 
 @pytest.fixture(scope='session')
 def equal_fits_once(once):
-    """Fit equal bags with equal options once, because many pages and examples need equal fits."""
+    """Compute fits of equal bags with equal options once, because many tests need equal fits."""
     from thermo_comp import fitting
 
     fit = fitting.fit
@@ -311,7 +311,7 @@ def equal_fits_once(once):
 
 @pytest.fixture(scope='session', autouse=True)
 def equal_tracks_once():
-    """Compute the thermal states of equal readings once: tests fit the same bags repeatedly."""
+    """Compute thermal states of equal readings once, because many tests fit the same bags."""
     from thermo_comp.fitting import windows
 
     track, known = windows._track, {}
@@ -326,7 +326,7 @@ def equal_tracks_once():
         place = key.digest()
         if place not in known:
             known[place] = track(bag, model, spec)
-            # All fits share the arrays of a track, so no fit may change an array.
+            # All fits share these arrays, so no fit may change them.
             known[place].states.flags.writeable = known[place].is_known.flags.writeable = False
             if len(known) > 60:
                 del known[next(iter(known))]

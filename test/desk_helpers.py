@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns a folder with every file that the examples in help texts and pages name."""
+"""Owns a folder with the files that examples in help texts and pages use."""
 
 import itertools
 import os
@@ -16,7 +16,7 @@ import pytest
 from conftest import ROOT
 from readme_helpers import shown
 
-#: Files made when an example needs them; all other files exist or are written by an example.
+#: Files that are made when an example needs them.
 MADE = (
     *('unit.yaml', 'unit42.yaml', 'unit01.yaml', 'unit02.yaml', 'unit03.yaml', 'map.yaml'),
     *('autopilot.params', 'xsens_acc.calib', 'accel_calib.yaml', 'chamber.mcap', 'unit42_p01'),
@@ -39,7 +39,7 @@ def write_fit_of_the_readme(path, cli):
 
 
 class Desk:
-    """Prepares files once, and runs examples in folders that contain these files."""
+    """Makes files once, and runs examples in folders that contain these files."""
 
     def __init__(self, folder, cli, once):
         self._cli = cli
@@ -68,7 +68,7 @@ class Desk:
         elif name == 'unit.yaml':
             shutil.copy(self._make('unit42.yaml'), path)
         elif name == 'unit01.yaml':
-            # A prior from three units takes 10 s with the default model, less with `golovach`.
+            # With the default model three fits take 10 s, with `golovach` less.
             bags = sorted(self._make('bags/unit42').iterdir())
             given = ('--gravity', '9.8154', '--model', 'golovach', '--serial', path.stem)
             self._cli('fit', *bags, *given, '-o', path, '-q')
@@ -78,7 +78,7 @@ class Desk:
             to = ('--to', _EXPORTS[name])
             self._cli('export', self._make('unit42.yaml'), *to, '-o', path, '-q')
         elif name in ('chamber.mcap', 'unit42_p01'):
-            # The bag is short, because some examples play it in real time.
+            # Some examples play the bag in real time, so it is short.
             self._cli('simulate', '--profile', '20 1s', '-o', path, '-q')
         elif name == 'freezer.mcap':
             program = ('--unit', 'mems', '--profile', '20 2min, 0@2 5min', '--rate-hz', '20')
@@ -137,12 +137,12 @@ class Desk:
             write_new(path, np.random.default_rng(5))
 
     def run(self, command, cli=None):
-        """Run an example with short waits for subscribers, in a new folder, or that of fleets."""
+        """Run an example in a new folder, or an example of `fleet` in the folder of fleets."""
         words = shlex.split(command, comments=True)
         assert words.pop(0) == 'thermo_comp'
         outputs = {after for word, after in itertools.pairwise(words) if word == '-o'}
         self._n += 1
-        # All `fleet` commands share a folder: a second `fleet fit` reports the existing results.
+        # All examples of `fleet` share a folder, so a second `fleet fit` finds existing results.
         here = self._folder / ('fleet' if words[0] == 'fleet' else f'run{self._n}')
         (here / 'bags').mkdir(parents=True, exist_ok=True)
         for word in words:
@@ -160,14 +160,14 @@ class Desk:
             arguments += sorted(str(path.relative_to(here)) for path in paths) or [word]
         if arguments[0] == 'play':
             pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-            # No node subscribes in the tests of examples, so wait only 0.5 s for subscribers.
+            # In these tests there is no subscriber, so wait only 0.5 s for subscribers.
             arguments[1:1] = ['--wait', '0.5']
         if arguments[:2] == ['record', '--positions']:
             return self._interrupted(arguments, here)
         return (cli or self._cli)(*arguments, cwd=here)
 
     def _interrupted(self, arguments, here):
-        """Start a command that runs until Ctrl-C; send SIGINT after its first printed line."""
+        """Run a command that does not end by itself; send SIGINT after its first printed line."""
         process = subprocess.Popen(
             [sys.executable, '-m', 'thermo_comp', *arguments], cwd=here,
             env={**os.environ, 'PYTHONPATH': str(ROOT)}, stdout=subprocess.PIPE,

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the fault bench: it sends messages over DDS to the real node process and collects the output.
+Owns the fault bench: it sends messages over DDS to a node process and collects the node's output.
 
-Messages are sent at full speed in lots of some hundred; after each lot the bench waits until the
-node's diagnostics account for every sample. Because the bench waits, no message is lost by
-accident, a fault shows in at least one report, and the result does not depend on the machine.
+Messages are sent without pauses in lots of up to 400. After each lot the bench waits until the
+node's diagnostics have counted every sample. Therefore no message is lost between bench and node,
+at least one report contains each fault, and the result does not depend on the machine.
 """
 
 import struct
@@ -30,15 +30,15 @@ from sensor_msgs.msg import Imu, Temperature
 
 from thermo_comp.ros.waitloop import WaitLoop
 
-#: Longest wait for any event [s]; reached only if the bench is broken.
+#: Time limit for any event [s]: after this time the test fails.
 TIMEOUT_S = 60.0
-#: Length of bag [s] and largest number of messages in one lot: the shared memory of Fast DDS has
-#: room for 512 messages; Fast DDS sends messages beyond 512 seconds later, out of order.
+#: Longest time span [s] and largest number of messages of a lot. The shared memory of Fast DDS has
+#: room for 512 messages; further messages arrive seconds later, out of order.
 LOT_S, LOT_SIZE = 10.0, 400
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
 FRAME = b'sensor\0'
 _REST = np.array([20.0])
-#: Counts of the unit of `fault_rig` at rest at the reference temperature.
+#: Samples of the unit of `fault_rig` at rest at the reference temperature [counts].
 _STANDING = counts_of(force_at(np.array([STANDS_S])), _REST, _REST, 0.0 * _REST)[0]
 _HEAD = '<4siII7s5x'
 _COUNTS, _READING = struct.Struct(_HEAD + '3d'), struct.Struct(_HEAD + '2d')
@@ -73,12 +73,12 @@ class Heard:
 
 
 class Bench:
-    """A peer of the node that acts as three drivers and an INS."""
+    """Publishes samples and two temperatures to the node, and receives the node's output."""
 
     def __init__(self, node, context):
         self.process = node
         self.node = rclpy.create_node('fault_bench', context=context)
-        # WaitLoop serves no service clients, so a `Peer` calls the services of the node.
+        # WaitLoop does not serve clients, so a `Peer` calls the services of the node.
         self._operator = Peer()
         self._client = self._operator.node.create_client(
             SetParameters, 'thermo_comp/set_parameters'
@@ -106,7 +106,7 @@ class Bench:
             self._publish[name] = publisher.handle.publish_raw
 
     def restart_publishers(self):
-        """End the drivers and start new ones, and wait until the node has discovered them."""
+        """Replace all publishers, and wait until the node has discovered the new publishers."""
         for publisher in self._publishers:
             self.node.destroy_publisher(publisher)
         self._publishers.clear()
@@ -116,7 +116,7 @@ class Bench:
             while not publisher.get_subscription_count():
                 pause.wait(0.01)
                 assert self.process.is_alive, self.process.said
-        # The subscriptions of the node need 0.5 s to discover the new publishers completely.
+        # Discovery of the new publishers by the node's subscriptions takes 0.5 s.
         pause.wait(0.5)
 
     def close(self):
@@ -155,7 +155,7 @@ class Bench:
     def set_parameters(self, **values):
         future = self.ask(**values)
         pause = threading.Event()
-        # Poll the future: a callback would wait for the executor, which waits for the answer.
+        # Poll, because a callback would wait for the executor, which waits for the answer.
         while not future.done():
             pause.wait(0.001)
             assert self.process.is_alive, self.process.said
@@ -175,18 +175,18 @@ class Bench:
         return n
 
     def meet(self):
-        """Send samples with stamps after any bag until the node returns them; reset counts."""
+        """Send samples, with stamps later than any bag, until the node publishes; reset counts."""
         pause = threading.Event()
         standing = _STANDING.copy()
         for k in range(1000):
             stamp_ns = START_NS + (100_000 + k) * 1_000_000_000
-            # Send a unit at rest at constant temperature, which the node's checks always accept.
+            # The node accepts samples of a unit at rest at constant temperature.
             standing[2] += 1.0
             self.send([('board', stamp_ns, _REST[0]), ('counts', stamp_ns, tuple(standing))])
             pause.wait(0.02)
             if self._frames:
                 break
-        # Messages sent before discovery are lost: take the counts of samples from the node.
+        # Messages before discovery are lost, so take the number of samples from the node.
         last_ns = stamp_ns + 1_000_000_000
         standing[2] += 1.0
         self.send([('counts', last_ns, tuple(standing))])
@@ -214,7 +214,7 @@ class Bench:
             if self.send(lot):
                 self.settle()
             else:
-                # The node empties its queues before each report.
+                # Before each report the node takes all messages from its queues.
                 n_reports = self._n_reports
                 self.wait_for(lambda n=n_reports: self._n_reports > n + 2, 'three reports')
         return self.take()
@@ -256,7 +256,7 @@ def bench(calibration, *parameters, **environment):
     """
     Start a node process and a peer, and wait until they have discovered each other.
 
-    `environment`: environment variables of the node, in addition to those of the test
+    `environment`: further environment variables of the node process
     """
     overrides = [f'calibration_file:={calibration}', *PARAMETERS, *parameters]
     arguments = [word for override in overrides for word in ('-p', override)]

@@ -4,9 +4,8 @@
 Owns the simulated bag of the fault tests (a unit in a soak, a ramp and a soak) with its truth, and
 the functions that change its messages.
 
-The unit has only effects that its calibration contains, so that any error beyond the noise is due
-to the fault, and every published number can be compared with the truth. The lags are seconds
-instead of minutes, so that the bag is short.
+The unit has only effects that its calibration contains, so that an error above the noise is caused
+by the fault. The lags are seconds instead of minutes, so that the bag is short.
 """
 
 import math
@@ -27,14 +26,14 @@ START_NS = 1_767_225_600 * SECOND_NS
 RATE_HZ = 12.5
 READINGS_HZ = 2.5
 DURATION_S = 320.0
-#: Time until which the platform turns; afterwards it is at rest [s].
+#: Time at which the turn of the unit ends and its rest begins [s].
 STANDS_S = 40.0
 RAMP_S = (60.0, 120.0)
 RAMP_K_S = 0.1
 CASE_LAG_S, BOARD_LAG_S, MEMORY_S = 10.0, 60.0, 20.0
 READING_SD = 0.003
 
-#: Counts per m/s^2: a 24-bit converter, whose rounding is 0.3 ug.
+#: Counts per m/s^2 of a 24-bit converter, whose rounding step is 0.3 ug.
 K = 3e5
 FULL_SCALE = 8388607.0
 NOISE_SD = 1e-4
@@ -43,14 +42,14 @@ BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^
 SCALE_SLOPE = 7e-5
 BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
 
-#: Residual sd of the static set [m/s^2]; contains the error in a ramp that is not yet detected.
+#: Residual sd of the static set [m/s^2]: it includes the error before a ramp is detected.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 
 CONFIG = CompensatorConfig(transition_time_s=5.0, temperature_timeout_s=20.0, case_timeout_s=10.0,
                            gravity_tolerance_m_s2=0.02)  # fmt: skip
 
-# A message is a tuple of topic, stamp [ns] and value. A list of messages is in order of arrival.
+# A message: topic, stamp [ns] and value. Lists of messages are in order of arrival.
 Event = tuple[str, int, Any]
 Inject = Callable[[list[Event]], list[Event]]
 
@@ -87,7 +86,7 @@ def unit(**changes):
 
 
 def force_at(seconds):
-    """Return the true specific force [m/s^2], shape (n, 3): a slow turn, then rest."""
+    """Return the true specific force [m/s^2], shape (n, 3), in a slow turn and then at rest."""
     angle = 0.02 * np.minimum(seconds, STANDS_S)
     up = np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)]).T
     return GRAVITY * up
@@ -95,7 +94,7 @@ def force_at(seconds):
 
 @dataclass(frozen=True)
 class Truth:
-    """The true temperatures [degC] of the unit on a fine grid of times [s]."""
+    """Temperatures of case and board [degC] and `memory` [K] on a fine grid of times [s]."""
 
     time: np.ndarray
     case: np.ndarray
@@ -129,7 +128,7 @@ def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
 
 
 def counts_of(force, case, board, memory):
-    """Return the counts for a specific force (equations 6 to 9 of Golovach's paper)."""
+    """Return the counts for a specific force, Eq. (6) to (9) of Golovach's paper."""
     t = board - 20.0
     drift = BIAS_SLOPE * t + BIAS_CURVE * t**2
     drift += BY_GRADIENT * (case - board) + BY_MEMORY * memory
@@ -161,7 +160,7 @@ def bag(rate_hz=RATE_HZ, ramp_s=RAMP_S, duration_s=DURATION_S, start_s=0.0):
 
 
 def corrected(events, compensator=None):
-    """Return stamps and rows (force, covariance) of the published samples, without DDS."""
+    """Correct events in this process; return stamps and rows (force, covariance)."""
     compensator = compensator or Compensator(unit(), CONFIG)
     stamps, rows = [], []
     for topic, stamp_ns, message in events:
@@ -178,7 +177,7 @@ def seconds_of(stamp_ns):
 
 
 def changed(topic, begin_s, end_s, change):
-    """Replace each message of a topic within a span of stamps by the events of `change(event)`."""
+    """Replace each message of a topic from `begin_s` to `end_s` by `change(message)`."""
 
     def inject(events):
         result = []
@@ -201,7 +200,7 @@ def stop(topic, begin_s, end_s):
 
 
 def frozen(topic, begin_s, end_s):
-    """Repeat the last value of a topic throughout a span, with new stamps."""
+    """Repeat the last value of a topic from `begin_s` to `end_s`, with new stamps."""
     last = []
 
     def hold(event):
@@ -224,7 +223,7 @@ def late(topic, delay_s, begin_s, end_s):
 
 
 def shuffled(topic, begin_s, end_s):
-    """Exchange the messages of a topic within a span in pairs of neighbours."""
+    """Exchange neighbouring messages of a topic from `begin_s` to `end_s`, in pairs."""
 
     def inject(events):
         result = list(events)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the rows of faults: the fault, the required output and the required diagnostics.
+Owns the faults of docs/faults.md: for each fault the required output and required diagnostics.
 
 Times are seconds of the bag of `fault_rig`: the unit turns until 40 s, the ramp is from 60 to
-120 s, and the lag of the board has decayed by 270 s. docs/faults.md describes each row.
+120 s, and at 270 s the lag of the board after the ramp has decayed.
 """
 
 import math
@@ -45,13 +45,13 @@ class Row:
     n_least: int
     #: Spans [s] in which nothing may be published.
     silent: tuple[tuple[float, float], ...] = ()
-    #: Span [s] before the fault can be detected, in which the output may be wrong.
+    #: Span [s] in which the fault is not yet detected and the output may be wrong.
     blind: tuple[float, float] = (0.0, 0.0)
     #: Time from which the output is within 1 ug of the fault-free output [s]; inf: never.
     recovered: float = 0.0
     #: Time from which stamps are ahead of the true times, and the difference [s].
     shift: tuple[float, float] = (math.inf, 0.0)
-    #: Messages of the row, or None for the bag of `fault_rig`.
+    #: Messages before the fault is applied; None: the bag of `fault_rig`.
     source: list[Event] | None = field(default=None, repr=False)
 
 
@@ -66,7 +66,7 @@ def lose(share):
 
 
 def faster(begin_s, end_s, factor):
-    """Shorten the conversion cycle: a sample becomes `factor` samples with fewer counts each."""
+    """Replace each sample by `factor` samples with 1/`factor` of its counts each."""
     step_ns = round(1e9 / RATE_HZ / factor)
 
     def split(event):
@@ -81,12 +81,12 @@ def faster(begin_s, end_s, factor):
 
 
 def half_time(begin_s):
-    """Let the stamps jump back: play the messages before `begin_s`, then the whole bag."""
+    """Play the messages before `begin_s` and then the whole bag, so that stamps jump back."""
     return lambda events: [e for e in events if seconds_of(e[1]) < begin_s] + events
 
 
 def sensor_rows(name):
-    """Return the rows of one thermometer; only faults of the board thermometer stop output."""
+    """Return the faults of a thermometer; only faults of the board thermometer stop the output."""
     is_board = name == 'board'
     lost = 'nothing is published' if is_board else 'the board sensor decides the regime'
     level = ERROR if is_board else WARN

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns simulated rests of a unit with any calibration, in the form that the node logs."""
+"""Owns simulated rests of a unit, in the form in which the node logs them."""
 
 from dataclasses import replace
 
@@ -15,15 +15,15 @@ from thermo_comp.unit.posterior import posterior_of
 from thermo_comp.unit.prediction import ramp_states
 
 DAY_NS = 86_400 * 10**9
-#: 2030-01-01, after any calibration that a test makes, in days since 1970.
+#: The day 2030-01-01, which is after the date of every calibration in tests, in days since 1970.
 FIRST_DAY = 21_915
 ZERO = np.zeros(3)
 
 
 def rests(calibration, attitudes, error, days=20, seed=1, turn_on=20.0 * MICRO_G, rate=0.0):
     """
-    Log three starts per day, each with four windows, in a ramp of `rate` [K/s]; `error(day)` is
-    the error of the bias [m/s^2].
+    Simulate three starts per day with four windows each, in a ramp of `rate` [K/s], with a bias
+    error of `error(day)` [m/s^2].
     """
     rng = np.random.default_rng(seed)
     correction = Correction(calibration)
@@ -70,7 +70,7 @@ def in_any_attitude(rng):
 
 
 def known(**keys):
-    """Make a calibration with an sd of 10 ug for each bias and of 10 ppm for each scale."""
+    """Make a calibration with an sd of 10 ug of each bias and of 10 ppm of each scale factor."""
     value = builders.calibration(noise_density_m_s2_sqrt_hz=(60 * MICRO_G,) * 3, **keys)
     layout = parameter_layout(value)
     sd = np.zeros(layout.n_parameters)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns window tables with known truth for tests of the regression, without samples or sensors."""
+"""Owns window tables, drawn from true parameters, for tests of the regression."""
 
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -40,10 +40,10 @@ class Truth:
     misalignment: Floats = field(default_factory=lambda: np.array([1e-3, -2e-3, 5e-4]))
     start_sd: float = 0.0
     sigma: Floats = field(default_factory=lambda: np.full(3, 2.0 * MICRO))
-    #: Slow noise of the bias, in addition to the white noise.
+    #: Slow noise of the bias (white noise: `sigma`).
     noise: Noise = field(default_factory=Noise)
     offset_sd: float = 0.0
-    #: Sd of the supports' tilts [rad per RMS of a temperature].
+    #: Sd of support tilts [rad], for a column of temperature with an RMS of 1.
     tilt_sd: float = 0.0
 
     @property
@@ -61,10 +61,10 @@ class Truth:
 
 
 def table_of(truth, n_positions, rng, *, n_windows=40, step_s=120.0, up=None):
-    """Draw a table of windows, one bag per position; also return the true directions."""
+    """Draw a table of windows, with a bag per position; return table and true directions."""
     up = positions(n_positions, 3) if up is None else up
     time = step_s * (np.arange(n_windows) + 0.5)
-    # In the bag of position p the temperature follows 0.7 + 0.05 p periods of a sine.
+    # The temperature in the bag of position p is a sine with 0.7 + 0.05 p periods.
     shapes = [_columns(n_windows, step_s, 0.7 + 0.05 * p) for p in range(n_positions)]
     share = np.zeros((n_windows, len(GROUPS)))
     share[:, 2:4] = np.exp(-time[:, None] / TAUS)
@@ -124,7 +124,7 @@ def _columns(n_windows, step_s, turns):
 
 
 def rows_of(windows, rows):
-    """Select rows of a table, position by position; positions and bags are renumbered."""
+    """Select rows of a table; number the remaining positions and bags from 0 on."""
     names = ('section', 'time', 'weight', 'mean', 'columns', 'start', 'tilt')
     taken = {name: getattr(windows, name)[rows] for name in names}
     for name in ('position', 'bag'):
@@ -136,7 +136,7 @@ def rows_of(windows, rows):
 
 
 def without_starts(windows):
-    """Remove unknown initial lag states, whose products with weights are not linear."""
+    """Remove initial lag states, so that the model has no products of unknowns."""
     return replace(
         windows, lag=np.full_like(windows.lag, -1), start=np.zeros_like(windows.start),
         start_covariance=np.zeros((0, 0)),
@@ -159,7 +159,7 @@ def prior_of(truth, names=('curve', 'board'), **changes):
 
 
 def candidates_of(windows, forced=()):
-    """Make all columns candidates, with typical slopes of 5 ug/K (bias) and 5 ppm/K (scale)."""
+    """Make all columns candidates, with prior slopes of 5 ug/K (bias) and 5 ppm/K (scale)."""
     none = np.zeros((2, len(windows.groups)), dtype=bool)
     typical, largest = (
         np.outer(slope, windows.kelvins) * windows.parts
@@ -186,5 +186,5 @@ def mode_of(regression, state, prior):
 
 
 def unit_of(state, layout):
-    """Return the unknowns of the unit (not of positions and bags) as a vector."""
+    """Return the parameters of the unit, without those of positions and bags, as a vector."""
     return as_vector(state, layout)[: layout.n_unit]

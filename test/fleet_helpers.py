@@ -12,9 +12,9 @@ from thermo_comp.simulation.presets import unit_preset as preset
 from thermo_comp.simulation.run import simulate
 from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
-#: Program of about half an hour with the fast ramps of a freezer; the board covers 36 K.
+#: Program of about half an hour with ramps of 5 K/min; the board temperature covers 36 K.
 PROGRAM = parse_cyclogram('20 2min, 45@5 8min, 5@5 10min')
-#: The paper's model is the fastest fit, for tests of everything around a fit.
+#: Tests that do not depend on the model use that of the paper, whose fit is the fastest.
 OPTIONS = FleetOptions(FitOptions(gravity=STANDARD_GRAVITY, model='golovach'), certificates=False)
 
 
@@ -33,8 +33,8 @@ def write_unit(
     fault=lambda counts: counts,
 ):
     """
-    Simulate a thermal test of a unit, a bag per position; thermometers may be exchanged, and
-    `fault` applied to the counts of each bag.
+    Simulate a thermal test of a unit with one bag per position; `is_exchanged` exchanges the
+    thermometers, and `fault` changes the counts of each bag.
     """
     unit = unit or preset('mems', seed)
     folder.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def write_unit(
 
 
 def damage(path):
-    """Overwrite 64 bytes at a third of the length of a bag, as a damaged disk does."""
+    """Overwrite 64 bytes at a third of the length of a bag, to simulate a damaged disk."""
     content = bytearray(path.read_bytes())
     middle = len(content) // 3
     content[middle : middle + 64] = bytes(64)

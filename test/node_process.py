@@ -11,14 +11,14 @@ from pathlib import Path
 
 _STOPPING_S = 10.0  # time for the node to end [s]
 
-#: Environment of a process that a test kills: Fast DDS without shared memory. A killed process
-#: leaves its segments of shared memory, the suspected cause of rare crashes when other nodes end.
+#: Environment for processes that a test kills: they use Fast DDS without shared memory, because
+#: segments that a killed process leaves may be the cause of rare crashes of other nodes.
 OVER_UDP = {'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
 
 
 class NodeProcess:
     """
-    The node in a separate process, which ends with the context.
+    The node in a separate process, which ends at the end of the `with` block.
 
     `environment`: environment variables in addition to those of the test
     """
@@ -49,11 +49,11 @@ class NodeProcess:
 
     @property
     def said(self):
-        # Read the output without moving the file position at which the node process writes.
+        # `pread` does not change the position at which the node process writes to the file.
         return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors='replace').strip()
 
     def stop(self, number=signal.SIGTERM):
-        # Popen sends no signal to a process that has ended.
+        # This sends no signal to a process that has already ended.
         self.process.send_signal(number)
         try:
             return self.process.wait(timeout=_STOPPING_S)

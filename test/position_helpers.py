@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulated positions for the tests of partial fits."""
+"""Owns simulated rests of a sensor, in the form that a fit reads."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +17,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass
 class Imu:
-    """The Imu columns that the search for jumps needs."""
+    """The columns of Imu messages that the search for jumps reads."""
 
     angular_velocity: np.ndarray
 
@@ -33,7 +33,7 @@ class ImuBlock(ArrayBlock):
 
 @dataclass
 class Rest:
-    """A sensor at rest: noise about `level` [m/s^2]; the board cools by `fall` K from `warm`."""
+    """A sensor at rest: noise about `level` [m/s^2]; the board cools by `fall` K, from `warm`."""
 
     rng: np.random.Generator
     duration_s: float = 600.0

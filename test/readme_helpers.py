@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the outputs shown in the README and on the page of the command line, and their comparison.
+Owns the command outputs shown in README and docs/cli.md, and their comparison with real outputs.
 
-``python test/readme_helpers.py`` runs the commands of docs/cli.md and writes their output into the
-page, and the picture of the demonstration into docs/images.
+``python test/readme_helpers.py`` runs the commands on docs/cli.md and writes their output into
+this page, and the picture of the demonstration into docs/images.
 """
 
 import os
@@ -24,7 +24,7 @@ _NUMBER = re.compile(r'-?\d+(?:\.\d+)?(?:e[+-]?\d+)?')
 
 
 def shown():
-    """Return docs/cli.md's console examples: sub-command -> (words of the command, output)."""
+    """Return the examples in docs/cli.md: sub-command -> (words of the command, its output)."""
     collected = {}
     for kind, text in FENCE.findall(CLI_PAGE.read_text(encoding='utf-8')):
         if kind == 'console':
@@ -42,7 +42,7 @@ def shown_of_demo():
 
 
 def is_alike(got, expected):
-    """Compare two outputs: words exactly, numbers to a third or to 5, as processors differ."""
+    """Whether outputs have equal words, and numbers that differ by less than a third or by 5."""
     if _NUMBER.sub('#', got).split() != _NUMBER.sub('#', expected).split():
         return False
     numbers = zip(_NUMBER.findall(got), _NUMBER.findall(expected), strict=True)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns bags made by other tools, and their content as read by plain Python."""
+"""Owns bags made by other programs, and readers of their content in plain Python."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -168,14 +168,14 @@ def assert_columns(block, messages):
             assert found.tolist() == expected[f'{role}_{name}'], (role, name)
         assert after.tolist() == expected[f'{role}_after']
         assert values.dtype == np.float64
-        # Compare bits, because a reader must keep the payload of a NaN.
+        # Compare bits, because a reader must keep the bits of a NaN, which does not equal itself.
         shape = (-1, 3) if role == 'accel' else (-1,)
         wanted = np.array(expected[f'{role}_values'], np.float64).reshape(shape)
         assert np.ascontiguousarray(values).tobytes() == wanted.tobytes(), role
 
 
 def regular_messages(n=40, accel=ACCEL, every=8):
-    """Make a small regular bag: counts, and both temperatures after every few counts."""
+    """Make messages of counts at a fixed rate, and both temperatures after each `every` counts."""
     messages = []
     width = 3 if accel == ACCEL else 37
     for row in range(n):

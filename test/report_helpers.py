@@ -43,14 +43,14 @@ def fitted():
         number = position + 1
         keys = {'sha256': f'{number:064x}', 'serial': 'thermostatted-0001'}
         sources.append(source_of(*arrays_of(record), name=f'{number:02d}.mcap', **keys))
-    # Without the group `product` the bank of columns is a third as large.
+    # Without the group `product` the fit has a third of the columns, and is faster.
     groups = ('curve', 'set', 'gradient', 'board')
     return fitting.fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups))
 
 
 @cache
 def evidence():
-    """Gather the evidence of the fit; left-out residuals are assumed, NaN in the last position."""
+    """Gather the data of a report, with invented left-out residuals, NaN in the last position."""
     *others, last = fitted().positions
     left_out = [
         replace(other, left_out_rms=rms) for other, rms in zip(others, LEFT_OUT_RMS, strict=True)

@@ -19,7 +19,7 @@ from sensor_msgs.msg import Imu, Temperature
 SECOND_NS = 1_000_000_000
 #: Stamp of the first sample of a test [ns], and interval between samples [ns].
 START_NS, CYCLE_NS = 1_767_225_600 * SECOND_NS, 10_000_000
-#: Longest wait for any event on DDS [s]; reached only if a test is broken.
+#: Time limit for any event on DDS [s]: after this time the test fails.
 TIMEOUT = 30.0
 DEEP = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -35,12 +35,12 @@ def stamp_of(message):
 
 
 def standing(k):
-    """Return distinct counts of a unit of 300 counts per m/s^2 at rest, with |f| close to g."""
+    """Return a sample at rest [counts], 300 per m/s^2, that differs from its neighbours."""
     return 30.0 + k % 3, -20.0 + k % 2, 2941.0 + k % 5
 
 
 class Peer:
-    """A node with its own thread; each received message makes `wait_for` test its condition."""
+    """A ROS node in a thread; after each received message `wait_for` tests its condition."""
 
     def __init__(self):
         self.context = Context()
@@ -80,7 +80,7 @@ class Peer:
             assert self._news.wait_for(condition, TIMEOUT), f'{what} did not come true'
 
     def poll(self, condition, what):
-        """Poll a condition that no message announces, such as a discovery."""
+        """Wait for a condition that no message announces, such as a discovery."""
         pause = threading.Event()
         for _ in range(int(TIMEOUT / 0.02)):
             if condition():
@@ -94,10 +94,10 @@ class Peer:
         return publisher
 
     def join(self, node):
-        """Wait until both ends of every topic have discovered each other."""
+        """Wait until publishers and subscribers of all topics have discovered each other."""
         topics = {subscription.topic_name for subscription in self.node.subscriptions}
         outputs = [output for output in node.node.publishers if output.topic_name in topics]
-        # Inputs without a publisher are ignored: some tests lack thermometers of the unit.
+        # Some tests have no thermometers, so leave out inputs without a publisher.
         sent = {publisher.topic_name for publisher in self.node.publishers}
         inputs = [input_ for input_ in node.node.subscriptions if input_.topic_name in sent]
         self.poll(
@@ -110,7 +110,7 @@ class Peer:
         )
 
     def call(self, kind, name, request):
-        # Keep service clients, because discovering a service takes longer than a call.
+        # Keep service clients, because discovery of a service takes longer than a call.
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
         client = self._clients[name]
@@ -168,14 +168,14 @@ def drive(peer, node, kind=Vector3Stamped, topic='accel/counts', qos=DEEP):
 
 
 def node_arguments(unit, *overrides):
-    """Make the arguments of a node that publishes 20 diagnostics reports a second."""
+    """Make the arguments of a node that publishes diagnostics at 20 Hz."""
     words = [f'calibration_file:={unit}', 'diagnostics_period:=0.05', *overrides]
     return [word for override in words for word in ('-p', override)]
 
 
 @contextmanager
 def bare_node(*overrides):
-    """Make a plain rclpy node named thermo_comp, with overridden parameters."""
+    """Make an rclpy node named thermo_comp with parameter overrides."""
     context = Context()
     words = [word for override in overrides for word in ('-p', override)]
     rclpy.init(args=['--ros-args', *words], context=context)
@@ -208,7 +208,7 @@ class Samples:
 
 
 def status_with(peer, heard, text, send=lambda: None):
-    """Call `send` until the message of a report contains the text; return the status."""
+    """Call `send` until a diagnostics message contains the text; return its status."""
     del heard[:]
     collected = []
 

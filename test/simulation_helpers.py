@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns functions for simulated runs that only tests need."""
+"""Owns functions for simulated runs that tests need, but not the package."""
 
 from dataclasses import replace
 
@@ -25,8 +25,8 @@ def noiseless(unit):
 
 
 def rippled(program, seed=1, amplitude=0.1, period=300.0):
-    """Return a program with the ripple of a chamber's control: a sine with a random-walk phase."""
-    # The sine has twelve points per period; its phase changes by an sd of 0.5 rad per period.
+    """Add the ripple of a chamber's control to a program: a sine whose phase is a random walk."""
+    # The sine has twelve points per period; per period its phase changes with an sd of 0.5 rad.
     time = np.arange(0.0, program.duration_s, period / 12.0)
     rng = np.random.default_rng(seed)
     phase = rng.uniform(0.0, 2.0 * np.pi) + np.cumsum(

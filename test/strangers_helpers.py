@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the averaging of bags for tests of the units of `strangers_units.py`."""
+"""Owns a function that averages the bags of benchmarks/strangers_units.py, to save time."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ def slow(bag):
     """
     Average the samples of a bag, and their times, over 4 s.
 
-    A correction of fewer samples takes less time, and means over 60 s do not change.
+    The correction of fewer samples is faster, and means over 60 s hardly change.
     """
     n = round(4.0 / (bag.time_s[1] - bag.time_s[0]))
     whole = len(bag.time_s) // n * n

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The state of a test during recording: positions are found in blocks of any length."""
+"""During a recording the positions of the unit are found, in blocks of samples of any length."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
     account = test.account()
     assert account.is_complete
     for position, up in zip(account.positions, UPS, strict=True):
-        # A bias of 0.04 g changes the measured direction by up to 2 degrees.
+        # The bias of 0.04 g changes the measured direction of gravity by up to 2 degrees.
         assert position.up @ up > np.cos(np.radians(2.5))
         assert position.still_s == pytest.approx(60.0, abs=2.0)
         board = position.thermometers['board']
@@ -88,7 +88,7 @@ def test_positions_do_not_depend_on_the_length_of_blocks(stream, seconds):
     assert board.highest == pytest.approx(26.0, abs=0.1)
 
 
-def test_a_position_grows_until_it_is_good(stream):
+def test_a_position_is_good_after_the_required_time_at_rest(stream):
     stream.rest((0, 0, 1), 40.0)
     test = Acquisition(2, 30.0)
     collected = []
@@ -137,7 +137,7 @@ def test_the_same_direction_does_not_count_twice(stream):
     assert reasons(test) == ['', '', 'repeats position 1']
 
 
-def test_a_clock_that_goes_back_begins_a_position(stream):
+def test_a_backward_jump_of_the_clock_begins_a_new_position(stream):
     stream.rest((0, 0, 1), 40.0)
     test = Acquisition(1, 30.0)
     for start_ns in (START_NS, 10**15):
@@ -147,7 +147,7 @@ def test_a_clock_that_goes_back_begins_a_position(stream):
     assert still_s == pytest.approx([40.0] * 2, abs=1.0)
 
 
-def test_a_dead_sensor_has_no_direction():
+def test_a_sensor_that_reads_zero_has_no_direction():
     stamp_ns = START_NS + np.arange(3000) * 20_000_000
     test = Acquisition(1, 30.0)
     log_ns = {'accel': stamp_ns}
@@ -157,7 +157,7 @@ def test_a_dead_sensor_has_no_direction():
     assert (account.n_good, account.farthest_deg) == (0, 180.0)
 
 
-def test_unsigned_words_have_their_zero_in_mid_range(stream):
+def test_the_zero_of_unsigned_words_is_in_mid_range(stream):
     for up in UPS:
         stream.rest(up, 40.0)
         stream.turn()

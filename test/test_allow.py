@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each named refusal of a fit can be overridden by its name; the fit gives a calibration."""
+"""A fit refuses wrong data by a named refusal; if it is allowed, the fit gives a calibration."""
 
 import re
 from contextlib import suppress
@@ -15,7 +15,7 @@ from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.options import REFUSALS
 from thermo_comp.simulation.campaign import positions
 
-# Refusals do not depend on the model; the model golovach is the fastest to fit.
+# Refusals do not depend on the model; a fit with the model golovach takes the shortest time.
 COUNTS = FitOptions(gravity=GRAVITY, model='golovach')
 FORCE = replace(COUNTS, input='m/s^2')
 
@@ -38,7 +38,7 @@ as_it_is = id  # a function that leaves a rest unchanged
 
 
 def swapped(source, rest):
-    """Replace the thermometers: the board cools at once, the case with a lag of two minutes."""
+    """Replace the readings: the board follows the chamber, the case lags it by 2 min."""
     (block,) = source.blocks()
     time = (block.board_stamp_ns - block.board_stamp_ns[0]) * 1e-9
     late = np.empty_like(block.board)
@@ -56,12 +56,12 @@ def swapped(source, rest):
         ('units', as_it_is, COUNTS, 1),
         ('jump', jumped, FORCE, 1),
         ('jump', jumped, FORCE, 7),
-        # The test replaces the thermometers of the bags by `swapped`, so that the board leads.
+        # For this name the test replaces the readings by those of the function `swapped`.
         ('swapped', as_it_is, FORCE, 7),
         ('compensated', compensated, FORCE, 12),
     ],
 )
-def test_an_allowed_refusal_ends_in_a_calibration(rng, name, spoil, options, n):
+def test_a_fit_with_an_allowed_refusal_gives_a_calibration(rng, name, spoil, options, n):
     assert name in REFUSALS
     sources = []
     for number, up in enumerate(positions(n, 3)):
@@ -121,8 +121,8 @@ def in_whole_degrees(rest):
         (dead, 'an axis is exactly zero at rest'),
     ],
 )
-def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text):
-    # WHY: temperatures of another clock or in mK, or a dead axis, ended the fit with a traceback.
+def test_bags_without_usable_numbers_are_refused_with_a_message(rng, spoil, text):
+    # WHY: for such bags the fit ended with a traceback.
     with pytest.raises(FitError, match=text):
         fit(spoilt(rng, spoil), FORCE)
 
@@ -131,31 +131,31 @@ def test_bags_without_usable_numbers_are_refused_in_a_sentence(rng, spoil, text)
     ('spoil', 'name', 'text'),
     [
         (late_by(120.0), 'unmeasured', '^2[0-9] % .* has no temperatures .* use the same clock'),
-        # WHY: if readings dropped out in the middle, the message asked whether two clocks differ.
+        # WHY: for readings that are missing for 200 s the message suggested a second clock.
         (
             dropping_out,
             'unmeasured',
             r'^2\d % .* has no temperatures .* stick, or drop out\? bag\d: temperature/board '
             'has no new value for 20[0-2] s$',
         ),
-        # WHY: a fit of readings in whole degrees, which first changed after a soak, was refused
-        # with the question whether the clocks are the same.
+        # WHY: readings in whole degrees are constant in the first soak; the message suggested a
+        # second clock.
         (in_whole_degrees, 'steps', r'^2\d % .* temperature/board \(steps of 1 K\) changes for'),
         (frozen, 'stuck', '^at rest all samples are equal'),
         (in_kelvins, 'kelvins', r'^temperature/board reads 2\d+\S* .. \d+\S* degC: that looks'),
     ],
 )
-def test_likely_mistakes_are_refused_by_name(rng, spoil, name, text):
+def test_likely_mistakes_are_refused_with_the_name_of_the_refusal(rng, spoil, name, text):
     findings = {note.name: note.message for note in fit(spoilt(rng, spoil), FORCE).findings}
     assert re.search(text, findings[name])
     assert name == 'unmeasured' or 'unmeasured' not in findings
 
 
-def test_rests_without_noise_advise_the_parameter_of_the_node(rng):
-    # WHY: the node, which takes equal samples for a stuck converter, dropped 60 % of the samples.
+def test_the_advice_for_rests_without_noise_names_the_parameter_of_the_node(rng):
+    # WHY: the node rejects equal samples as those of a stuck converter, and dropped 60 %.
     rests = [Rest(rng, level=tuple(GRAVITY * up), sd=0.3 * MG) for up in positions(7, 3)]
     for rest in rests[:2]:
-        # The drift of 40 mg changes the samples by steps of 4 mg.
+        # The samples have no noise; a drift of 40 mg changes them by steps of 4 mg.
         drift = 40.0 * MG * np.linspace(0.0, 1.0, len(rest.accel))[:, np.newaxis]
         rest.accel = np.rint((rest.accel + drift) / (4.0 * MG)) * 4.0 * MG
     findings = {note.name: note.message for note in fit(sources_of(rests), FORCE).findings}
@@ -164,9 +164,9 @@ def test_rests_without_noise_advise_the_parameter_of_the_node(rng):
     assert 'set stuck_timeout of the node to 0' in findings['stuck']
 
 
-def test_an_axis_that_is_dead_in_one_position_is_named(rng):
-    # WHY: in one position the y axis read exactly 3000 for hours, and the missing drift of y was
-    # attributed to all other positions.
+def test_an_axis_that_is_constant_in_one_position_is_named(rng):
+    # WHY: in one position the y axis was constant for hours, and the fit attributed the missing
+    # drift of y to all positions.
     rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
     rests[4].accel[:, 1] = rests[4].level[1]
     with pytest.raises(FitError, match=r'^bag4: y reads exactly \S+ for 0\.\d+ h: the axis is'):
@@ -177,7 +177,7 @@ def test_an_axis_that_is_dead_in_one_position_is_named(rng):
     with pytest.raises(FitError, match=r'^bag0: z reads exactly \S+ for 0\.\d+ h; bag1: z .*dead'):
         fit(sources_of(rests), FORCE)
     rests = [Rest(rng, level=tuple(GRAVITY * up)) for up in positions(7, 3)]
-    # WHY: axes at the full scale, here 10 m/s^2, were taken for dead axes.
+    # WHY: axes that were constant at the full scale, here 10 m/s^2, were reported as dead.
     rests[2].accel[:, 0], rests[4].accel[:, 1] = -10.0, 10.0
     with pytest.raises(FitError, match=r'^bag2: x .*; bag4: y .* full scale: .*-scale 9.999 '):
         fit(sources_of(rests), FORCE)
@@ -195,9 +195,9 @@ def spoilt(rng, spoil):
 
 
 @pytest.mark.parametrize(('n', 'n_prior', 'step'), [(8, 6, 1e-2), (2, 1, 1e-4)])
-def test_steps_far_above_the_noise_end_in_a_calibration_or_a_sentence(rng, n, n_prior, step):
-    # WHY: constant samples of an axis had a noise of 1e-8 m/s^2 in the fit, and the equations of
-    # an update by such bags ended in a LinAlgError.
+def test_samples_with_steps_above_their_noise_are_fitted_or_refused(rng, n, n_prior, step):
+    # WHY: for constant samples of an axis the fit assumed a noise of 1e-8 m/s^2, and a fit with a
+    # prior ended with a LinAlgError.
     rests = [Rest(rng, level=tuple(GRAVITY * up), sd=1e-5) for up in positions(n, 3)]
     for rest in rests:
         drift = 1e-2 * np.outer((rest.temperature(rest.time) - 25.0) / 20.0, (1.0, -0.5, 0.3))

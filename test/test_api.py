@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface: corrected arrays are equal to the compensator's output bit for bit."""
+"""The Python interface: arrays are corrected to the bits of the compensator's output."""
 
 import shutil
 from dataclasses import replace
@@ -27,7 +27,7 @@ def fitted(root):
 
 @pytest.fixture
 def arrays(rng):
-    """Make two minutes at 10 Hz, with a reading of each thermometer at every tenth sample."""
+    """Make samples of 2 min at 10 Hz, with a reading of each thermometer every tenth sample."""
     time_s = np.arange(1200) * 0.1
     given = np.arange(1200) % 10 == 0
     board = np.where(given, 20.0 + 0.01 * time_s + rng.normal(0.0, 0.01, 1200), np.nan)
@@ -36,8 +36,8 @@ def arrays(rng):
     return {'time_s': time_s, 'counts': counts, 'board': board, 'case': case}
 
 
-def test_importing_the_package_is_light_and_unknown_names_fail():
-    # `import thermo_comp` must load neither numpy nor the libraries of a fit.
+def test_importing_the_package_loads_no_large_library():
+    # `import thermo_comp` must load neither numpy nor other large libraries.
     heavy = ('numpy', 'scipy', 'yaml', 'rosbags', 'mcap', 'matplotlib')
     assert loaded_after('import thermo_comp', *heavy) == []
     assert all(getattr(tc, name) is not None for name in tc.__all__)
@@ -65,8 +65,8 @@ def test_arrays_have_the_bits_of_a_replayed_bag(root, tmp_path, fitted):
     np.testing.assert_array_equal(changes, np.searchsorted(stamps, switches))
 
 
-def test_no_reading_of_a_large_number_is_lost(rng):
-    # WHY: `correct` queued all readings at once, and the limited queue dropped some readings.
+def test_all_of_5000_readings_of_two_thermometers_are_used(rng):
+    # WHY: `correct` passed all readings before the first sample, and the queue dropped some.
     time_s = np.arange(5000) * 0.1
     readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
     counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (5000, 3)).round()
@@ -84,7 +84,7 @@ def test_readings_per_sample_equal_readings_with_separate_times(arrays):
         for here in [~np.isnan(arrays[name])]
     }
     again = unit.correct(arrays['time_s'], arrays['counts'], **pairs)
-    # In a merged table each reading is repeated up to the next reading.
+    # In a table with a reading per sample each reading is repeated until the next reading.
     filled = {
         name: np.repeat(arrays[name][~np.isnan(arrays[name])], 10) for name in ('board', 'case')
     }
@@ -121,7 +121,7 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     counts[7, 1], counts[9, 2] = np.nan, 32767.0
     board = np.where(arrays['time_s'] < 0.55, np.nan, arrays['board'])
     out = thermal_calibration().correct(arrays['time_s'], counts, board=board, case=arrays['case'])
-    # The first board reading that is no NaN is at 1 s, so 10 samples have no temperature.
+    # The first board reading that is not NaN is at 1 s, so ten samples have no temperature.
     assert np.isnan(out.specific_force[:10]).all()
     assert np.isnan(out.covariance[:10]).all()
     assert np.isfinite(out.specific_force[10:]).all()
@@ -129,8 +129,8 @@ def test_unusable_samples_give_rows_of_nan(arrays):
     late = thermal_calibration().correct(arrays['time_s'], counts, board=arrays['board'])
     assert np.flatnonzero(np.isnan(late.specific_force[:, 0])).tolist() == [7, 9]
     assert (late.counters.n_not_finite, late.counters.n_saturated) == (1, 1)
-    # If the board alone decides the regime, `dynamic` begins no earlier than with a case
-    # thermometer.
+    # Without a case thermometer the dynamic regime begins later than with a case thermometer, or
+    # at the same sample.
     assert late.dynamic.any()
     assert np.argmax(late.dynamic) >= np.argmax(out.dynamic)
 
@@ -176,7 +176,7 @@ def test_wrong_arguments_are_named(change, text):
         calibration().correct(**given)
 
 
-def test_a_fit_of_arrays_is_the_fit_of_their_bags(root, tmp_path, fitted):
+def test_a_fit_of_arrays_equals_the_fit_of_their_bags(root, tmp_path, fitted):
     bags = sorted((root / 'bags' / 'fit').glob('*.mcap'))[:3]
     recordings = [tc.read(bag) for bag in bags]
     again = tc.fit(recordings, gravity=9.80665, model='golovach')
@@ -189,7 +189,7 @@ def test_a_fit_of_arrays_is_the_fit_of_their_bags(root, tmp_path, fitted):
         tc.fit(recordings, gravity=9.80665)
 
 
-def test_the_python_lines_of_the_readme_run(root, tmp_path, fitted, monkeypatch):
+def test_the_python_code_of_the_readme_runs(root, tmp_path, fitted, monkeypatch):
     (snippet,) = (body for kind, body in FENCE.findall(README) if kind == 'python')
     (tmp_path / 'bags').symlink_to(root / 'bags')
     tc.save(fitted, tmp_path / 'unit.yaml')
@@ -216,7 +216,7 @@ def test_tc_read_reads_a_table_by_its_headings(tmp_path):
         read_log(table, imu=1)
 
 
-def test_a_further_thermometer_goes_in_by_its_name(arrays):
+def test_a_further_thermometer_is_passed_by_its_name(arrays):
     unit = replace(calibration(), sensors=('case', 'lid'))
     out = unit.correct(**arrays, lid=arrays['case'] + 1.0)
     assert np.isfinite(out.specific_force).all()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Statements of the pages on theory and architecture about the source agree with it."""
+"""Tables and file names on the pages about theory and architecture agree with the source."""
 
 import re
 
@@ -15,7 +15,7 @@ DOCS = ROOT / 'docs'
 SOURCES = sorted((ROOT / 'thermo_comp').rglob('*.py'))
 
 
-def test_the_page_s_table_of_packages_is_that_of_test_layers():
+def test_the_table_of_packages_on_the_page_equals_that_of_test_layers():
     text = (DOCS / 'architecture.md').read_text()
     rows = re.findall(r'^\| (\d) \| `(\w+)` \|', text, re.MULTILINE)
     assert {room: int(layer) for layer, room in rows} == LAYERS
@@ -32,15 +32,15 @@ def test_the_files_that_a_page_names_exist(page):
     text = (DOCS / page).read_text()
     for name in re.findall(r'[\w*/]+\.py\b', text):
         places = (ROOT, ROOT / 'thermo_comp', ROOT / 'test')
-        # A page names a file by its path, or by its name if the sentence has named the folder.
+        # A page names a file by its path, or by its name alone if the folder is named before.
         is_path = any(list(place.glob(name)) for place in places)
         assert is_path or any(path.name == name for path in SOURCES), name
 
 
-def test_the_table_of_the_response_has_every_group():
+def test_the_table_of_the_response_on_the_page_has_every_group():
     text = (DOCS / 'theory.md').read_text()
     shown = re.findall(r'^\| `(\w+)` \|', text, re.MULTILINE)
     columns = bank(('case',), {'case': -0.5}, (-9.0, 9.0))
-    # The curves of parts are sums of columns of the bank.
+    # The group `part` has no columns of its own: its curves are sums of other columns.
     groups = {'part', *(column.group for column in columns)}
     assert shown == [group for group in GROUPS if group in groups]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node withstands attacks by clocks, rates, many clients, links, full disks and logs."""
+"""Extreme clocks, sample rates, clients, links, killed writes and logs cause no wrong output."""
 
 import itertools
 import random
@@ -27,7 +27,7 @@ def of_kind(kind, cycle_s, path):
     return path
 
 
-def test_a_clock_topic_that_goes_back_or_pauses_changes_no_sample(peer, tmp_path):
+def test_a_clock_topic_that_goes_back_or_pauses_does_not_change_samples(peer, tmp_path):
     from diagnostic_msgs.msg import DiagnosticArray
     from ros_helpers import drive, node_in_thread, stamp_of, standing
     from rosgraph_msgs.msg import Clock
@@ -41,7 +41,7 @@ def test_a_clock_topic_that_goes_back_or_pauses_changes_no_sample(peer, tmp_path
         driver = drive(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
-        # /clock starts, goes back by an hour, is constant for five checks, jumps by a year, ends.
+        # /clock begins, falls by 1 h, is constant for five checks, jumps by a year, and ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
         for n, now_ns in enumerate(times):
@@ -63,7 +63,7 @@ def test_a_clock_topic_that_goes_back_or_pauses_changes_no_sample(peer, tmp_path
         assert node._loop.n_failures == 0
 
 
-def test_a_rate_that_goes_up_twentyfold_and_back_loses_no_sample(peer, tmp_path):
+def test_no_sample_is_lost_when_the_sample_rate_changes_by_a_factor_of_20(peer, tmp_path):
     from ros_helpers import drive, node_in_thread, stamp_of
     from sensor_msgs.msg import Imu
 
@@ -123,7 +123,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
             assert len(results) == len(given)
             for (key, value), result in zip(given.items(), results, strict=True):
                 is_good = value not in (str(tmp_path / 'none'), 'x' * 300, -1.0, 'imu')
-                # The node may refuse some of too many requests at once, with a reason.
+                # The node may refuse a request because too many arrive at a time.
                 assert result.successful == is_good or 'too many' in result.reason, (key, value)
         config = node._config
         for key in ('calibration_file', 'frame_id', 'transition_time', 'diagnostics_period'):
@@ -132,8 +132,8 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
         assert node._loop.n_failures == 0
 
 
-def test_links_exchanged_in_the_folder_never_lead_out_of_it(tmp_path):
-    # WHY: between the check of a path and its opening a folder can be replaced by a link.
+def test_a_link_that_replaces_a_folder_is_not_followed_out_of_it(tmp_path):
+    # A folder may be replaced by a link after the node has checked a path in it.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from thermo_comp.ros.reader import read
 
@@ -209,7 +209,7 @@ def test_a_write_killed_at_any_line_leaves_the_old_or_the_new_calibration(tmp_pa
     lines = [line.split() for line in done.stdout.splitlines()]
     *killed, last = lines
     assert last == ['0', 'new']
-    # The writing process was killed at every line, before and after the rename of its file.
+    # The writing process was killed at each line before and after the rename of the new file.
     assert len(killed) > 30
     assert {code for code, _ in killed} == {str(signal.SIGKILL.value)}
     assert [name for name, _ in itertools.groupby(name for _, name in killed)] == ['old', 'new']
@@ -217,7 +217,7 @@ def test_a_write_killed_at_any_line_leaves_the_old_or_the_new_calibration(tmp_pa
 
 
 @pytest.mark.parametrize('kind', ['ulog', 'dataflash'])
-def test_crafted_logs_are_refused_in_a_line_or_read(kind, tmp_path):
+def test_damaged_autopilot_logs_are_read_or_refused_with_one_line(kind, tmp_path):
     pytest.importorskip('pyulog' if kind == 'ulog' else 'pymavlink')
     from thermo_comp.convert.autopilot import read_autopilot
     from thermo_comp.convert.log import write_log

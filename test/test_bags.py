@@ -22,9 +22,9 @@ def test_sample_bags_are_small():
 
 
 @pytest.mark.parametrize('command', COMMANDS, ids=['fit', 'held_out'])
-def test_the_readme_s_commands_make_the_sample_bags(command, tmp_path, cli):
+def test_the_commands_in_the_readme_of_the_bags_make_the_sample_bags(command, tmp_path, cli):
     arguments = shlex.split(command)[1:]
-    # Simulate the content of the sample bags with the fastest compression, level 1.
+    # Level 1 is the fastest compression; it does not change the messages.
     arguments[arguments.index('--level') + 1] = '1'
     cli(*arguments, cwd=tmp_path)
     made = sorted((tmp_path / 'bags').rglob('*.mcap'))
@@ -44,7 +44,7 @@ def test_the_readme_s_commands_make_the_sample_bags(command, tmp_path, cli):
             before = shipped.columns.temperatures[name]
             np.testing.assert_array_equal(readings.stamp_ns, before.stamp_ns, err_msg=path.name)
             np.testing.assert_array_equal(readings.after, before.after, err_msg=path.name)
-            # Processors differ in the last bit of an exponential, but not in the rounded counts.
+            # Exponentials may differ in the last bit between processors; rounded counts do not.
             np.testing.assert_allclose(readings.celsius, before.celsius, rtol=1e-12)
 
 
@@ -56,7 +56,7 @@ def test_every_sample_of_the_sample_bags_can_be_corrected():
         assert (np.diff(block.accel_stamp_ns) > 0).all()
 
 
-def test_the_readme_s_counts_are_right():
+def test_the_numbers_in_the_readme_of_the_bags_are_right():
     for name, samples in (('fit/01.mcap', '18 236'), ('held_out.mcap', '15 407')):
         n = len(read_recording(ROOT / 'bags' / name).columns)
         assert n == int(samples.replace(' ', ''))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections beyond calibrated ranges follow tangents, with a claimed sd that grows."""
+"""Beyond calibrated ranges corrections follow tangents, and the claimed sd increases."""
 
 import math
 
@@ -16,7 +16,7 @@ from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
 from thermo_comp.unit.prediction import SlowUncertainty
 
 
-def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
+def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
     unit = calibration(
         axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
         response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
@@ -34,7 +34,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_clipped_and_widens_the_sd():
 
 
 def sd_at(unit, board, behind=0.0, force=0.0):
-    """Return the claimed sd of the x axis in a soak, without the noise of a message [m/s^2]."""
+    """Return the claimed sd of x in a soak, without noise; `behind`: lag of parts [K]."""
     correction = Correction(unit)
     layout = Layout(correction.memory)
     state = [0.0] * layout.width
@@ -46,26 +46,26 @@ def sd_at(unit, board, behind=0.0, force=0.0):
     return math.sqrt(a - correction.noise[0] + b * force + c * force**2)
 
 
-def test_beyond_the_range_lagging_parts_do_not_lower_the_claimed_sd():
-    # For an error of the thermometer the slopes of curve and lag cancel inside the range only.
+def test_beyond_the_range_curve_and_lag_do_not_cancel_in_the_claimed_sd():
+    # Inside the range the slopes of curve and lag over board temperature cancel; outside of it
+    # their sum is not known, and the claimed sd is that of the curve.
     bias = axis_set((0.0, 0.5), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bias), dynamic=regime_set(bias),
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
     assert sd_at(unit, 35.0) == pytest.approx(1e-6, rel=1e-6)
-    # The board is at 41 degC, 6 K outside a range of +-15 K.
+    # The board is at 41 degC, 6 K above the range of 20 +- 15 degC.
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0) == pytest.approx(0.5 * 6.0 / 300.0 * far, rel=1e-3)
 
 
-def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
+def test_beyond_the_range_bias_and_scale_slopes_do_not_cancel_in_the_claimed_sd():
     # At the upper edge the bias slope is 0.8 counts/K, which the scale slope cancels at a force of
     # 10 m/s^2.
     bent = axis_set((0.0, 0.5, 0.01), (1.0, -0.8 / 3000.0), residual_sd_m_s2=1e-6)
     unit = calibration(static=regime_set(bent), dynamic=regime_set(bent))
-    # Over the range of 30 K the bias slope varies with an sd of 0.02 * 30 / sqrt(12) counts/K,
-    # more on a coarse grid.
+    # The bias slope changes by 0.02 counts/K^2: over 30 K its sd is 0.02 * 30 / sqrt(12) counts/K.
     bends = 0.6 / math.sqrt(12.0)
     far = math.sqrt(1.0 + (6.0 / 15.0) ** 2)
     assert sd_at(unit, 41.0, force=10.0) == pytest.approx(bends * 6.0 / 300.0 * far, rel=0.05)
@@ -73,14 +73,14 @@ def test_beyond_the_range_slopes_that_cancel_do_not_lower_the_claimed_sd():
 
 
 def curves_at(unit, celsius):
-    """Return bias and relative scale of x in both sets at temperatures, shape (2, 2, n)."""
+    """Return bias and relative scale of x in both sets at n temperatures, shape (2, 2, n)."""
     return Correction(unit).curves.values(np.array(celsius))[:, ::3]
 
 
 BENT, WAVY = (0.0, 0.5, 0.01), (0.0, -0.3, 0.02, 1e-3)
 
 
-def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span():
+def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_range():
     static, dynamic = axis_set(BENT, (1.0, 1e-4, 2e-6)), axis_set(WAVY, (1.0, 5e-5), delta=2.0)
     unit = calibration(static=regime_set(static), dynamic=regime_set(dynamic))
     for edge, sign in ((35.0, 1.0), (5.0, -1.0)):
@@ -97,7 +97,7 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_span(
             np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_beyond_the_narrower_range_of_a_set_it_follows_the_other_set_and_then_a_tangent():
+def test_beyond_its_narrower_range_a_set_follows_the_curve_of_the_other_set():
     # The static set has a range of 5 to 35 degC, the dynamic set of 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
@@ -105,7 +105,7 @@ def test_beyond_the_narrower_range_of_a_set_it_follows_the_other_set_and_then_a_
     )
     celsius = [-20.0, -7.5, -3.0, 0.0, 5.0, 30.0, 35.0, 38.0, 42.5, 60.0]
     static, dynamic = curves_at(unit, celsius)[:, 0]
-    # Outside the common range the sets differ by as much as at its nearest edge, 5 or 30 degC.
+    # Outside the common range, 5 to 30 degC, the difference of the sets is that at its edge.
     np.testing.assert_allclose((dynamic - static)[:5], dynamic[4] - static[4], rtol=1e-12)
     np.testing.assert_allclose((dynamic - static)[5:], dynamic[5] - static[5], rtol=1e-12)
     wavy, bent = np.polynomial.Polynomial(WAVY), np.polynomial.Polynomial(BENT)
@@ -115,8 +115,8 @@ def test_beyond_the_narrower_range_of_a_set_it_follows_the_other_set_and_then_a_
 
 
 def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
-    # Bias and scale must change by the regressors times the change of the parameters. The dynamic
-    # range, 0 to 30 degC, ends before the static range at the top and after it at the bottom.
+    # A change of parameters must change bias and scale by regressors times change. The ranges are
+    # 5 to 35 degC (static) and 0 to 30 degC (dynamic).
     spline = CubicSpline((-15.0, 0.0, 15.0), (-4.0, 0.0, 6.0))
     exponential = Exponential(-1.0, (1.0,), (18.0,))
     splined = AxisSet(spline, Polynomial((1.0, 1e-4)))
@@ -159,14 +159,14 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
             line = correction.line(state, state, slow.at(state, nobody), 0.0)
             variances.append(line[list(VARIANCES), 0])
         assert (np.diff(variances, axis=0) > 0.0).all()
-        # The claimed sd covers the case that the true curve is constant beyond the edge.
+        # If the true curve is constant beyond the edge, the error is within the claimed sd.
         slopes = np.abs(correction.curves.slopes(np.array([35.0]))[0, :3, 0]) / correction.K[:, 0]
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 
 
-def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
-    # WHY: bags of soaks have rates below 0.1 K/min, and a ramp multiplied the variance of all
-    # parameters by several hundred, although the variance of the lag grew with the ramp already.
+def test_with_lags_the_sd_in_a_ramp_does_not_grow_with_the_distance_from_the_rates():
+    # WHY: after bags of soaks, with rates below 0.1 K/min, the variance in a ramp was multiplied
+    # by several hundred, although it already contained the variance of the lag in the ramp.
     axis = axis_set(residual_sd_m_s2=1e-5)
     soaks = regime_set(axis, rate_range_k_min=(-0.1, 0.1))
     sds = []
@@ -176,14 +176,13 @@ def test_a_ramp_after_soaks_alone_is_claimed_by_its_lags_only_once():
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # Without a lag the sd grows with the 19 half ranges by which the ramp exceeds the range of
-    # rates.
+    # The ramp of 2 K/min exceeds the range by 19 half ranges, which only a unit without lags adds.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 
-def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
-    # WHY: a temperature difference of 10 K, after bags with up to 0.1 K, is 100 times the range,
-    # the square of the difference 10000 times. The claimed sd was 0.1 g, for 10000 half ranges.
+def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity():
+    # WHY: after bags with lags up to 0.1 K, a lag of 10 K is 100 ranges, its square 10000 ranges.
+    # The claimed sd was that of 10000 ranges, 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
     state = np.zeros(Layout(correction.memory).width)
@@ -192,13 +191,14 @@ def test_a_squared_column_is_as_far_outside_its_range_as_its_quantity():
     assert 99.0 < excess.relative < 150.0
 
 
-def test_a_part_that_is_still_outside_the_range_widens_the_claimed_sd():
+def test_a_lagged_temperature_outside_the_range_increases_the_claimed_sd():
     bent = axis_set((0.0, 0.5, 0.01), residual_sd_m_s2=1e-6)
     unit = calibration(
         static=regime_set(bent), dynamic=regime_set(bent),
         response=(term('board', (-0.5, 0.0, 0.0), tau_s=600.0),),
     )  # fmt: skip
-    # The board is back at 33 degC; a part at 34 degC adds no variance, a part at 41 degC does.
+    # The board is at 33 degC, inside the range of 5 to 35 degC. A part at 34 degC adds no
+    # variance; a part at 41 degC does.
     assert sd_at(unit, 33.0, behind=-1.0) == pytest.approx(1e-6, rel=1e-6)
     bends = 0.6 / math.sqrt(12.0)
     assert sd_at(unit, 33.0, behind=-8.0) == pytest.approx(bends * 6.0 / 300.0, rel=0.05)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration and its file: round trip to the bit, and every refusal with its key."""
+"""Calibration files are read back to the bit, and messages on wrong entries name the key."""
 
 import contextlib
 import os
@@ -27,9 +27,9 @@ from thermo_comp.unit.functions import CubicSpline, Exponential
 from thermo_comp.unit.provenance import GroupEvidence
 
 REPOSITORY = Path(__file__).parents[1]
-# A bias must be within twice the full scale of 32767 counts.
+# The largest accepted bias is twice the full scale of 32767 counts.
 number = st.floats(-6.5e4, 6.5e4)
-# A scale function with coefficients up to 1e-6 stays far from 0 over 15 K.
+# With coefficients up to 1e-6 a scale function is near 1 over 15 K.
 small = st.floats(-1e-6, 1e-6)
 RICH = rich_calibration()
 
@@ -77,7 +77,7 @@ def calibrations(draw):
 
 @given(calibrations())
 @settings(max_examples=40, deadline=None)
-def test_the_round_trip_of_a_calibration_is_exact(value):
+def test_a_calibration_is_read_back_from_its_text_bit_for_bit(value):
     assert parse_calibration(dump_calibration(value).encode()) == value
 
 
@@ -92,12 +92,12 @@ def test_the_end_condition_of_the_dynamic_regime_is_in_the_file(end_condition):
 
 
 @pytest.mark.parametrize('serial', ['no', '1e5', '0x1F', '12', 'null', '~', 'a: b', '- x', '1:30'])
-def test_serials_that_look_like_numbers_or_dates_stay_texts(serial):
+def test_serials_like_numbers_or_dates_are_read_as_texts(serial):
     value = calibration(unit=replace(calibration().unit, serial=serial))
     assert parse_calibration(dump_calibration(value).encode()).unit.serial == serial
 
 
-def test_numbers_of_a_calibration_may_have_any_yaml_form():
+def test_numbers_of_a_calibration_may_have_any_yaml_notation():
     text = dump_calibration(calibration())
     text = text.replace('full_scale: 32767.0', 'full_scale: 32767')
     text = text.replace('cycle_time_s: 0.01', 'cycle_time_s: 1e-02')
@@ -172,7 +172,7 @@ TEXT = dump_calibration(RICH)
          "'board' or 'case', got 'both'"),
     ],
 )  # fmt: skip
-def test_refusals_name_key_value_and_rule(old, new, key, message):
+def test_the_message_on_a_wrong_entry_names_key_value_and_rule(old, new, key, message):
     assert old in TEXT
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(TEXT.replace(old, new, 1).encode(), 'unit.yaml')
@@ -203,10 +203,10 @@ def test_refusals_name_key_value_and_rule(old, new, key, message):
         (b'"\\ud800": 1', 'not valid YAML|invalid'),
     ],
 )
-def test_bytes_that_are_no_calibration_are_refused(content, message):
+def test_files_without_a_calibration_are_refused(content, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         parse_calibration(content)
-    # `rule` is the message for peers without access to the file: it quotes nothing of the file.
+    # `rule` is the message for peers on the network, which must not quote the file.
     rule, whole = caught.value.rule or str(caught.value), str(caught.value)
     quotes = whole.startswith('not valid YAML: ')
     assert re.fullmatch(r'not valid YAML( \(line \d+\))?', rule) if quotes else rule == whole
@@ -214,7 +214,7 @@ def test_bytes_that_are_no_calibration_are_refused(content, message):
 
 @given(st.data())
 @settings(max_examples=150, deadline=None)
-def test_any_damage_gives_a_calibration_or_a_calibration_error(data):
+def test_a_damaged_file_gives_a_calibration_or_a_calibration_error(data):
     content = bytearray(TEXT.encode())
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(content) - 1))
@@ -225,7 +225,7 @@ def test_any_damage_gives_a_calibration_or_a_calibration_error(data):
 
 
 def test_a_written_file_that_is_cut_at_any_line_is_refused():
-    # WHY: a copy that a reload reads half-way lost columns and covariance without a word.
+    # WHY: a reload of a file that was still being copied lost columns and covariance silently.
     lines = dump_calibration(rich_calibration()).splitlines(keepends=True)
     for n in range(1, len(lines)):
         with pytest.raises(CalibrationError, match='the file is cut'):
@@ -270,7 +270,7 @@ def test_paths_that_are_no_regular_file_are_refused(tmp_path):
             'static.x.bias_function',
             'must be finite over its range',
         ),
-        # The scale 1 - 0.05 t is 0.15 at 37 degC, and negative along its tangent beyond 37 degC.
+        # The scale 1 - 0.05 t is 0.15 at 37 degC; its continuation above 37 degC is negative.
         ('[1.0, 7.7e-05]', '[1.0, -0.05]', 'static.x.scale_function', 'must stay above 0.1'),
     ],
 )
@@ -299,7 +299,7 @@ def test_a_calibration_that_the_reader_refuses_is_not_written():
         ('diagonal', '', 'must hold 0 x'),
     ],
 )
-def test_a_posterior_of_wrong_content_is_refused(key, value, message):
+def test_a_posterior_with_wrong_numbers_is_refused(key, value, message):
     old = getattr(RICH.posterior, key)
     assert old in TEXT
     with pytest.raises(CalibrationError, match=message) as caught:
@@ -315,7 +315,7 @@ def test_a_posterior_of_another_size_is_refused():
         replace(RICH, response=(term('gradient'), *RICH.response))
 
 
-def test_former_names_of_columns_are_read():
+def test_files_with_former_column_names_are_read():
     text = TEXT
     for former, name in _FORMER.items():
         text = re.sub(rf'(group|kind): {name}(?=[,}}\n])', rf'\1: {former}', text)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The conversion of serialized messages gives the same bytes as rclpy."""
+"""The node's own conversion of serialized messages gives the same bytes as rclpy."""
 
 import struct
 
@@ -26,7 +26,7 @@ def process(stamp_ns, x, y, z):
 
 
 def cdr(order, stamp, frame, values):
-    """Serialize a stamped message of float64 values by the CDR standard, without rclpy."""
+    """Serialize a message of a header and float64 values by the CDR standard, without rclpy."""
     name = frame.encode() + b'\0'
     head = struct.pack(f'{order}iII', *stamp, len(name)) + name
     head += bytes(-len(head) % 8)
@@ -55,7 +55,7 @@ def convert(converter, *messages):
     frame=frames,
     values=st.lists(floats, min_size=3, max_size=3),
 )
-def test_counts_become_an_imu(order, sec, nanosec, frame, values):
+def test_counts_are_converted_to_an_imu_message(order, sec, nanosec, frame, values):
     converter = SampleConverter(Vector3Stamped)
     written = convert(converter, *[cdr(order, (sec, nanosec), frame, values)] * 2)
     assert written[0] == written[1]
@@ -69,8 +69,7 @@ def test_counts_become_an_imu(order, sec, nanosec, frame, values):
     fields = doubles(written[0])
     assert fields[25:28] == [z, x, y]
     assert b''.join(fields[28:]) == pack('<', covariance)
-    # A covariance that starts with -1 marks a field as not measured (REP 145); the quaternion is
-    # valid.
+    # A first covariance entry of -1 marks a quantity as not measured (REP 145).
     assert b''.join(fields[:4]) == pack('<', [0.0, 0.0, 0.0, 1.0])
     assert fields[4] == fields[16] == pack('<', [-1.0])
     assert not any(b''.join(fields[5:16] + fields[17:25]))
@@ -82,7 +81,7 @@ def test_counts_become_an_imu(order, sec, nanosec, frame, values):
     override=st.sampled_from(['', 'other_link']),
     values=st.lists(floats, min_size=37, max_size=37),
 )
-def test_other_fields_of_an_imu_pass_bit_for_bit(order, frame, override, values):
+def test_other_fields_of_an_imu_are_copied_bit_for_bit(order, frame, override, values):
     converter = SampleConverter(Imu, override)
     (written,) = convert(converter, cdr(order, (5, 7), frame, values))
     assert converter.traffic.n_fallback == (order == '>')
@@ -92,8 +91,8 @@ def test_other_fields_of_an_imu_pass_bit_for_bit(order, frame, override, values)
     assert b''.join(doubles(written)[25:28]) == pack('<', [z, x, y])
 
 
-def test_signalling_nan_survives_the_byte_swap():
-    # A signalling NaN may become quiet in a register; the bytes of the message must not change.
+def test_the_byte_swap_keeps_the_bits_of_a_signalling_nan():
+    # A processor may turn a signalling NaN into a quiet NaN when it loads it as a float64.
     payload = 0x7FF0_0000_0000_0001
     values = struct.pack('>37Q', *[payload] * 37)
     message = cdr('>', (1, 2), 'imu', [])[:] + values
@@ -103,8 +102,8 @@ def test_signalling_nan_survives_the_byte_swap():
     assert doubles(written)[:25] == [struct.pack('<Q', payload)] * 25
 
 
-def test_frame_ids_of_several_lengths_in_one_stream():
-    # WHY: the position of numbers in a message depends on the length of the driver's frame_id.
+def test_messages_with_frame_ids_of_different_lengths_are_converted():
+    # WHY: the positions of the numbers in a message depend on the length of the frame_id before.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))
@@ -116,12 +115,11 @@ def test_frame_ids_of_several_lengths_in_one_stream():
 
 @pytest.mark.parametrize('kind', [Vector3Stamped, Imu])
 @pytest.mark.parametrize('override', ['', 'other_link'])
-def test_messages_of_another_form_go_through_rclpy(kind, override):
+def test_messages_with_extra_bytes_are_converted_by_rclpy(kind, override):
     values = [float(k) for k in range(37 if kind is Imu else 3)]
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
-    # rclpy accepts bytes after the end of a message; the fast conversion leaves such a message to
-    # rclpy.
+    # Only rclpy converts messages with extra bytes at the end; both results must be equal.
     (expected,), (written,) = convert(fast, good), convert(slow, good + bytes(8))
     assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
     assert deserialize_message(written, Imu) == deserialize_message(expected, Imu)
@@ -138,7 +136,7 @@ def test_messages_of_another_form_go_through_rclpy(kind, override):
         cdr('<', (1, 2), 'imu', [1.0, 2.0, 3.0])[:-1],
     ],
 )  # fmt: skip
-def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad):
+def test_unreadable_messages_are_counted_and_later_messages_converted(bad):
     converter = SampleConverter(Vector3Stamped)
     good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
     written = convert(converter, good, bad, good)
@@ -147,8 +145,8 @@ def test_unreadable_bytes_are_counted_and_the_stream_goes_on(bad):
     assert converter.traffic.n_malformed == 1
 
 
-def test_the_first_message_may_be_any_bytes():
-    # WHY: a first message of one byte matched the initial empty layout (found by fuzzing).
+def test_an_unreadable_first_message_of_any_length_is_counted():
+    # WHY: the converter took a first message of one byte for a valid one (found by fuzzing).
     for n in range(40):
         converter = SampleConverter(Vector3Stamped)
         good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
@@ -156,7 +154,7 @@ def test_the_first_message_may_be_any_bytes():
         assert converter.traffic.n_malformed == 1
 
 
-def test_dropped_samples_give_no_message():
+def test_samples_without_a_correction_give_no_message():
     converter = SampleConverter(Vector3Stamped)
     good = cdr('<', (3, 4), 'imu', [1.0, 2.0, 3.0])
     for message in (good, good + bytes(8)):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line prints help, plain tables and valid JSON, and takes topics by name."""
+"""The command line: help, plain tables, valid JSON, and topics by name."""
 
 import json
 import os
@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope='session')
 def bag(tmp_path_factory, cli):
-    # 15 minutes at 10 Hz, less the 4 samples before the first board reading: 8996.
+    # 15 min at 10 Hz are 9000 samples, of which 4 precede the first board reading.
     path = tmp_path_factory.mktemp('cli') / 'bag'
     cli('simulate', '--profile', '20 4min, 30@2 6min', '--rate-hz', '10', '-o', path)
     return path
@@ -49,7 +49,7 @@ class TestHelp:
 
 
 class TestOutput:
-    def test_tables_pipe_as_plain_columns(self, bag, cli):
+    def test_tables_in_a_pipe_are_plain_columns(self, bag, cli):
         printed = cli('info', bag).stdout
         assert '\x1b' not in printed
         assert printed.isascii()
@@ -57,15 +57,13 @@ class TestOutput:
         row = next(line for line in printed.splitlines() if line.startswith('/accel/counts'))
         assert row.split() == ['/accel/counts', 'geometry_msgs/msg/Vector3Stamped', '8996']
 
-    def test_a_closed_pipe_is_no_error(self, bag):
+    def test_a_closed_pipe_gives_no_error(self, bag):
         command = f'{sys.executable} -m thermo_comp info {bag} | head -n 1'
         finished = ran('bash', '-c', f'set -o pipefail; {command}')
         assert finished.stderr == ''
         assert len(finished.stdout.splitlines()) == 1
 
-    def test_progress_is_shown_on_a_terminal_only_and_no_colour_where_none_is_wanted(
-        self, bag, cli
-    ):
+    def test_progress_is_shown_only_on_a_terminal_and_colour_only_without_no_color(self, bag, cli):
         for no_color in (False, True):
             text = on_a_terminal('info', str(bag), no_color=no_color)
             assert 'reading bag' in text
@@ -75,7 +73,7 @@ class TestOutput:
 
 
 def test_a_command_computes_in_one_thread():
-    # WHY: on two busy cores a fit took 16 times as long, as BLAS threads waited for each other.
+    # WHY: BLAS threads waited for each other; on two busy cores a fit took 16 times as long.
     code = (
         'import os, sys; from thermo_comp.cli import app; '
         "app.run = lambda _: print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS']); "
@@ -117,7 +115,7 @@ class TestPlay:
     def needs_ros(self):
         pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
 
-    def test_sends_every_message_under_the_requested_names(self, bag, cli):
+    def test_play_sends_every_message_under_the_requested_names(self, bag, cli):
         arguments = ('play', bag, '--rate', '0', '--wait', '0', '--json')
         finished = cli(*arguments, '--ros-args', '-r', '__ns:=/here')
         data = parsed(finished.stdout)
@@ -128,7 +126,7 @@ class TestPlay:
         assert data['unheard'] == sorted(data['unheard'])
         assert '/here/accel/counts had no subscriber' in finished.stderr
 
-    def test_ros_arguments_end_where_ros_says(self):
+    def test_ros_arguments_end_at_two_dashes(self):
         words = ['play', 'a', '--ros-args', '-r', 'x:=y', '--', '-q']
         assert split_arguments(words) == (['play', 'a', '-q'], ['-r', 'x:=y'])
         assert split_arguments(['info', '--', 'a']) == (['info', '--', 'a'], [])
@@ -148,9 +146,9 @@ class TestSimulate:
             ups.append(truth['up'])
             block = read_recording(path).columns
             measured = block.accel.mean(axis=0) / truth['scale_factor']
-            # Bias and drift of a MEMS unit change a mean sample by a few per cent of g at most.
+            # The bias of a MEMS unit and its drift are at most a few per cent of g.
             np.testing.assert_allclose(measured / 9.80665, truth['up'], atol=0.05)
-            # Readings of both thermometers precede the first sample, so every sample is corrected.
+            # Both thermometers have a reading before the first sample, so no sample is dropped.
             assert [temperature.after[0] for temperature in block.temperatures.values()] == [0, 0]
         assert len({tuple(up) for up in ups}) == 3
 
@@ -176,7 +174,7 @@ class TestInfo:
 
 
 class TestTopics:
-    """Inputs by name: from the command line, from a file, or chosen by their type."""
+    """Topics of inputs: from the command line, from a file, or chosen by their type."""
 
     @pytest.fixture
     def named(self, tmp_path):
@@ -221,7 +219,7 @@ class TestCells:
             (123456.7, '123457'),
         ],
     )  # fmt: skip
-    def test_cells_of_tables_as_text(self, cell, text):
+    def test_cells_of_tables_have_the_expected_text(self, cell, text):
         assert output.text(cell) == text
 
     def test_plain_values_are_json_without_nan(self):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration plays a bag over DDS without loss, and the output equals the offline run."""
+"""The demonstration plays a bag to the node without loss; node and offline run agree."""
 
 import re
 import sys
@@ -20,8 +20,8 @@ def needs_ros():
 
 
 @pytest.mark.slow
-def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
-    # The demo runs in this process, so that its fits of the sample bags serve other tests, too.
+def test_the_demonstration_prints_the_output_shown_on_the_pages(tmp_path, monkeypatch, capsys):
+    # The demo runs in this process, so that other tests can use its fits of the sample bags.
     import demo
 
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
@@ -30,12 +30,12 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv('COLUMNS', '80')
     assert demo.main() == 0
     printed = capsys.readouterr().out
-    # The demo finds its imports if it runs as a program.
+    # The demo must also run as a program of its own.
     script = ROOT / 'benchmarks' / 'demo.py'
     assert '--bags' in ran(sys.executable, script, '--help', check=True).stdout
     assert 'messages in 15407, messages out 15407' in printed
     assert 'bit for bit: yes' in printed
-    # The output is that of docs/cli.md and, in part, of the README, except for the speed.
+    # The output is shown on docs/cli.md and in part in the README; only the speed differs.
     speed = re.compile(r' in [\d.]+ s, \d+ times real time')
     assert is_alike(speed.sub('', printed), speed.sub('', shown()['demo'][1])), printed
     lines = speed.sub('', printed).splitlines()
@@ -51,8 +51,8 @@ def test_the_demonstration_runs_end_to_end(tmp_path, monkeypatch, capsys):
         rows = re.findall(rf'^{section} +([a-z ]+?) +\d+ +([\d.]+) ', printed, re.MULTILINE)
         assert len(rows) == 4, printed
         raw, node, two_sets, one_set = (float(rms) for _, rms in rows)
-        # A correction by one set lacks the difference of regimes, a correction by two sets lacks
-        # lags; noise is below 10 ug.
+        # One set cannot describe the difference of the regimes, and two sets no lags, so the node
+        # must be better than both; noise is below 10 ug.
         assert raw > 150.0
         assert node < 10.0
         assert node < 0.5 * min(one_set, two_sets)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bad input: one line on stderr, no file, exit code 1 (bad data) or 2 (bad command line)."""
+"""Wrong input gives one line on stderr, no output, exit code 1 (data) or 2 (command line)."""
 
 import re
 
@@ -103,7 +103,7 @@ class TestUsage:
         assert re.search(message, lines[0]), lines[0]
         assert list(tmp_path.iterdir()) == []
 
-    def test_no_command_prints_the_help(self, cli):
+    def test_thermo_comp_without_a_command_prints_the_help(self, cli):
         finished = cli(code=2)
         assert 'Usage: thermo_comp' in finished.stdout + finished.stderr
 
@@ -124,7 +124,7 @@ class TestBags:
     def test_a_missing_bag_is_refused(self, cli, unit, tmp_path):
         self.replayed(cli, unit, tmp_path / 'absent', r'absent: no such file or directory')
 
-    def test_garbage_with_the_suffix_of_a_bag(self, cli, unit, tmp_path):
+    def test_random_bytes_with_the_suffix_of_a_bag_are_refused(self, cli, unit, tmp_path):
         for name in ('noise.mcap', 'noise.db3', 'noise.bag'):
             (tmp_path / name).write_bytes(b'\x89MCAP0\r\n' + bytes(range(256)) * 8)
             self.replayed(cli, unit, tmp_path / name, name)
@@ -166,21 +166,21 @@ class TestFits:
 
 class TestEvaluations:
     def test_a_calibration_that_is_not_valid_gives_exit_code_1(self, cli, tmp_path):
-        # The unit reads exactly g at 20 degC; the calibration wrongly subtracts 50 mg by a delta.
+        # The unit reads exactly g; the calibration subtracts 50 mg by a wrong level of both sets.
         wrong = axis_set((0.0, 1.0), (1.0,), delta=150.0)
         sets = regime_set(wrong, wrong, wrong)
         save_calibration(calibration(static=sets, dynamic=sets), tmp_path / 'wrong.yaml')
         path = tmp_path / 'bag'
         stamps = START_NS + np.arange(3000) * 100_000_000
         level = np.tile([0.0, 0.0, 300.0 * 9.80665], (3000, 1))
-        # Add noise to x and y, because the compensator drops constant samples as stuck.
+        # Add noise to x and y, because the compensator rejects constant samples.
         level[:, :2] += np.random.default_rng(2).integers(-1, 2, (3000, 2))
         with BagWriter(path) as writer:
             writer.write_temperature(TOPICS.board, stamps[::10], np.full(300, 20.0))
             writer.write_counts(TOPICS.counts, stamps, level)
         finished = cli('evaluate', path, '-c', tmp_path / 'wrong.yaml', code=1)
         assert 'no better than raw: 48 mg RMS of |f| - g, ' in finished.stdout
-        # The calibration has no covariance, a delta of +10 mg and constant biases of -10 mg.
+        # The second calibration is right: its level of +10 mg cancels biases of -10 mg.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
         axes = Axes(*[AxisReference(300.0, -30.0)] * 3)
@@ -194,7 +194,7 @@ class TestEvaluations:
 
 
 @pytest.mark.usefixtures('no_figures')
-def test_a_torn_bag_is_processed_and_sets_the_exit_code(cli, unit, tmp_path):
+def test_a_cut_bag_is_processed_and_gives_exit_code_1(cli, unit, tmp_path):
     whole = bag(tmp_path / 'whole.mcap').read_bytes()
     torn = tmp_path / 'torn.mcap'
     torn.write_bytes(whole[:-100])

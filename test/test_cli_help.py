@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Examples of the help run, JSON output parses, --quiet prints nothing, lines fit a terminal."""
+"""Examples in the help texts work, also with --json and --quiet, and lines fit a terminal."""
 
 import re
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 
 
 def leaves(group, prefix=''):
-    """Return every command by the words that call the command, including commands of groups."""
+    """Return every command and sub-command by its full name, such as `group command`."""
     collected = {}
     for name, command in group.commands.items():
         inner = hasattr(command, 'commands')
@@ -29,9 +29,9 @@ EXAMPLES = [
     for name, command in COMMANDS.items()
     for line in re.findall(r'^ +(thermo_comp .*)$', command.help or '', re.MULTILINE)
 ]
-# Example that runs in a separate process; all other examples run in the process of the tests.
+# The example that is run in a separate process; the others run in the process of the tests.
 OF_ITS_OWN = 'thermo_comp evaluate held_out.mcap -c unit42.yaml --tolerance 100ug'
-# One example of each command that prints figures and ends; other files test other commands.
+# An example of each command that prints figures, except for those that other files test.
 WITH_JSON = {
     example.split()[1]: example
     for example in EXAMPLES
@@ -55,28 +55,28 @@ def test_every_command_has_an_example():
 
 
 @pytest.mark.parametrize('example', EXAMPLES)
-def test_the_example_runs_and_fits_a_pipe(example, desk, program):
+def test_the_example_runs_and_its_lines_are_short_enough(example, desk, program):
     finished = desk.run(example, program if example == OF_ITS_OWN else None)
     assert '\x1b' not in finished.stdout + finished.stderr
     long = [line for line in finished.stdout.splitlines() if len(line) > 80]
-    # The terminal wraps prose; a table must not be wrapped.
+    # A terminal may wrap lines of prose, but not lines of a table.
     assert [line for line in long if not line.startswith('- ') and '  ' in line.strip()] == []
 
 
 @pytest.mark.parametrize('example', WITH_JSON)
-def test_json_is_one_object_and_nothing_else(example, desk):
+def test_with_json_the_command_prints_one_object_only(example, desk):
     finished = desk.run(f'{example} --json -q')
     assert finished.stderr == ''
     assert parsed(finished.stdout)
 
 
 @pytest.mark.parametrize('example', QUICK)
-def test_quiet_says_nothing(example, desk):
+def test_with_quiet_the_command_prints_nothing(example, desk):
     finished = desk.run(f'{example} -q')
     assert (finished.stdout, finished.stderr) == ('', '')
 
 
-def test_commands_that_print_figures_have_json():
+def test_every_command_that_prints_figures_has_the_option_json():
     lacking = {
         name for name, page in COMMANDS.items() if not any('--json' in p.opts for p in page.params)
     }
@@ -84,20 +84,20 @@ def test_commands_that_print_figures_have_json():
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_help_cuts_no_name(name, cli, monkeypatch):
+def test_the_help_prints_complete_names(name, cli, monkeypatch):
     # WHY: a terminal of 80 columns showed `--reference-tempera…`, an incomplete option name.
     monkeypatch.setattr(rich_utils, 'MAX_WIDTH', 80)
     text = cli(*name.split(), '--help').stdout
     assert '…' not in text
     assert max(map(len, text.splitlines())) <= 80
-    # The help printer takes square brackets as mark-up and drops their content, which leaves ' .'.
+    # The library that prints the help removes text in square brackets, which would leave ' .'.
     assert not re.search(r' \.\s', text)
     assert text == cli(*name.split(), '-h').stdout
     for parameter in COMMANDS[name].params:
         assert all(option in text for option in parameter.opts if option.startswith('-')), text
 
 
-def test_every_option_says_what_it_is_for():
+def test_every_option_has_a_help_text():
     bare = [
         f'{name} {parameter.name}'
         for name, command in COMMANDS.items()

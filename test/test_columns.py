@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of the thermal response have the values computed by hand, and limited memory."""
+"""The columns of the thermal response: their number, their lags, values computed by hand."""
 
 import math
 
@@ -37,7 +37,7 @@ def by_group(columns):
     return {name: len(group) for name, group in groups.items()}
 
 
-def test_the_bank_of_columns_by_group():
+def test_the_bank_of_columns_has_the_expected_number_per_group():
     assert tuple(60.0 * 2.0**k for k in range(8)) == BANK_TAUS
     assert pytest.approx([60.0 * 2.0 ** (k / 2) for k in range(15)]) == FINE_TAUS
     assert by_group(bank()) == {
@@ -51,21 +51,21 @@ def test_the_bank_of_columns_by_group():
         'gradient_even': 42, 'play': 20,
     }  # fmt: skip
     assert len(set(bank(('case', 'tip')))) == len(bank(('case', 'tip')))
-    # Knees lie within the temperatures of the bags, for the board and for parts that lag it.
+    # Knees are within the temperature span of the bags, for the board and for parts that lag it.
     assert 'bend' not in by_group(bank(span_k=(-0.4, 0.4)))
     bends = [column for column in bank(span_k=(-10.0, 2.0)) if column.group == 'bend']
     assert len(bends) == 12 * len({column.tau_s for column in bends}) == 96
     assert all(-10.0 < column.knee_k < 2.0 for column in bends)
 
 
-def test_gradient_even_about_rest_is_even_about_rest():
+def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     warm = bank(('case', 'tip'), {'case': -0.5, 'tip': 0.0})
     change = [column for column in warm if column.group == 'gradient_even_about_rest']
     assert by_group(warm)['gradient_even_about_rest'] == 21
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
     states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
-    # The three states have a gradient of -0.5 K, as at rest, and 1.5 K above and below -0.5 K.
+    # Gradients of three states: -0.5 K, the gradient at rest, and 1.5 K above and below it.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
     assert np.all(values[:, 0] == 0.0)
@@ -74,7 +74,7 @@ def test_gradient_even_about_rest_is_even_about_rest():
     np.testing.assert_allclose(slopes[:, 1], -slopes[:, 2])
 
 
-def test_memory_that_the_bank_of_columns_needs():
+def test_the_memory_has_the_lags_and_plays_that_the_columns_need():
     spec = memory_of(bank(('case', 'tip')), ('case', 'tip'))
     assert spec.inputs == ('board', 'case', 'tip')
     taus = {
@@ -88,7 +88,7 @@ def test_memory_that_the_bank_of_columns_needs():
         memory_of(bank(('tip',)))
 
 
-def test_each_value_of_a_column_by_hand():
+def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
     columns = [
         Column('gradient', 'gradient', 'tip', **WIDE),
         Column('rate', 'rate', **WIDE),
@@ -121,20 +121,20 @@ def test_each_value_of_a_column_by_hand():
         0.25, 0.49 * 3.0, 0.7, 0.5 * 3.0, 1.0, 0.5, 0.0,
     ]  # fmt: skip
     assert values == pytest.approx(expected)
-    # A column `product` limits t to the calibrated temperatures; a column `board` has no limit.
+    # In a product with t, t is limited to calibrated temperatures; the column `board` has no t.
     at_edge = ColumnTable(columns, spec, 20.0, (-10.0, 22.0)).values(state)[:, 0]
     assert at_edge[4] == pytest.approx(-0.6)
     assert at_edge[2] == 0.5
 
 
-def test_a_bend_moves_with_the_board_and_its_lag():
+def test_a_bend_has_slopes_over_board_temperature_and_lag():
     columns = [Column('bend', 'bend', tau_s=tau, knee_k=2.0, **WIDE) for tau in (0.0, 60.0)]
     spec = memory_of(columns)
     table = ColumnTable(columns, spec, 20.0)
     state = np.zeros((Layout(spec).width, 1))
     lag = Layout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
-    # A bend depends on its quantity of the thermal state and on the board temperature.
+    # Slopes over the quantity of each column (t, lag), then over the board temperature.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
     state[BOARD] = 21.0
     assert not np.any(table.slopes(state))
@@ -142,7 +142,7 @@ def test_a_bend_moves_with_the_board_and_its_lag():
     assert flow.slopes(np.zeros((7, 1)))[1] is None
 
 
-def test_a_new_kind_of_column_is_one_class(monkeypatch):
+def test_a_new_kind_of_column_needs_one_class_only(monkeypatch):
     class RateSquare(Term):
         kind, formula, order, form = 'rate_square', '(dT_s/dt)^2', 2, TERMS['square'].form
 
@@ -162,7 +162,7 @@ def test_a_new_kind_of_column_is_one_class(monkeypatch):
     rate, variance = state[place : place + 2]
     line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
     assert line[8] == pytest.approx(3e6 * rate**2) == pytest.approx(300.0, rel=0.02)
-    # d(bias)/d(rate) = 2 * 3e6 rate; 300 counts per m/s^2.
+    # d(bias)/d(rate) is 2 * 3e6 * rate [counts], at 300 counts per m/s^2.
     by_rate = (2.0 * 3e6 * rate / 300.0) ** 2 * variance
     assert line[VARIANCES[2]] - correction.noise[2] == pytest.approx(by_rate, rel=1e-6)
     with pytest.raises(ValueError, match=r'keep the largest effect of the column within'):
@@ -171,7 +171,7 @@ def test_a_new_kind_of_column_is_one_class(monkeypatch):
 
 @given(st.lists(st.floats(-60.0, 60.0), min_size=5, max_size=5))
 @settings(max_examples=50, deadline=None)
-def test_columns_of_one_state_have_the_bits_of_those_of_many(boards):
+def test_columns_of_one_state_and_of_many_states_have_equal_bits(boards):
     columns = bank(('case', 'tip'), span_k=(-10.0, 10.0))
     tracker = ThermalTracker(DetectorSettings(), memory_of(columns, ('case', 'tip')))
     rows = []

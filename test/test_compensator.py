@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The compensator against hand calculations; samples one by one give the bits of blocks."""
+"""The compensator agrees with hand calculations; single samples and blocks give equal bits."""
 
 import math
 import random
@@ -29,12 +29,12 @@ from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.correction import Correction
 
 UNIQUE = [0, 1, 2, 4, 5, 8]
-#: Variance of a sample [(m/s^2)^2]: density^2 / cycle, plus rounding with a carried remainder.
+#: Variance of a sample [m^2/s^4]: density^2 / cycle, plus rounding with a carried remainder.
 NOISE = 1e-4**2 / 0.01 + (1.0 / 6.0) / 300.0**2
 
 
 def warm(compensator, celsius=20.0, case=None, *, until_s=1, start_s=0, flicker=0.0):
-    """Feed steady readings; a `flicker` [K] keeps the thermometer from counting as stuck."""
+    """Push constant readings; with a `flicker` [K] the thermometer does not count as stuck."""
     for second in range(start_s, until_s):
         noise = flicker * (-1) ** second
         compensator.push('board', second * SECOND_NS, celsius + noise)
@@ -63,8 +63,8 @@ def assert_same(blocks, rows, index):
 
 
 def test_signed_counts_and_the_printed_equations():
-    # Counts at +g and -g: offset = sum / 2, scale = difference / 2. Equations 3 and 4 of the paper
-    # exchange sum and difference.
+    # From counts at +g and -g: offset = sum / 2, scale = difference / 2. The paper prints Eq. (3)
+    # and (4) with sum and difference exchanged.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
     axis = AxisReference((plus - minus) / 2.0 / GRAVITY, (plus + minus) / 2.0)
     compensator = Compensator(calibration(axes=Axes(*[axis] * 3)))
@@ -73,7 +73,7 @@ def test_signed_counts_and_the_printed_equations():
     assert corrected == pytest.approx((GRAVITY, -GRAVITY, 0.0), abs=1e-12)
 
 
-def test_every_term_of_the_correction_by_hand():
+def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
     # The expected values are the formula of the static set at t = 10 K without a gradient or rate.
     axis = axis_set((0.0, 0.5, 0.01), (1.0, 1e-4), delta=2.0)
     unit = calibration(
@@ -88,19 +88,19 @@ def test_every_term_of_the_correction_by_hand():
     bias = 7.0 + 2.0 + 0.5 * 10.0 + 0.01 * 100.0
     scale = 300.0 * (1.0 + 1e-4 * 10.0)
     a, b, c = ((n - bias) / scale for n in (1000.0, -500.0, 3000.0))
-    # At constant temperature the thermometer is exact, and only rounding remains.
+    # At constant temperature the temperature estimate is exact, so the tolerance is rounding.
     assert (x, y, z) == pytest.approx((a, 1e-3 * a + b, 2e-3 * a - 3e-3 * b + c), abs=1e-12)
 
 
-#: All examples use one calibration, which no example changes.
+#: Calibration of all examples; no example changes it.
 RICH = rich_calibration()
 
-#: Values that a converter never gives, its limits, and zero; most samples are between the limits.
+#: Values of a few samples: not finite, limits of a 16-bit converter, zero, the smallest number.
 STRANGE = (math.nan, math.inf, -math.inf, 32767.0, -32768.0, 0.0, -0.0, 5e-324)
 
 
 def event_list(seed):
-    """Make messages in any order: late, repeated, jumping back, not finite, saturated."""
+    """Make random messages: late, repeated, with falling stamps, not finite, saturated."""
     rng = random.Random(seed)
     events = []
     stamp = rng.choice([0, rng.randrange(2**60)])
@@ -123,7 +123,7 @@ def event_list(seed):
     return events
 
 
-#: Hypothesis draws only the seed of a list: drawing each message takes as long as the test.
+#: Hypothesis draws the seed of a list, because drawing each message would double the time.
 event_lists = st.integers(0, 2**64 - 1).map(event_list)
 
 
@@ -136,14 +136,14 @@ def at_seconds(*events):
     ]
 
 
-# In the examples an applied reading, or a reading a day later, shows that waiting readings are of
-# another clock.
+# In the examples a reading that was applied, or a reading one day later, shows that stored
+# readings have stamps of another clock.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
 @example(at_seconds('B', 12, 'B', 7.1, 'A', 7.1, 'B', 6.1), 1, 0.0)
 @settings(max_examples=40, deadline=None)
-def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, transition_s):
+def test_blocks_of_any_size_give_the_bits_of_single_samples(events, chunk, transition_s):
     config = CompensatorConfig(transition_time_s=transition_s, case_timeout_s=2.0)
     streamed = Compensator(RICH, config)
     whole = Compensator(RICH, config)
@@ -159,7 +159,7 @@ def test_batch_has_the_bits_of_the_stream_however_it_is_cut(events, chunk, trans
 
 
 def assert_sound(block, counters, events):
-    """Check that the output is finite, in order and counted for any input."""
+    """Check that the output is finite and in order, and that the counters agree with it."""
     assert np.isfinite(block.specific_force).all()
     assert np.isfinite(block.angular_rate).all()
     assert np.isfinite(block.angular_rate_variance).all()
@@ -174,20 +174,20 @@ def assert_sound(block, counters, events):
     assert np.count_nonzero(backward) <= counters.n_time_jumps
 
 
-def test_an_unknown_regime_widens_the_covariance():
+def test_the_covariance_in_an_unknown_regime_contains_the_difference_of_the_sets():
     unit = calibration(dynamic=regime_set(axis_set(delta=3.0)))
     compensator = Compensator(unit)
     warm(compensator, until_s=1)
     early = compensator.process(SECOND_NS // 2, 0.0, 0.0, 1.0)
     warm(compensator, until_s=1500, start_s=1)
     late = compensator.process(1500 * SECOND_NS, 0.0, 0.0, 1.0)
-    # The static and the dynamic set differ by 3 counts = 0.01 m/s^2 on x, and are equal on y.
+    # The static and the dynamic set differ by 3 counts (0.01 m/s^2) on x, and are equal on y.
     assert early[3] == pytest.approx(NOISE + 0.01**2, rel=1e-6)
     assert early[6] == pytest.approx(NOISE, rel=1e-6)
     assert late[3] == pytest.approx(NOISE, rel=1e-6)
 
 
-def test_nothing_is_published_before_a_temperature_or_long_after_the_last():
+def test_samples_before_the_first_temperature_or_20_s_after_the_last_are_not_published():
     compensator = Compensator(thermal_calibration(), CompensatorConfig(temperature_timeout_s=20.0))
     assert compensator.process(1, 0.0, 0.0, 1.0) is None
     compensator.push('board', 2, 20.0)
@@ -206,15 +206,15 @@ def test_nothing_is_published_before_a_temperature_or_long_after_the_last():
 @pytest.mark.parametrize(
     'run', [lambda *given: stream(*given)[1], lambda *given: batch(*given).index.tolist()]
 )
-def test_a_stamp_that_leaps_ahead_needs_a_second_stamp(run):
-    # WHY: a single stamp 20 s ahead made all later samples count as late and reset the memory.
+def test_a_sample_with_a_stamp_20_s_ahead_is_dropped_unless_the_next_stamp_agrees(run):
+    # WHY: after one stamp 20 s ahead all later samples counted as late, and lags were reset.
     leap, step = 20 * SECOND_NS, SECOND_NS // 100
     usual = np.arange(1, 6) * step
     for stamps, kept in (
         (np.insert(usual, 2, usual[2] + leap), [0, 1, 3, 4, 5]),
-        # A gap of 20 s between samples is accepted from the second stamp after the gap on.
+        # After a gap of 20 s the first sample is dropped, and the samples after it are used.
         (np.where(np.arange(5) < 2, usual, usual + leap), [0, 1, 3, 4]),
-        # Damaged stamps are dropped: two separate stamps, and two stamps in falling order.
+        # Samples with wrong stamps are dropped: two apart, or two in falling order.
         (np.insert(usual, [1, 3], usual[[1, 3]] + leap), [0, 2, 3, 5, 6]),
         (np.array([1, 2 + leap, 1 + leap, 3, 4]), [0, 3, 4]),
     ):
@@ -226,7 +226,7 @@ def test_a_stamp_that_leaps_ahead_needs_a_second_stamp(run):
 
 
 @pytest.mark.parametrize('is_read', [False, True])
-def test_a_reading_with_a_near_stamp_confirms_a_leap_of_a_sample(is_read):
+def test_a_reading_with_a_near_stamp_confirms_a_sample_20_s_ahead(is_read):
     compensator = Compensator(thermal_calibration())
     compensator.push('board', 0, 20.0)
     assert compensator.process(1, 1.0, 2.0, 3.0) is not None
@@ -235,7 +235,7 @@ def test_a_reading_with_a_near_stamp_confirms_a_leap_of_a_sample(is_read):
     assert (compensator.process(20 * SECOND_NS, 2.0, 3.0, 4.0) is not None) == is_read
 
 
-def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
+def test_at_most_4096_readings_of_another_clock_are_stored():
     compensator = Compensator(calibration())
     for k in range(10_000):
         compensator.push('board', 10**18 + k, 20.0)
@@ -245,15 +245,15 @@ def test_readings_of_a_foreign_clock_do_not_fill_the_memory():
 
 @pytest.mark.parametrize('n_before', [0, 3])
 @pytest.mark.parametrize('ahead_s', [0, 2])
-def test_readings_from_a_long_time_without_samples_are_all_applied(n_before, ahead_s):
-    """Temperatures at 20 Hz that arrive 102 s before the samples are applied in order."""
+def test_all_readings_of_102_s_without_samples_are_applied(n_before, ahead_s):
+    """Readings at 20 Hz over 120 s, which precede the samples, are applied in order."""
     first = [('accel', k * SECOND_NS // 100, (1.0, 2.0, 2930.0)) for k in range(1, 1 + n_before)]
     readings = [
         (name, k * SECOND_NS // 20, 20.0 + 1e-4 * k + 1e-3 * (k % 7))
         for k in range(4, 20 * 120)
         for name in ('board', 'case')
     ]
-    # With `ahead_s` = 2 some readings have later stamps than the first sample after the readings.
+    # If `ahead_s` is 2, readings of 2 s have later stamps than the first sample after them.
     after_ns = (120 - ahead_s) * SECOND_NS
     last = [('accel', after_ns + k * SECOND_NS // 100, (1.0, 2.0 + k, 2930.0)) for k in range(5)]
     block, live = (Compensator(replace(rich_calibration(), gyroscope=None)) for _ in range(2))
@@ -270,7 +270,7 @@ def test_readings_from_a_long_time_without_samples_are_all_applied(n_before, ahe
     assert block.counters.n_board_rejected == block.counters.n_case_rejected == 0
 
 
-def test_flush_lets_the_regime_go_on_without_samples():
+def test_flush_updates_the_regime_without_samples():
     compensator = Compensator(calibration())
     warm(compensator, until_s=1500)
     compensator.flush(1500 * SECOND_NS)
@@ -278,8 +278,8 @@ def test_flush_lets_the_regime_go_on_without_samples():
     assert flags[-1] == (1499 * SECOND_NS, False)
 
 
-def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
-    # The static and the dynamic set differ by 0.025 counts = 8.5 ug at any temperature.
+def test_another_transition_time_during_a_transition_causes_no_step_of_the_output():
+    # The static and the dynamic set differ by 0.025 counts (8.5 ug) at any temperature.
     unit = calibration(dynamic=regime_set(axis_set(delta=0.025)))
     config = CompensatorConfig(
         transition_time_s=100.0, stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0
@@ -299,9 +299,9 @@ def test_reconfigure_in_the_middle_of_a_transition_makes_no_step():
     assert after == pytest.approx(before, abs=1e-9)
 
 
-def test_another_setting_does_not_end_a_stop_by_the_check_of_gravity(rng):
-    # WHY: any change of a parameter began the check of |f| anew, and samples were published for
-    # another 13 s at rest, and without end in motion.
+def test_a_new_transition_time_does_not_restart_the_check_of_gravity(rng):
+    # WHY: after a change of any parameter the check of |f| began again, and samples with a wrong
+    # |f| were published for 13 s at rest, and without a limit in motion.
     compensator = Compensator(calibration(), CompensatorConfig())
 
     def published(seconds, size):
@@ -322,13 +322,13 @@ def test_another_setting_does_not_end_a_stop_by_the_check_of_gravity(rng):
     other = replace(compensator.config, transition_time_s=50.0)
     compensator.take_over(compensator.thermal.model, other)
     assert published(range(65, 70), 1.3 * count_per_g) == 0
-    # Another tolerance is a new check.
+    # A change of the tolerance restarts the check.
     other = replace(other, gravity_tolerance_m_s2=5.0)
     compensator.take_over(compensator.thermal.model, other)
     assert published(range(70, 75), 1.1 * count_per_g) > 0
 
 
-def test_another_setting_does_not_end_a_stop_by_the_rate_of_samples(rng):
+def test_a_new_transition_time_does_not_restart_the_check_of_the_sample_rate(rng):
     compensator = Compensator(calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.0))
     warm(compensator, until_s=10)
     step_ns = round(0.25e9 * compensator.calibration.unit.cycle_time_s)
@@ -339,7 +339,7 @@ def test_another_setting_does_not_end_a_stop_by_the_rate_of_samples(rng):
         samples = zip(stamps, *force.T, strict=True)
         return sum(compensator.process(*sample) is not None for sample in samples)
 
-    # Samples that come at four times the rate of the converter are refused after a burst.
+    # Samples at four times the converter's rate are published for a short time, then refused.
     assert published(3) > 0
     assert published(4) == 0
     other = replace(compensator.config, transition_time_s=50.0)
@@ -349,7 +349,7 @@ def test_another_setting_does_not_end_a_stop_by_the_rate_of_samples(rng):
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, 1e200])
 def test_output_that_is_not_finite_is_never_published(monkeypatch, bad):
-    # The compensator drops output that is not finite, even if the calibration passed its checks.
+    # `broken` gives output that is not finite, which no accepted calibration should give.
     line = Correction.line
 
     def broken(self, start, end, slow, excess):

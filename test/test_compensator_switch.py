@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Switches of sets and calibrations between samples cause no step and lose no sample."""
+"""Switches between sets cause no step of the output; a swap of calibrations loses no sample."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from thermo_comp.online.compensator import Compensator, CompensatorConfig
 from thermo_comp.unit.calibration import Axes, AxisReference
 
 
-def test_a_switch_of_sets_makes_no_step():
-    # Sets that differ by 5 counts = 1.7 mg blend over 300 s: 0.28 ug per sample at 20 Hz.
+def test_a_switch_of_sets_causes_no_step():
+    # The output changes by 5 counts = 1.7 mg within 300 s, at most 0.28 ug per sample at 20 Hz.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
     compensator = Compensator(
         unit, CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
@@ -33,7 +33,7 @@ def test_a_switch_of_sets_makes_no_step():
 
 @pytest.mark.parametrize(
     ('delta', 'given_s', 'expected_s'),
-    # Sets that differ by 0.3 counts = 1e-3 m/s^2 = 102 ug take 102 s to blend at 1 ug/s.
+    # The blend is limited to 1 ug/s: 102 s for sets that differ by 0.3 counts = 102 ug.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
 def test_a_switch_of_sets_that_differ_much_takes_longer(delta, given_s, expected_s):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A converted table accounts for every row, and its bag gives the values of the table."""
+"""Conversion of a table: each row is in the bag or counted, and values are unchanged."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def table(path, n=400, scale=1.0):
-    """Write a log of a unit at rest; temperature cells repeat a reading until the next."""
+    """Write a log of a unit at rest; temperature cells repeat the last reading."""
     rng = np.random.default_rng(1)
     columns = {
         'ms': 1000 + 10 * np.arange(n),
@@ -51,7 +51,7 @@ def column_map(**changes):
     return build(ColumnMap, {**data, **changes})
 
 
-def test_a_table_is_unchanged_by_a_round_trip_through_a_bag(tmp_path):
+def test_a_bag_converted_from_a_table_has_the_values_of_the_table(tmp_path):
     path, columns = table(tmp_path / 'log.csv')
     gyro = {'columns': ['wx', 'wy', 'wz'], 'unit': 'deg/s'}
     report = write_log(table_log(path, column_map(gyro=gyro)), tmp_path / 'bag')
@@ -67,17 +67,17 @@ def test_a_table_is_unchanged_by_a_round_trip_through_a_bag(tmp_path):
     np.testing.assert_allclose(
         np.degrees(block.imu.angular_velocity),
         np.column_stack([columns[k] for k in ['wx', 'wy', 'wz']]),
-        rtol=1e-14,  # conversions to rad/s and back to deg/s round once each
+        rtol=1e-14,  # rounding of the conversions to rad/s and back to deg/s
     )
-    # The Imu marks the missing orientation by -1, and the unknown covariance of the rate by 0.
+    # sensor_msgs/Imu: -1 for a missing orientation, 0 for an unknown covariance of the rate.
     assert block.imu.orientation_covariance[:, 0].tolist() == [-1.0] * 400
     assert not block.imu.angular_velocity_covariance.any()
-    # Only changed temperatures become messages: 4 of the case, 10 of the board.
+    # A temperature becomes a message if it changes: 4 times for the case, 10 times for the board.
     case, board = block.temperatures['case'], block.temperatures['board']
     assert case.celsius.tolist() == [20.0, 20.5, 21.0, 21.5]
     assert case.stamp_ns.tolist() == [(1000 + 1000 * k) * 10**6 for k in range(4)]
     assert len(board.celsius) == report.messages['board'] == 10
-    # A reading precedes the sample with its stamp, so that the node applies the reading to it.
+    # A reading precedes the sample with an equal stamp, so that it applies to this sample.
     assert case.after.tolist() == [0, 100, 200, 300]
     assert (report.rows, report.messages['accel']) == (400, 400)
     assert report.rate_hz == pytest.approx(100.0)
@@ -85,7 +85,7 @@ def test_a_table_is_unchanged_by_a_round_trip_through_a_bag(tmp_path):
     assert 'gravity is 1 g' in report.inferred_unit
 
 
-def test_counts_become_an_imu_with_a_sensitivity(tmp_path):
+def test_counts_with_a_stated_sensitivity_become_imu_messages(tmp_path):
     path, columns = table(tmp_path / 'log.csv', scale=2048.0)
     accel = {'columns': ['ax', 'ay', 'az'], 'unit': 'counts', 'output': 'imu'}
     write_log(
@@ -93,7 +93,7 @@ def test_counts_become_an_imu_with_a_sensitivity(tmp_path):
     )
     block = read_recording(tmp_path / 'bag').columns
     np.testing.assert_allclose(block.accel[:, 0], columns['ax'] * STANDARD_GRAVITY / 2048.0)
-    # A stated sensitivity is compared with |a| at rest, as a stated unit is.
+    # A sensitivity that contradicts |a| at rest is refused.
     wrong = table_log(path, column_map(accel={**accel, 'counts_per_g': 16384.0}))
     with pytest.raises(RecordingError, match=r'16384 counts/g are stated$'):
         write_log(wrong, tmp_path / 'other')
@@ -122,9 +122,9 @@ def test_an_offset_of_raw_words_is_subtracted(tmp_path):
 
 
 @pytest.mark.parametrize('unit', ['ms', 'us'])
-def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
-    # WHY: Arduino's micros() begins again at 0 after 71.6 min, and a fit read only a part of a
-    # longer log.
+def test_times_of_a_counter_of_32_bits_continue_after_its_overflow(tmp_path, unit):
+    # WHY: Arduino's micros() overflows to 0 after 71.6 min, and of a longer log the fit used only
+    # the part before the overflow.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     ticks = [(2**32 - 2000 + 10 * k) % 2**32 for k in range(400)]
@@ -136,7 +136,7 @@ def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
     report = write_log(log, tmp_path / 'bag')
     assert (report.findings['continued'].count, report.findings['continued'].lines) == (1, (202,))
     assert report.findings['backwards'].count == 0
-    # A clock that is set back from a small value is not a counter that begins again.
+    # A clock that falls from a value far below 2^32 is not taken for an overflow.
     lines[200] = lines[200].replace(lines[200].partition(',')[0], '1000.0')
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'other')
@@ -144,7 +144,7 @@ def test_a_counter_of_32_bits_continues_at_its_end(tmp_path, unit):
 
 
 def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
-    # WHY: in the bag all readings after a restart of the clock stood before all samples after it.
+    # WHY: after a restart of the clock, the bag had all readings first and then all samples.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in range(201, 401):
@@ -153,24 +153,25 @@ def test_readings_stay_among_samples_after_a_restart_of_the_clock(tmp_path):
     path.write_text('\n'.join(lines))
     write_log(table_log(path, column_map()), tmp_path / 'bag')
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']
-    # The board temperature changes once in 40 rows. A reading precedes the sample of its row.
+    # The board temperature changes every 40 rows; a reading precedes the sample of its row.
     assert board.after.tolist() == list(range(0, 400, 40))
 
 
-def test_readings_that_are_no_temperatures_are_left_out(tmp_path):
-    # WHY: 46 readings of -127 degC (DS18B20 without contact) raised an error from 0.02 to 0.68 mg.
+def test_readings_of_minus_127_degc_are_left_out(tmp_path):
+    # WHY: 46 readings of -127 degC (DS18B20 without contact) increased the error of a fit from
+    # 0.02 to 0.68 mg.
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     for k in (50, 51, 300):
         lines[k] = lines[k].rpartition(',')[0] + ',-127'
     path.write_text('\n'.join(lines))
     report = write_log(table_log(path, column_map()), tmp_path / 'bag')
-    assert report.findings['impossible'].count == 2  # a reading held for two rows counts once
+    assert report.findings['impossible'].count == 2  # a reading repeated in two rows counts once
     board = read_recording(tmp_path / 'bag').columns.temperatures['board']
     assert board.celsius.min() == 25.0
 
 
-def test_every_odd_row_is_accounted_for(tmp_path):
+def test_every_row_with_a_fault_is_counted(tmp_path):
     path, _ = table(tmp_path / 'log.csv')
     lines = path.read_text().splitlines()
     lines[11] = lines[11].replace(lines[11].split(',')[1], 'nan')
@@ -190,10 +191,10 @@ def test_every_odd_row_is_accounted_for(tmp_path):
     assert (report.findings['backwards'].count, report.findings['backwards'].lines) == (1, (43,))
     assert (report.findings['repeated'].count, report.findings['repeated'].lines) == (1, (52,))
     assert len(block) == report.messages['accel'] == 397
-    # Clipped rows and rows in wrong order stay in the bag, because the node rejects such samples.
+    # The bag contains clipped samples and samples in wrong order: the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
-    # Log times of a bag rise in the order of the rows, even where stamps fall.
+    # Log times rise from row to row, also where stamps fall.
     assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 
@@ -202,11 +203,11 @@ def test_stamps_of_a_fixed_rate_do_not_accumulate_rounding(tmp_path):
     write_log(table_log(path, column_map(stamp={'rate_hz': 3.0})), tmp_path / 'bag')
     stamps = read_recording(tmp_path / 'bag').columns.accel_stamp_ns
     assert stamps[0] == 10**9
-    # Each stamp is the nanosecond nearest to a multiple of 1/3 s, not of 0.333333333 s.
+    # Each stamp is a multiple of 1/3 s, not of 0.333333333 s, rounded to a nanosecond.
     assert stamps[-1] == 10**9 + round(299 * 1e9 / 3.0)
 
 
-def test_the_number_of_rows_in_a_block_makes_no_difference(tmp_path, monkeypatch):
+def test_the_bag_does_not_depend_on_the_number_of_rows_in_a_block(tmp_path, monkeypatch):
     path, _ = table(tmp_path / 'log.csv')
     write_log(table_log(path, column_map()), tmp_path / 'whole')
     monkeypatch.setattr('thermo_comp.convert.log._RUN_ROWS', 64)
@@ -229,7 +230,7 @@ def test_temperatures_of_any_unit_become_degc(tmp_path, unit, celsius):
     board = {'column': 'board', 'unit': unit, **raw}
     write_log(table_log(path, column_map(board=board)), tmp_path / 'bag')
     first = float(read_recording(tmp_path / 'bag').columns.temperatures['board'].celsius[0])
-    # Expected in degC: 300 K, 212 degF (boiling water), and 160 counts of 1/16 K above 20 degC.
+    # The readings are 300 K, 212 degF, 160 counts of 1/16 K above 20 degC, and 30 degC.
     assert first == pytest.approx({'K': 26.85, 'degF': 100.0, 'raw': 30.0, 'degC': 30.0}[unit])
 
 
@@ -240,7 +241,7 @@ def test_implausible_temperatures_are_refused(tmp_path):
         write_log(table_log(path, column_map()), tmp_path / 'bag')
 
 
-def test_a_table_of_words_is_refused(tmp_path):
+def test_a_table_without_numbers_is_refused(tmp_path):
     path = tmp_path / 'log.csv'
     path.write_text('ms,ax,ay,az,board,case\n' + 'a,b,c,d,e,f\n' * 5)
     with pytest.raises(RecordingError, match='none of its 5 rows holds numbers'):
@@ -260,7 +261,7 @@ class TestThinning:
         assert self.kept([float('nan'), 1, float('nan'), 1, 2]) == [1, 4]
         assert self.kept([float('nan')] * 3) == []
 
-    def test_a_clock_that_starts_anew_gives_a_message(self):
+    def test_the_first_reading_after_a_clock_restart_is_kept(self):
         readings = Readings(np.array([5, 6, 1, 2]) * 10**9, np.full(4, 20.0))
         assert (readings.thinned().stamp_ns // 10**9).tolist() == [5, 1]
 
@@ -318,7 +319,7 @@ class TestColumnMap:
         assert str(path) in str(caught.value)
         assert key is None or (caught.value.key or '').startswith(key)
 
-    def test_files_that_are_no_column_maps_are_refused(self, tmp_path):
+    def test_files_that_are_not_column_maps_are_refused(self, tmp_path):
         path = tmp_path / 'map.yaml'
         with pytest.raises(ThermoCompError, match=r'map\.yaml: .*No such file'):
             load_column_map(path)
@@ -354,7 +355,7 @@ class TestCommand:
 
 
 class TestFreezer:
-    """A real MPU6050 in a freezer, with all faults of a real log."""
+    """The recording of an MPU-6050 in a freezer, whose log has several faults."""
 
     @pytest.fixture
     def path(self, real_data):
@@ -378,10 +379,10 @@ class TestFreezer:
         assert len(block) == 24514
         assert block.temperatures['case'].celsius.min() == pytest.approx(-17.8, abs=0.1)
         assert block.temperatures['board'].celsius.min() == pytest.approx(3.6, abs=0.5)
-        # The three thermometers are in three places, so their ranges differ.
+        # The thermometers of board, case and barometer are in different places.
         assert block.temperatures['barometer'].celsius.min() == pytest.approx(-17.0, abs=0.1)
         n_barometer = len(block.temperatures['barometer'].celsius)
         assert report.messages['barometer'] == n_barometer
         assert report.messages.keys() == {'accel', 'board', 'case', 'barometer'}
-        # The air sensor holds its value between its readings, so it has fewer messages than rows.
+        # The air sensor repeats its value between readings, which gives fewer messages than rows.
         assert report.messages['case'] < 0.75 * report.rows

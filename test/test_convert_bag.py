@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of other programs are converted: topics of any name, ROS 1 and 2, units by gravity."""
+"""Bags of ROS 1 and 2 with topics of any name are converted; the unit follows from |f| at rest."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ NAMES = {'/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE}
 
 
 def messages(ros, rng, scale, names):
-    """Yield (topic, type, log_ns, message) of a sensor at rest that reads `scale` at 1 g."""
+    """Yield (topic, type, log_ns, message) of a sensor at rest whose samples have norm `scale`."""
     types = typestore(ros).types
     vector = types['geometry_msgs/msg/Vector3']
 
@@ -58,7 +58,7 @@ def write_bag(path, rng, ros=2, scale=G):
 
 
 @pytest.mark.parametrize('ros', [1, 2])
-def test_topics_of_any_name_become_the_usual_topics(tmp_path, rng, ros):
+def test_topics_of_any_name_are_converted_to_the_default_topics(tmp_path, rng, ros):
     path = write_bag(tmp_path / ('old.bag' if ros == 1 else 'new'), rng, ros)
     report = write_log(bag_log(path), tmp_path / 'bag.mcap')
     recording = read_recording(tmp_path / 'bag.mcap')
@@ -101,14 +101,15 @@ def present(imu, temperature=(), pressure=()):
         ((), (), None, None),
         (('/t',), (), '/t', None),
         (('/imu/t', '/air'), (), '/imu/t', '/air'),
-        # A thermometer beside a barometer is the case thermometer, even if there is no other.
+        # A thermometer in the namespace of a barometer is the case's, also as the only
+        # thermometer.
         (('/baro/t',), ('/baro/p',), None, '/baro/t'),
         (('/imu/t', '/baro/t', ), ('/baro/p',), '/imu/t', '/baro/t'),
         (('/robot/imu/t', '/robot/baro/t'), ('/robot/baro/p',), '/robot/imu/t', '/robot/baro/t'),
         (('/robot/baro/t',), ('/robot/baro/p',), None, '/robot/baro/t'),
     ],
 )  # fmt: skip
-def test_thermometers_are_identified_by_topics_beside_them(temperature, pressure, board, case):
+def test_thermometers_are_identified_by_their_namespace(temperature, pressure, board, case):
     imu = '/robot/imu/data' if temperature and temperature[0].startswith('/robot') else '/imu/data'
     topics = find_topics(present([imu], temperature, pressure), None, None, None)
     assert topics == {'imu': imu, 'board': board, 'case': case}
@@ -127,7 +128,7 @@ def test_ambiguous_topics_must_be_named():
     assert chosen['case'] == '/imu/t1'
 
 
-def test_convert_takes_a_bag(tmp_path, rng, cli):
+def test_the_command_convert_reads_a_bag(tmp_path, rng, cli):
     bag = write_bag(tmp_path / 'bag', rng, scale=1.0)
     refused = cli('convert', bag, '-o', tmp_path / 'out.mcap', code=1)
     assert 'looks like g' in refused.stderr
@@ -163,7 +164,7 @@ def test_convert_takes_a_bag(tmp_path, rng, cli):
         (32.2, 'unknown'),  # gravity in ft/s^2
     ],
 )
-def test_the_unit_follows_from_the_magnitude_at_rest(magnitude, unit):
+def test_the_unit_follows_from_the_norm_at_rest(magnitude, unit):
     inferred, reason = infer_unit(magnitude)
     assert inferred == unit
     assert f'{magnitude:.4g}' in reason
@@ -172,10 +173,10 @@ def test_the_unit_follows_from_the_magnitude_at_rest(magnitude, unit):
 def test_a_stated_unit_that_may_be_true_is_not_contradicted():
     assert contradiction('g', 1.15, None) is None
     assert contradiction('m/s^2', 9.6, None) is None
-    # Counts are a possible unit of any |a| at rest of 50 and more: converters have many bits.
+    # Any |a| at rest above 50 may be in counts, because converters differ in their bits.
     assert contradiction('counts', 2941.7, None) is None
     assert contradiction('counts', 2060.0, 2048.0) is None
-    # A sensor that never rests cannot contradict the stated unit.
+    # Without a rest |a| is unknown, and no unit is refused.
     assert contradiction('g', float('nan'), None) is None
 
 
@@ -191,18 +192,18 @@ def test_movement_is_found_in_any_unit(rng, scale):
     n = 5000
     stamp_ns = np.arange(1, n + 1) * 10_000_000
     stillness = find_stillness(stamp_ns, shaken(rng, n, scale, 1e-3 * scale))
-    # The sensor is shaken in the middle fifth of 50 s, from 20 to 30 s.
+    # The sensor is shaken from 20 to 30 s.
     assert [(t0 * 1e-9, t1 * 1e-9) for t0, t1 in stillness.moving_ns] == [
         (pytest.approx(20.01), pytest.approx(30.01))
     ]
-    # Noise of 0.1 % at 100 Hz has an sd of 0.1 % / sqrt(200) in a mean over 2 s.
+    # A mean over 2 s at 100 Hz of samples with a noise of 0.1 % has a noise of 0.1 % / sqrt(200).
     assert stillness.magnitude == pytest.approx(scale, rel=3e-4)
     assert stillness.noise == pytest.approx(1e-3 * scale, rel=0.1)
     assert stillness.still_s == pytest.approx(40.0, abs=0.5)
 
 
-def test_a_sensor_that_shows_no_noise_is_not_moving(rng):
-    # A value rounded to steps larger than the noise changes by a step from time to time, at rest.
+def test_rare_steps_of_a_coarse_sensor_are_not_taken_for_motion(rng):
+    # If rounding steps are larger than the noise, samples at rest change by a step now and then.
     accel = np.tile([0.0, 0.0, 1.0], (1000, 1))
     accel[::97, 0] = 0.1
     stillness = find_stillness(np.arange(1000) * 10_000_000, accel)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ArduPilot logs, written by the public description of DataFlash, give the data of each sensor."""
+"""ArduPilot logs, written here by the public description of DataFlash, are converted to bags."""
 
 import struct
 
@@ -74,7 +74,7 @@ def write_new(path, rng, parameters=(('INS_TCAL1_ENABLE', 0.0),)):
 
 @pytest.mark.parametrize('imu', [0, 1])
 @pytest.mark.parametrize('baro', [0, 1])
-def test_logs_of_the_new_format_give_each_instance(tmp_path, rng, imu, baro):
+def test_each_imu_of_a_log_in_the_new_format_can_be_converted(tmp_path, rng, imu, baro):
     path = tmp_path / 'new.BIN'
     force = write_new(path, rng)
     write_log(read_autopilot(path, imu=imu, baro=baro), tmp_path / 'bag.mcap')
@@ -84,18 +84,18 @@ def test_logs_of_the_new_format_give_each_instance(tmp_path, rng, imu, baro):
         bag.accel_stamp_ns, (2_000_000 + np.arange(N) * STEP_US + imu) * 1000
     )
     np.testing.assert_array_equal(bag.accel, force[imu])
-    # The log stores the rate 0.3 as float32, which rounds it by up to 1e-7.
+    # The log has numbers of single precision, so the rate 0.3 has a rounding error of 1e-7.
     np.testing.assert_allclose(bag.imu.angular_velocity[:, 2], 0.3 + imu, atol=1e-7)
-    # The chip temperature is constant for ten samples; only changes of a temperature are messages.
+    # The chip temperature changes every ten samples, and each change is a message.
     np.testing.assert_array_equal(
         bag.temperatures['board'].celsius, 30.0 + imu + 0.25 * np.arange(N // 10)
     )
-    # A log has the temperature of the barometer in hundredths of a degree.
+    # The log has the temperature of the barometer in units of 0.01 degC.
     hundredths = (2000 + np.arange(0, N, 10)) if baro == 0 else (1500 - np.arange(0, N, 10))
     np.testing.assert_allclose(bag.temperatures['case'].celsius, hundredths / 100, rtol=1e-15)
 
 
-def test_types_of_old_logs_are_the_instances(tmp_path, rng):
+def test_each_imu_of_a_log_in_the_old_format_can_be_converted(tmp_path, rng):
     log = DataflashWriter()
     for name in ('IMU', 'IMU2'):
         log.define(name, *OLD_IMU)
@@ -118,7 +118,7 @@ def test_types_of_old_logs_are_the_instances(tmp_path, rng):
 
 
 def test_a_temperature_of_0_means_no_thermometer(tmp_path, rng):
-    # ArduPilot writes 0 if a driver gives no temperature.
+    # ArduPilot writes 0 as temperature if the driver has no thermometer.
     log = DataflashWriter()
     log.define('IMU', *NEW_IMU)
     for k, force in enumerate(still(rng)):
@@ -145,8 +145,8 @@ HALF_US = 2_000_000 + N // 2 * STEP_US
     [
         ([(0.0, 1000), (1.0, HALF_US)], slice(0, N // 2), 50),
         ([(1.0, 1000), (0.0, HALF_US)], slice(N // 2, N), 50),
-        # WHY: a log of ArduPilot's temperature learning, which sets INS_TCAL1_ENABLE from 2 to 1,
-        # was refused.
+        # WHY: a log in which ArduPilot learns a temperature calibration was refused; at the end of
+        # learning INS_TCAL1_ENABLE changes from 2 to 1.
         ([(2.0, 1000), (1.0, HALF_US + N // 4 * STEP_US)], slice(0, 3 * N // 4), 25),
     ],
 )
@@ -157,7 +157,7 @@ def test_samples_corrected_by_ardupilot_are_left_out(tmp_path, rng, course, kept
     np.testing.assert_array_equal(read.accel, force[0][kept])
     assert f'INS_TCAL1_ENABLE was 1 for {share} % of the samples' in read.chosen
     assert len(read_autopilot(path, allow_compensated=True).stamp_ns) == N
-    # Temperatures are kept where samples are left out: the fit needs the thermal history.
+    # The fit needs the thermal history, so temperatures stay where samples are left out.
     assert len(read.temperatures['board'].celsius) > 1
 
 
@@ -179,7 +179,7 @@ def test_a_torn_dataflash_log_is_read_up_to_the_cut(tmp_path, rng):
     np.testing.assert_array_equal(log.accel, force[1][: N - 1])
 
 
-def test_absent_instances_are_named(tmp_path, rng):
+def test_the_message_on_an_absent_instance_names_the_instances(tmp_path, rng):
     path = tmp_path / 'new.BIN'
     write_new(path, rng)
     with pytest.raises(RecordingError, match='no IMU 2; there are: 0, 1'):
@@ -189,7 +189,7 @@ def test_absent_instances_are_named(tmp_path, rng):
 
 
 @pytest.mark.parametrize('content', [b'', b'time,x,y,z\n', b'\xa3\x95' + bytes(600)])
-def test_files_that_are_no_dataflash_logs_are_refused(tmp_path, content):
+def test_files_that_are_not_dataflash_logs_are_refused(tmp_path, content):
     path = tmp_path / 'other.BIN'
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=r'not a DataFlash log|holds no IMU'):
@@ -217,11 +217,11 @@ def test_damaged_formats_are_refused(tmp_path, rng, columns, message):
         read_autopilot(path)
 
 
-def test_absurd_stamps_are_no_stamps(tmp_path, rng):
+def test_messages_with_impossible_stamps_are_left_out(tmp_path, rng):
     path = tmp_path / 'jump.BIN'
     write_new(path, rng)
     body = bytearray(path.read_bytes())
-    # All bits of the time of the first IMU message are set, which is half a million years.
+    # Set all bits of the time of the first IMU message, a time of half a million years.
     at = body.index(b'\xa3\x95\x81') + 3
     body[at : at + 8] = b'\xff' * 8
     path.write_bytes(body)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other programs are read by their headings; units follow from gravity and rates."""
+"""Tables of other programs are read by headings; units follow from |f| at rest and rates."""
 
 from datetime import datetime, timedelta, timezone
 from itertools import takewhile
@@ -35,7 +35,7 @@ UP = np.repeat([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], N // 3, axi
     [
         ('2026-03-29T01:30:00Z', 0),
         ('2026-03-29T01:30:00.123456789Z', 0.123456789),
-        ('2026-03-29 01:30:00', 0),  # UTC if no zone is given
+        ('2026-03-29 01:30:00', 0),  # a time without a zone is UTC
         ('2026-03-29T03:30:00.5+02:00', 0.5),
         ('2026-03-29T03:30:00+0200', 0),  # format of GGIR
         ('2026-03-29 03:30:00.250+0200 [Europe/Paris]', 0.25),  # format of actipy
@@ -101,7 +101,7 @@ def test_a_table_is_read_by_its_headings(tmp_path, rng, kind, headings, unit, on
 
 @pytest.mark.parametrize('kind', ['dates', 'text', 'numbers'])
 def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
-    # WHY: a Parquet table needed a column map, although its headings name the columns.
+    # WHY: a Parquet table was read only with a column map, although it has headings.
     pa = pytest.importorskip('pyarrow', reason='pyarrow is the extra `parquet`')
     import pyarrow.parquet as pq
 
@@ -120,7 +120,7 @@ def test_a_parquet_table_is_read_by_its_headings(tmp_path, rng, kind):
     assert log.temperatures['board'].celsius[0] == 20.5
 
 
-def test_the_right_triad_and_thermometers_are_taken():
+def test_the_accelerometer_is_chosen_among_several_triads_of_a_table():
     names = read_headings(
         [
             *('now[ms]', 'magx', 'magy', 'magz', 'linear_acc_x', 'linear_acc_y', 'linear_acc_z'),
@@ -149,13 +149,13 @@ def test_the_right_triad_and_thermometers_are_taken():
         ('t [s],ax [g],ay [g],az [g],T [°C]', 'ax [g]', ('s', 'g', 'degC')),
         ('t,imu0_ax,imu0_ay,imu0_az,T_board,T_case', 'imu0_ax', ('', '', 'degC')),
         ('elapsed_h,ax,ay,az,temp (°F)', 'ax', ('h', '', 'degF')),
-        (  # the fields of sensor_msgs/Imu, as PlotJuggler writes them
+        (  # headings that PlotJuggler writes for sensor_msgs/Imu
             '__time,/imu/angular_velocity/x,/imu/angular_velocity/y,/imu/angular_velocity/z,'
             '/imu/linear_acceleration/x,/imu/linear_acceleration/y,/imu/linear_acceleration/z,temp',
             '/imu/linear_acceleration/x',
             ('', '', 'degC'),
         ),
-        (  # EuRoC
+        (  # headings of the EuRoC data sets
             'timestamp [ns],w_S_x [rad s^-1],w_S_y [rad s^-1],w_S_z [rad s^-1],'
             'a_S_x [m s^-2],a_S_y [m s^-2],a_S_z [m s^-2],temp',
             'a_S_x [m s^-2]',
@@ -164,14 +164,14 @@ def test_the_right_triad_and_thermometers_are_taken():
     ],
 )
 def test_units_and_names_in_headings_of_loggers_are_recognised(headings, accel, units):
-    # WHY: `temp_f` was read as degC, and common headings were not recognised.
+    # WHY: the column `temp_f` was read as degC; other common headings were not recognised.
     names = read_headings(headings.split(','))
     assert names.accel[0] == accel
     assert (names.time_unit, names.accel_unit, names.thermometers['board'][1]) == units
 
 
 def slow_table(path, heading, times, first=20.0, last=45.0):
-    """Write a log of one attitude in which the temperature changes by 25 K."""
+    """Write a log of one attitude in which the temperature changes from `first` to `last`."""
     up = np.tile([0.0, 5.88, 7.84], (len(times), 1))
     up += 0.01 * np.random.default_rng(0).standard_normal(up.shape)
     temperature = np.linspace(first, last, len(times))
@@ -189,9 +189,9 @@ def slow_table(path, heading, times, first=20.0, last=45.0):
         # WHY: a test of two hours at 1 Hz was read as 8 s at 1 kHz, even with stamps since 1970.
         *(('s', [since + step * k for k in range(4000)], 45.0)
           for since in (0, 1_774_747_800) for step in (1, 5)),
-        # WHY: a table with one row in seven written twice was refused for times that do not rise.
+        # WHY: a table in which every seventh row occurs twice was refused: times did not rise.
         ('s', [k / 10 for k in range(900) for _ in range(2 if k % 7 == 0 else 1)], 45.0),
-        # At constant temperature in one attitude, only the size of the stamps shows their unit.
+        # Without motion and temperature change the unit follows from the size of the stamps.
         *((unit, [START_NS // size + step * k for k in range(900)], 20.0)
           for unit, size, step in (('s', 10**9, 2), ('ms', 10**6, 5000), ('us', 10**9, 10_000))),
     ],
@@ -208,22 +208,22 @@ def test_the_unit_of_the_times_of_a_slow_log_is_recognised(tmp_path, unit, times
         ('time', [k // 10 for k in range(900)], "'time' has the same time as the row before"),
         ('date', [46110 + k / 864000 for k in range(900)], 'no plausible interval of samples'),
         ('time', list(range(900, 0, -1)), "'time' is not a rising time"),
-        # WHY: dates not of ISO 8601 gave the message that no row has numbers in the stamp column.
+        # WHY: for dates that are not ISO 8601 the message was that no row has a number as stamp.
         *(('date', [cell] * 900, f"column 'date' is a date of ISO 8601.*'{cell}'")
           for cell in ('29/03/2026 01:30:00', '01:30:00.5')),
         # WHY: the message `column 'temp' is given twice` suggested a wrong command line.
         ('t,temp', [f'{k / 10},20' for k in range(900)], r"log\.csv: 2 columns are called 'temp'"),
     ],
 )  # fmt: skip
-def test_columns_that_cannot_be_used_are_described(tmp_path, heading, times, reason):
-    # WHY: times in minutes were read as seconds; times that do not rise got a wrong message.
+def test_columns_with_unusable_times_or_temperatures_are_refused(tmp_path, heading, times, reason):
+    # WHY: times in minutes were read as seconds; for times that do not rise the message was wrong.
     path = slow_table(tmp_path / 'log.csv', heading, times)
     with pytest.raises(RecordingError, match=reason):
         table_log(path, guess_columns(path))
 
 
-def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
-    # WHY: if the last cell of most rows was blank, the row of headings had a cell too many.
+def test_a_table_with_blank_temperature_cells_is_read(tmp_path):
+    # WHY: if the last cell of most rows was blank, the reader counted a heading too many.
     path = slow_table(tmp_path / 'log.csv', 'time', [k / 100 for k in range(N)], last=31.99)
     head, *rows = path.read_text().splitlines()
     rows = [row if k % 100 == 0 else f'{row.rpartition(",")[0]},' for k, row in enumerate(rows)]
@@ -237,7 +237,7 @@ def test_a_slower_thermometer_leaves_cells_blank(tmp_path):
     ('comment', 'sign'), [('# t ax ay az temp', ' '), ('#t [s],ax,ay,az,temp', ',')]
 )
 def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
-    # WHY: numpy.savetxt and EuRoC write the headings as a comment, which the reader left out.
+    # WHY: numpy.savetxt and EuRoC write headings in a comment, and the reader skipped comments.
     path = slow_table(tmp_path / 'log.csv', 't', [k / 10 for k in range(900)])
     rows = path.read_text().replace(',', sign).splitlines()[1:]
     path.write_text('\n'.join(['# logger 3', comment, *rows]) + '\n')
@@ -250,12 +250,12 @@ def test_headings_in_a_comment_are_read(tmp_path, comment, sign):
         guess_columns(path)
 
 
-def test_a_temperature_and_a_force_of_other_units_are_refused(tmp_path):
+def test_a_temperature_in_millikelvins_and_a_force_without_gravity_are_refused(tmp_path):
     times = [k / 10 for k in range(900)]
     path = slow_table(tmp_path / 'log.csv', 'time', times, 20_000.0, 21_000.0)
     with pytest.raises(RecordingError, match='expected -90 to 200: the unit in a column map may'):
         write_log(table_log(path, guess_columns(path)), tmp_path / 'bag')
-    # A phone's linear acceleration has no gravity in it.
+    # A phone's linear acceleration is the acceleration without gravity.
     names = [f'Linear acceleration {axis} (m/s^2)' for axis in 'xyz']
     rows = [f'{at},0.01,0.02,{0.01 * (k % 3)}' for k, at in enumerate(times)]
     path.write_text('\n'.join([','.join(['time', *names]), *rows]) + '\n')
@@ -263,8 +263,8 @@ def test_a_temperature_and_a_force_of_other_units_are_refused(tmp_path):
         write_log(table_log(path, guess_columns(path)), tmp_path / 'bag')
 
 
-def test_headings_without_a_time_take_a_rate(tmp_path, rng):
-    # WHY: --rate-hz worked only for tables without headings, and tables with headings ignored it.
+def test_a_table_whose_headings_name_no_time_needs_a_sample_rate(tmp_path, rng):
+    # WHY: --rate-hz was ignored for tables with headings.
     path, rows = tmp_path / 'log.csv', UP + 0.002 * rng.standard_normal(UP.shape)
     path.write_text('\n'.join(['ax,ay,az', *(f'{x:.5f},{y:.5f},{z:.5f}' for x, y, z in rows)]))
     with pytest.raises(RecordingError, match="name no time: 'ax', 'ay', 'az'; give --rate-hz, or"):
@@ -282,7 +282,7 @@ def test_headings_without_a_time_take_a_rate(tmp_path, rng):
 
 @pytest.mark.parametrize(
     ('headings', 'thermometers', 'not_used'),
-    [  # WHY: thermometers with other headings than `temp` and `T_board` were dropped silently.
+    [  # WHY: thermometers with headings other than `temp`, `T_board` were left out silently.
         ('board_degC,case_degC,imu', ['board_degC', 'case_degC'], 'imu'),
         ('case,board,label', ['board', 'case'], 'label'),
         ('T_magnet_C,case [°C],die', ['T_magnet_C', 'case [°C]'], 'die'),
@@ -309,8 +309,8 @@ def test_the_guessed_column_map_is_printed(tmp_path, rng, cli, headings, thermom
 
 
 @pytest.mark.parametrize(('last', 'unit'), [(3, None), (1200, None), (40, 'degC')])
-def test_whole_numbers_of_a_board_may_be_its_temperature(tmp_path, last, unit):
-    # The column `board` holds the number of a board, a count of rows, or whole degrees.
+def test_a_column_board_of_whole_numbers_is_a_temperature_only_if_plausible(tmp_path, last, unit):
+    # The column `board` has 3 in all rows (number of a board), row numbers, or 3 to 40 degC.
     rows = [f'{k / 10},0,6,8,{3 + k * (last - 3) // 1199}' for k in range(1200)]
     (tmp_path / 'log.csv').write_text('\n'.join(['time,ax,ay,az,board', *rows]))
     board = guess_columns(tmp_path / 'log.csv').board
@@ -339,7 +339,7 @@ def test_words_of_24_and_32_bits_are_not_saturated(rng, one_g, bits):
 
 
 def write(path, rng, unit, **columns):
-    """Write a table of rests with `unit` per g, and with times and angular rates if given."""
+    """Write a table of rests; samples have `unit` per g; times and angular rates are optional."""
     accel = unit * (UP + 0.002 * rng.standard_normal(UP.shape))
     parts = [columns['time'][:, None]] if 'time' in columns else []
     parts += [accel, columns['rate']] if 'rate' in columns else [accel]
@@ -350,7 +350,7 @@ def write(path, rng, unit, **columns):
 @pytest.mark.parametrize(
     ('unit', 'text'), [(9.80665, 'm/s^2'), (1.0, 'g'), (1000.0, 'mg'), (4096.0, 'counts')]
 )
-def test_the_unit_follows_from_the_size_of_gravity(tmp_path, rng, unit, text):
+def test_the_unit_of_samples_follows_from_their_norm_at_rest(tmp_path, rng, unit, text):
     path = write(tmp_path / 'log.txt', rng, unit, time=0.01 * np.arange(len(UP)))
     columns = guess_columns(path)
     assert column_map_text(columns) == f'time [s], x y z [{text}]'
@@ -373,9 +373,9 @@ def test_the_unit_of_times_gives_a_plausible_sample_rate(tmp_path, rng, step, un
     np.testing.assert_array_equal(np.diff(table_log(path, columns).stamp_ns), 10**9 // rate_hz)
 
 
-def test_seconds_and_milliseconds_differ_in_how_fast_a_hand_turns(tmp_path, rng):
-    # WHY: samples at 1 Hz were taken for 1 kHz. A turn by 180 deg takes one sample, 1 s, or 800
-    # samples, 0.8 s.
+def test_the_speed_of_a_turn_by_hand_shows_the_unit_of_times(tmp_path, rng):
+    # WHY: samples at 1 Hz were taken for samples at 1 kHz. A turn by 180 deg takes one interval at
+    # 1 Hz (1 s), and 800 intervals at 1 kHz (0.8 s).
     angle = np.repeat([0.0, np.pi, 0.0], [400, 800, 400])
     ramp = np.clip((np.arange(1600) - 400) / 800, 0.0, 1.0) * np.pi
     for turned, unit in ((angle, 's'), (ramp, 'ms')):
@@ -388,7 +388,7 @@ def test_seconds_and_milliseconds_differ_in_how_fast_a_hand_turns(tmp_path, rng)
 
 @pytest.mark.parametrize(('rest_s', 'gap_s'), [(30, 0), (30, 670), (60, 1), (45, 3)])
 def test_times_of_short_rests_at_1_hz_are_seconds(tmp_path, rng, rest_s, gap_s):
-    # WHY: cells of 30 and more samples contained two rests, and |f| of their mean is below g.
+    # WHY: samples were averaged over 30 and more, so over two attitudes, and |f| was below g.
     ups = positions(18, 1)
     accel = np.repeat(ups, rest_s, axis=0) + 2e-5 * rng.standard_normal((18 * rest_s, 3))
     times = (np.arange(18)[:, None] * (rest_s + gap_s) + np.arange(rest_s)).ravel()
@@ -400,7 +400,7 @@ def test_times_of_short_rests_at_1_hz_are_seconds(tmp_path, rng, rest_s, gap_s):
 
 
 @pytest.mark.parametrize(('fastest', 'unit'), [(3.0, 'rad/s'), (170.0, 'deg/s')])
-def test_turns_by_hand_show_the_unit_of_the_angular_rate(tmp_path, rng, fastest, unit):
+def test_the_largest_angular_rate_shows_its_unit(tmp_path, rng, fastest, unit):
     rate = np.linspace(-fastest, fastest, 3 * len(UP)).reshape(-1, 3)
     path = write(tmp_path / 'log.txt', rng, 9.8, rate=rate)
     columns = guess_columns(path, 100.0)
@@ -411,7 +411,7 @@ def test_turns_by_hand_show_the_unit_of_the_angular_rate(tmp_path, rng, fastest,
     np.testing.assert_allclose(gyro, expected, atol=1e-6)
 
 
-def test_unidentified_columns_are_refused(tmp_path, rng):
+def test_tables_whose_columns_cannot_be_identified_are_refused(tmp_path, rng):
     path = tmp_path / 'log.txt'
     time = 0.01 * np.arange(len(UP))
     for size, columns, rate_hz, reason in (
@@ -425,7 +425,7 @@ def test_unidentified_columns_are_refused(tmp_path, rng):
     for content, reason in (
         ('t,a,b,c\n' + '0,0,0,9.8\n' * 100, 'its headings name no accelerometer'),
         ('a,b,c\n1,2,3\n2,3,4\n', "name no accelerometer: 'a', 'b', 'c'; give a column map"),
-        # WHY: decimal commas divided cells; the message was `its headings name no accelerometer`.
+        # WHY: decimal commas were taken for separators, so the headings had too few names.
         (
             't;ax;ay;az\n' + '0,01;0,0;0,1;9,8\n' * 100,
             'has decimal commas, it begins with 0,01: write decimal points',

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of any layout give equal columns; errors name the place of a bad cell."""
+"""Tables of any layout give equal columns; messages name the place of a wrong cell."""
 
 import numpy as np
 import pytest
@@ -47,14 +47,14 @@ def test_every_layout_of_a_table_gives_equal_values(tmp_path, delimiter, newline
 def test_headings_of_a_table_are_optional(tmp_path):
     path = write(tmp_path / 'log.txt', '1 2 3\n4 5 6\n')
     assert read_text(path, [2], ROWS_ALONE).values[2].tolist() == [3.0, 6.0]
-    # The words 'nan' and 'inf' are numbers, unless the user says that the first line is a heading.
+    # 'nan' and 'inf' are numbers, unless the user states that the first line is a heading.
     path = write(tmp_path / 'words.txt', 'nan inf\n1 2\n')
     assert read_text(path, [0], ROWS_ALONE, Format(header=True)).values[0].tolist() == [1.0]
 
 
 @pytest.mark.parametrize('separator', [',', ';', '\t', ' '])
 def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
-    # A row of units counts as a row of NaN; the incomplete last row is counted and left out.
+    # The row of units becomes a row of NaN; the incomplete last row is counted and left out.
     head = ['Inertial logger', '# serial 7', '% matlab', '// c', f'Rate:{separator}100', '']
     rows = ['t|ax|ay|az', 's|g|g|g', *(f'{k}|0.1|0.2|{k}' for k in range(60)), '# end', '60|0.1']
     text = '\n'.join([*head, *(row.replace('|', separator) for row in rows)])
@@ -66,7 +66,7 @@ def test_lines_before_the_table_of_a_logger_are_left_out(tmp_path, separator):
 
 
 def test_a_column_of_a_table_may_begin_late(tmp_path):
-    # WHY: a table was not read if its last column, a thermometer, begins some rows late.
+    # WHY: a table was refused if the last column, a thermometer, is blank in the first rows.
     rows = [f'{k},0.1,{"" if k < 20 else 20 + k}' for k in range(60)]
     path = write(tmp_path / 'log.csv', '\n'.join(['t,ax,celsius', *rows]))
     table = read_text(path, ['t', 'celsius'], ROWS_ALONE)
@@ -80,12 +80,12 @@ def test_line_numbers_are_those_of_an_editor(tmp_path):
     table = read_text(path, ['a', 'b'], ROWS_ALONE)
     assert table.line.tolist() == [4, 5, 7]
     np.testing.assert_array_equal(table.values['a'], [1.0, np.nan, 5.0])
-    # The row with one cell is not shifted silently: it is counted and left out.
+    # The row with a single cell is counted and left out.
     assert table.n_short == 1
 
 
 def test_stamps_of_a_table_are_exact():
-    # Stamps are not read as float64, which has steps of 256 ns for nanoseconds since 1970.
+    # Numbers of double precision would round nanoseconds since 1970 to steps of 256 ns.
     cells = ['1767225600.123456789', '1767225600123456789e-9', ' +2 ', '1.5e-9']
     exact = [1767225600123456789, 1767225600123456789, 2 * 10**9, 2]
     assert [exact_ns(cell, 's') for cell in cells] == exact
@@ -94,7 +94,7 @@ def test_stamps_of_a_table_are_exact():
     assert {exact_ns(cell, 'ns') for cell in bad} == {NO_STAMP}
 
 
-def test_layout_prefers_the_delimiter_that_splits_all_lines_alike():
+def test_the_delimiter_is_that_which_gives_equal_numbers_of_cells():
     assert layout('a;b,c;d\n1,5;2,5;3,5\n') == (';', 3)
     assert layout('1 2 3\n4 5 6\n') == (' ', 3)
     assert layout('a\tb\n1\t2\n') == ('\t', 2)
@@ -112,7 +112,7 @@ def test_layout_prefers_the_delimiter_that_splits_all_lines_alike():
         ('1,2\n3,4\n', 'a', "no column 'a': the table has no headings"),
         ('1,2\n3,4\n', 2, 'no column 2: the table has 2 columns, 0 to 1'),
         ('1,2\n3,4\n', -1, 'no column -1: the table has 2 columns, 0 to 1'),
-        # WHY: rows without whole numbers were left out of a table with decimal commas.
+        # WHY: of a table with decimal commas only rows with whole numbers were read.
         ('a;b\n1,5;2\n3;4\n5;6\n', 'a', "column 'a' has decimal commas, it begins with 1,5"),
         ('a,b\n\0\0\n', 'a', 'it holds zero bytes'),
     ],
@@ -141,7 +141,7 @@ class TestParquet:
         pq.write_table(pa.table(columns), tmp_path / 'log.parquet')
         return tmp_path / 'log.parquet'
 
-    def test_parquet_gives_the_values_of_the_text_table(self, tmp_path):
+    def test_a_parquet_table_gives_the_values_of_the_text_table(self, tmp_path):
         path = self.table(
             tmp_path, t=[row[0] for row in ROWS], a=[row[1] for row in ROWS], b=[1, None, 3]
         )
@@ -150,14 +150,14 @@ class TestParquet:
         assert table.values['a'].tolist() == [row[1] for row in ROWS]
         np.testing.assert_array_equal(table.values['b'], [1.0, np.nan, 3.0])
 
-    def test_timestamps_of_parquet_state_their_unit(self, tmp_path):
+    def test_parquet_timestamps_have_their_unit(self, tmp_path):
         path = self.table(
             tmp_path, t=np.array([1767225600123, 0], dtype='datetime64[ms]'), a=[1.0, 2.0]
         )
         table = read_parquet(path, ['a'], Stamp('t', 's'))
         assert table.stamp_ns.tolist() == [1767225600123 * 10**6, 0]
 
-    def test_stamps_of_parquet_may_be_floats_of_seconds(self, tmp_path):
+    def test_parquet_stamps_may_be_fractional_seconds(self, tmp_path):
         path = self.table(tmp_path, t=[0.5, float('nan')], a=[1.0, 2.0])
         table = read_parquet(path, ['a'], Stamp('t', 's'))
         assert table.stamp_ns.tolist() == [500_000_000, NO_STAMP]
@@ -178,7 +178,7 @@ class TestParquet:
 @pytest.mark.parametrize('suffix', ['csv', 'parquet'])
 @pytest.mark.parametrize('unit', ['s', 'ns'])
 def test_stamps_that_ros_cannot_hold_are_left_out(tmp_path, suffix, unit):
-    """A row is in the bag with its stamp, or left out and counted; stamps of 2e10 s overflowed."""
+    """A row with a stamp outside 0 to 2^31 s is left out and counted, also 2e10 s."""
     scale = 10**9 if unit == 's' else 1
     good = [10**9 + k for k in range(40)] if unit == 's' else [10**18 + k for k in range(40)]
     bad = [-1, 2**31, 2 * 10**10, 2**62, 2**63] if unit == 's' else [-1, 2**31 * 10**9, 2**63]

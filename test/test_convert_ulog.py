@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PX4 logs, written by the public description of ULog, give the data of each sensor."""
+"""PX4 logs, written here by the public format description of ULog, are converted to bags."""
 
 import struct
 
@@ -46,7 +46,7 @@ class UlogWriter:
 
 
 def still(rng, n=N, sd=0.03):
-    """Make forces of a sensor at rest, z down as PX4 has it [m/s^2], exact in float32."""
+    """Make forces at rest [m/s^2], with z down as in PX4, as numbers of single precision."""
     return np.float32(np.array([0.2, -0.1, -9.8]) + sd * rng.standard_normal((n, 3)))
 
 
@@ -86,11 +86,11 @@ def test_each_imu_of_a_log_can_become_a_bag(flight, tmp_path, imu):
     recording = read_recording(tmp_path / 'bag.mcap')
     bag = recording.columns
     assert report.messages['accel'] == N
-    # The stamp is the time of the sample, not of its publication, separately for each IMU.
+    # A stamp is the time at which this IMU took the sample, not that of its publication.
     expected_ns = (5_000_000 + np.arange(N) * STEP_US + imu) * 1000
     np.testing.assert_array_equal(bag.accel_stamp_ns, expected_ns)
     np.testing.assert_array_equal(bag.accel, truth['force'][imu])
-    # The chip gives the board temperature at every sample, the barometer the case temperature.
+    # Board: temperature of the accelerometer chip at each sample. Case: that of the barometer.
     np.testing.assert_array_equal(bag.temperatures['board'].celsius, truth['celsius'][imu])
     np.testing.assert_array_equal(bag.temperatures['case'].celsius, 20 + 0.5 * np.arange(12))
     assert recording.info.metadata['serial'] == f'px4-accel-{77 + imu}'
@@ -100,7 +100,7 @@ def test_the_gyroscope_of_an_instance_is_in_its_bag(flight, tmp_path):
     path, _ = flight
     write_log(read_autopilot(path, imu=0), tmp_path / 'bag.mcap')
     rate = read_recording(tmp_path / 'bag.mcap').columns.imu.angular_velocity
-    # In this log gyroscope and accelerometer have equal stamps; values are rounded to float32.
+    # Gyroscope and accelerometer have equal stamps; values are rounded to single precision.
     np.testing.assert_allclose(rate[:, 0], 0.001 * np.arange(N), atol=1e-6)
     assert read_autopilot(path, imu=1).gyro is None
 
@@ -122,7 +122,7 @@ def test_a_log_without_sample_times_is_read(tmp_path, rng):
     read = read_autopilot(path)
     np.testing.assert_array_equal(read.accel, force)
     assert 'case' not in read.temperatures
-    # A constant chip temperature is repeated every 10 s; the log is 6 s long.
+    # A constant temperature is written every 10 s, so in this log of 6 s once.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, [31.5])
 
 
@@ -170,7 +170,7 @@ AIR = 'vehicle_air_data:uint64_t timestamp;uint64_t timestamp_sample;float baro_
 
 
 def write_combined(path, rng, later=None, **parameters):
-    """Write a log of a PX4 version that did not log single sensors by default."""
+    """Write a log with sensor_combined only, as earlier versions of PX4 do by default."""
     log = UlogWriter(COMBINED, AIR)
     for name, value in parameters.items():
         log.message('P', parameter(name, value))
@@ -180,7 +180,7 @@ def write_combined(path, rng, later=None, **parameters):
         now = 7_000_000 + k * STEP_US
         rows = [(-200, vector)]
         if k == 3:
-            # Two extra messages: one without an accelerometer sample, one with an old sample.
+            # Add a message without an accelerometer sample, and one with an old sample.
             rows += [(2**31 - 1, vector), (-200 - 50, vector)]
         for j, (relative, (x, y, z)) in enumerate(rows):
             at = now + (50 if j == 2 else 0)
@@ -209,7 +209,7 @@ def test_sensor_combined_replaces_a_missing_sensor_accel(tmp_path, rng, cli):
     np.testing.assert_array_equal(read.accel, force)
     np.testing.assert_array_equal(read.stamp_ns, (7_000_000 - 200 + np.arange(N) * STEP_US) * 1000)
     np.testing.assert_allclose(read.gyro, np.tile([0.1, 0.2, 0.3], (N, 1)), rtol=1e-6)
-    # The only thermometer in the log, in the barometer, must become the board thermometer.
+    # The only thermometer in the log is that of the barometer: it is taken as the board's.
     np.testing.assert_array_equal(read.temperatures['board'].celsius, 40.0 + np.arange(6))
     assert 'case' not in read.temperatures
     printed = cli('convert', path, '-o', tmp_path / 'bag.mcap').stdout
@@ -231,14 +231,14 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     force = write_combined(path, rng, {'TC_A_ENABLE': 1 - begin}, TC_A_ENABLE=begin)
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
-    # A change of a parameter gets the stamp of the previous message, so the sample at a change may
-    # be left out or kept wrongly.
+    # In a log a changed parameter has the stamp of the message before it, so the sample at the
+    # change may be on the wrong side; `- 1` leaves it out of the comparison.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])
 
 
-def test_the_use_of_a_log_of_1_hz_is_reported(tmp_path, rng, cli):
+def test_the_report_on_a_log_at_1_hz_states_what_it_is_sufficient_for(tmp_path, rng, cli):
     log = UlogWriter(OLD_ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, force in enumerate(still(rng)):
@@ -256,7 +256,7 @@ def test_a_log_without_an_accelerometer_is_refused(tmp_path):
     refused(tmp_path, log.body, 'the log holds no IMU')
 
 
-def test_files_that_are_no_ulog_are_refused(tmp_path):
+def test_files_that_are_not_a_ulog_are_refused(tmp_path):
     for content in (b'', b'ULog', b'time,x,y,z\n1,2,3,4\n' * 10):
         refused(tmp_path, content, 'not a ULog file')
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""With all kinds of columns, blocks have the bits of a stream, and errors scatter as claimed."""
+"""The correction with all kinds of columns: equal bits in blocks, and the claimed sd."""
 
 import math
 from dataclasses import replace
@@ -39,10 +39,10 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
-    """Draw a unit with all columns of two sensors."""
+    """Draw a unit with random weights of all columns that two further thermometers allow."""
     terms = []
     for column in bank(SENSORS):
-        # Weights give some counts of bias and 1e-4 of scale at the edges of a column of any power.
+        # At the edge of its range a column adds some counts of bias and 1e-4 of scale.
         sd = 10.0**-column.power * size
         bias, scale = np.zeros(3), np.zeros(3)
         bias[list(axes)] = 0.05 * sd * rng.standard_normal(len(axes))
@@ -70,7 +70,7 @@ def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
 
 
 def run_of(rng, seconds=240, rate=4, swing_k=12.0):
-    """Make messages in order: samples, three thermometers that jitter and drop out."""
+    """Make messages in order: samples, and three thermometers with jitter and lost readings."""
     events = []
     for k in range(seconds * rate):
         stamp = k * SECOND_NS // rate + int(rng.integers(0, 1_000_000))
@@ -96,10 +96,10 @@ def assert_same(blocks, rows):
 
 @given(st.integers(0, 2**32 - 1), st.integers(40, 900))
 @settings(max_examples=3, deadline=None, phases=[Phase.generate])
-def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
+def test_blocks_corrected_with_all_columns_have_the_bits_of_single_samples(seed, chunk):
     rng = np.random.default_rng(seed)
     unit = full_bank(rng, posterior=True)
-    # The run leaves the range 5 to 35 degC, and also -2.5 to 42.5 degC, where tangents end.
+    # Temperatures exceed the range (5 to 35 degC) and its continuation (-2.5 to 42.5 degC).
     events = run_of(rng, seconds=50, swing_k=90.0)
     rows = stream(Compensator(unit, UNCHECKED), events)[0]
     assert max(value for kind, _, value in events if kind == 'board') > 45.0
@@ -110,7 +110,7 @@ def test_a_full_bank_in_a_batch_has_the_bits_of_the_stream(seed, chunk):
     assert len(rows) > 190
 
 
-def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
+def test_columns_of_the_x_axis_do_not_change_the_output_of_y_and_z(rng):
     events = run_of(rng)
     plain, _ = stream(Compensator(full_bank(rng, axes=()), UNCHECKED), events)
     moved, _ = stream(Compensator(full_bank(rng, axes=(0,)), UNCHECKED), events)
@@ -120,7 +120,7 @@ def test_columns_of_one_axis_leave_every_bit_of_the_others(rng):
 
 
 def states_of(unit, rng, n=5):
-    """Return a tracker in the middle of a run, and thermal states of the run."""
+    """Return the tracker after a run, and n thermal states of the run."""
     tracker = ThermalTracker(unit.detector, Correction(unit).memory)
     collected = []
     for k, (kind, stamp, value) in enumerate(run_of(rng, seconds=1200, rate=1)):
@@ -134,7 +134,7 @@ def states_of(unit, rng, n=5):
 
 
 @pytest.mark.slow
-def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_posterior(rng):
+def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
     # Corrections with randomly drawn parameters must scatter as `SlowUncertainty` claims.
     unit = replace(full_bank(rng), noise_density_m_s2_sqrt_hz=(1e-4,) * 3)
     layout = parameter_layout(unit)
@@ -173,7 +173,7 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
         for axis, (a, b, c) in enumerate(parts):
             for x in (-9.8, 0.0, 9.8):
                 variance = np.var(scatter[:, 0, axis, k] + scatter[:, 1, axis, k] * x)
-                # A variance from n draws has a relative sd of sqrt(2 / n) = 8 %; tolerance: 4 sd.
+                # The variance of n draws is uncertain by sqrt(2 / n) = 8 %; tolerance: 4 * 8 %.
                 assert a + b * x + c * x * x == pytest.approx(variance, rel=0.33)
         for force in rng.uniform(-9.8, 9.8, (5, 3)):
             along = -scatter[:, 0, :, k] - scatter[:, 1, :, k] * force
@@ -182,16 +182,15 @@ def test_the_sd_of_parameters_is_the_scatter_of_calibrations_drawn_from_the_post
             claimed = np.zeros((3, 3))
             claimed[np.triu_indices(3)] = covariance_at(coefficients, *force.tolist())
             claimed += np.triu(claimed, 1).T
-            # A covariance from n draws has an sd of at most sqrt(2 / n) times the product of both
-            # sds; tolerance: 4 sd.
+            # The covariance of n draws is uncertain by at most 8 % of the product of both sd.
             sds = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
             assert (np.abs(claimed - expected) < 0.33 * sds).all()
-            # Claimed and drawn variances agree in all directions: the correlations are right.
+            # Claimed and drawn variances agree in all directions, so correlations agree, too.
             root = np.linalg.inv(np.linalg.cholesky(expected))
             assert np.abs(root @ claimed @ root.T - np.eye(3)).max() < 0.5
 
 
-def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
+def test_corrections_with_random_initial_lag_states_scatter_by_the_claimed_sd(rng):
     unit = full_bank(rng)
     correction = Correction(unit)
     lags = correction.memory.lags
@@ -208,7 +207,7 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
     wide = replace(
         unit, response=tuple(replace(term, range=(-4000.0, 4000.0)) for term in unit.response)
     )
-    # Squares of lags are nonlinear, so initial lag states are drawn with 0.05 of their sd.
+    # Columns with squares of lags are nonlinear, so draw initial lag states with 0.05 of their sd.
     small = 0.05
     moved[places] += small * (draws * np.array(shares)).T
     values = Correction(wide).bias_scale(moved)
@@ -216,12 +215,12 @@ def test_the_sd_of_a_start_is_the_scatter_of_lags_drawn_from_the_prior(rng):
         bias, scale = values[:, axis]
         for x in (-9.8, 0.0, 9.8):
             expected = np.var(bias / 300.0 + scale / 300.0 * x) / small**2
-            # A variance from 4000 draws has a relative sd of 2.2 %; the tolerance is 4 sd.
+            # The variance of 4000 draws is uncertain by 2.2 %; the tolerance is 4 * 2.2 %.
             assert a + b * x + c * x * x == pytest.approx(expected, rel=0.09)
 
 
-def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
-    # Only the initial state of a lag of 60 s is uncertain: its sd falls as exp(-t / 60 s).
+def test_the_variance_of_initial_lag_states_is_updated_every_ten_seconds():
+    # The variance is that of the initial state of a lag of 60 s, whose sd falls as exp(-t / 60 s).
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     compensator = Compensator(unit, UNCHECKED)
     noise = compensator.thermal.correction.noise[0]
@@ -240,7 +239,7 @@ def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
         last.setdefault(stamp // 10_000_000_000, []).append((stamp, variance))
     assert len(last) >= 9
     for span in last.values():
-        # Within 10 s only the thermometer changes the variance: 30 counts/K times 5 mK.
+        # Within 10 s only the variance of the thermometer (30 counts/K, 5 mK) changes.
         part = (30.0 / 300.0 * 0.005) ** 2
         stamp, variance = span[0]
         age = (stamp - collected[0][0]) * 1e-9 + 1.0
@@ -249,7 +248,7 @@ def test_slow_variances_are_held_for_ten_seconds_of_the_stamps():
         assert [v for _, v in span] == pytest.approx([variance] * len(span), abs=part)
 
 
-def test_a_lost_further_sensor_widens_the_claimed_sd():
+def test_the_claimed_variance_increases_when_a_further_thermometer_is_lost():
     unit = calibration(
         sensors=SENSORS, response=(term('gradient', (30.0, 0.0, 0.0), sensor='tip'),)
     )
@@ -262,7 +261,7 @@ def test_a_lost_further_sensor_widens_the_claimed_sd():
     assert variances[-1] > variances[99] + (0.3 * 900.0 * 0.02 * 30.0 / 300.0) ** 2
 
 
-def test_a_thermometer_that_the_calibration_does_not_know_changes_nothing(rng):
+def test_a_thermometer_that_is_not_in_the_calibration_has_no_effect(rng):
     events = [('lid', stamp, 99.0) for _, stamp, _ in run_of(rng, seconds=20)]
     known = run_of(rng, seconds=20)
     both = [event for pair in zip(known, events, strict=False) for event in pair]
@@ -273,7 +272,7 @@ def test_a_thermometer_that_the_calibration_does_not_know_changes_nothing(rng):
     )
 
 
-def test_a_swap_of_calibrations_keeps_the_lags_that_the_two_share(rng):
+def test_a_new_calibration_with_equal_lags_keeps_the_lag_states(rng):
     unit = full_bank(rng)
     events = run_of(rng, seconds=60)
     compensator = Compensator(unit, UNCHECKED)

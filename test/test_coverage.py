@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The expected accuracy for given directions agrees with closed forms and simulated estimates."""
+"""The expected accuracy for given positions agrees with closed forms and simulated estimates."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def mean_variance(ups, at):
     return float(np.mean(np.trace(columns @ covariance @ columns.transpose(0, 2, 1), 0, 1, 2)))
 
 
-def test_the_columns_are_derivatives_of_the_measured_force(rng):
+def test_the_columns_equal_the_derivatives_of_the_measured_force(rng):
     up, step = units(rng, 20), 1e-6
 
     def force(constants):
@@ -54,24 +54,24 @@ def test_the_columns_are_derivatives_of_the_measured_force(rng):
 def test_without_positions_the_covariance_is_that_of_the_prior():
     covariance = constants_covariance(NOTHING, np.empty(0))
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), PRIOR_SD)
-    # If an axis is vertical, the variance of |f| is that of the bias plus that of the scale.
+    # With an axis along gravity the variance of |f| is the sum of those of its bias and scale.
     assert worst_sd(covariance) == pytest.approx(np.hypot(PRIOR_SD[0], PRIOR_SD[3]), rel=1e-3)
 
 
 def test_two_opposite_faces_determine_bias_and_scale_of_their_axis():
     sd = np.sqrt(np.diag(constants_covariance(FACES[:2], np.full(2, SD))))
-    # Bias and scale error of x are half the difference and half the sum of two readings of |f|.
+    # Bias and scale error are half the difference and half the sum of the errors of two readings.
     assert sd[[0, 3]] == pytest.approx(SD / np.sqrt(2.0), rel=1e-6)
     np.testing.assert_allclose(sd[[1, 2, 4, 5, 6, 7, 8]], PRIOR_SD[[1, 2, 4, 5, 6, 7, 8]])
 
 
-def test_the_covariance_is_the_scatter_of_estimates(rng):
+def test_the_covariance_equals_that_of_simulated_estimates(rng):
     up, n = positions(12, 3), 4000
     covariance = constants_covariance(up, np.full(12, SD))
     truth = rng.standard_normal((n, 9)) * PRIOR_SD
     columns = norm_columns(up)
     seen = truth @ columns.T + SD * rng.standard_normal((n, 12))
-    # The estimate is the mean of the constants given the norms, from their joint covariance.
+    # The estimate is the conditional mean of the constants for the given values of |f|.
     joint = columns * PRIOR_SD**2 @ columns.T + SD**2 * np.eye(12)
     estimate = seen @ np.linalg.solve(joint, columns * PRIOR_SD**2)
     # 4000 trials determine a standard deviation to 1.1 %.
@@ -81,24 +81,24 @@ def test_the_covariance_is_the_scatter_of_estimates(rng):
 
 
 @pytest.mark.parametrize('n', [0, 1, 4, 7, 11])
-def test_the_next_direction_lowers_the_mean_variance(n, rng):
+def test_the_next_direction_reduces_the_mean_variance(n, rng):
     up, at = units(rng, n), units(rng, 2000)
     covariance = constants_covariance(up, np.full(n, SD))
     proposed = next_direction(covariance, SD, up)
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
-    # A face, which is easy to hold, is chosen even with half the benefit of the best direction.
+    # Faces are preferred, as they are easy to hold, if they have at least half the best benefit.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
 
-def test_the_proposed_directions_make_a_good_test():
+def test_the_proposed_directions_are_nearly_as_good_as_spread_positions():
     up = NOTHING
     for _ in range(18):
         covariance = constants_covariance(up, np.full(len(up), SD))
         up = np.vstack([up, next_direction(covariance, SD, up)])
-    # Faces are proposed first, +z before all other faces, then directions for the misalignment.
+    # The six faces are proposed first, beginning with +z, then directions for the misalignment.
     assert up[0].tolist() == [0.0, 0.0, 1.0]
     assert {tuple(row) for row in up[:6]} == {tuple(face) for face in FACES}
     proposed = worst_sd(constants_covariance(up, np.full(18, SD)))
@@ -108,7 +108,7 @@ def test_the_proposed_directions_make_a_good_test():
 
 
 def test_the_largest_angle_to_the_nearest_direction():
-    # The directions farthest from all six faces are the corners of a cube.
+    # The corners of a cube are the directions farthest from all six faces.
     up, angle = farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))
     assert angle == pytest.approx(np.degrees(np.arccos(1.0 / np.sqrt(3.0))))

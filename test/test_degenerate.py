@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Degenerate inputs end with a sentence, in bounded time and memory."""
+"""Commands with unusable inputs end with a message, within limits of time and memory."""
 
 import degenerate
 import pytest
@@ -39,10 +39,10 @@ def test_a_degenerate_input_ends_with_a_sentence_in_bounded_memory(name, command
         ('axes not orthogonal', 'the angle between two of the axes is less than 60 degrees'),
     ],
 )
-def test_the_cause_of_a_refusal_is_named_in_the_users_words(name, text, tmp_path, cli):
+def test_the_message_of_a_refusal_names_its_cause(name, text, tmp_path, cli):
     path = degenerate.INPUTS[name].make(tmp_path)
     failed = cli('fit', path, '--gravity', '9.81', '-o', tmp_path / 'out.yaml', code=1)
     (line,) = [text for text in failed.stderr.splitlines() if ': error: ' in text]
     assert text in line
-    # If the command chose a topic by its message type, the message names the topic.
+    # The message names a topic that the command has selected by its message type.
     assert 'bag.mcap (/imu/data)' in line or name in {'stamps all zero', 'axes not orthogonal'}

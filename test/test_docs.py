@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Commands and snippets on the pages work, and every page is in the site."""
+"""Commands in the documentation print the output shown, and every page is in the site's menu."""
 
 import contextlib
 import io
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures('equal_fits_once', 'no_figures')
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 TUTORIAL = ROOT / 'docs' / 'tutorial.ipynb'
 FENCE = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
-# Commands that other test files run: a bag that plays for minutes, a record of 18 positions.
+# Commands that other files test: `play` takes minutes, and `record` waits for 18 positions.
 ELSEWHERE = (
     'thermo_comp play bags/held_out.mcap --rate 20',
     'thermo_comp record session --positions 18 --soak 45min -o bags/unit42',
@@ -59,15 +59,15 @@ def test_a_command_on_a_page_gives_the_output_shown(page, command, output, desk)
         assert is_alike(finished.stdout, output), finished.stdout
 
 
-def test_pages_have_commands_to_test():
+def test_commands_to_test_are_found_on_the_pages():
     assert {page for page, _, _ in COMMANDS} >= {'README.md', 'integration.md', 'recording.md'}
 
 
-def test_bash_takes_the_completion_script():
+def test_bash_accepts_the_completion_script():
     bash = shutil.which('bash')
     if bash is None:
         pytest.skip('no bash')
-    # thermo_comp looks for the shell that started it; the `:` keeps this shell running.
+    # thermo_comp asks which shell started it; without the `:` bash would replace itself by Python.
     words = f'eval "$({sys.executable} -m thermo_comp --show-completion; :)"; complete'
     finished = ran(bash, '-c', words)
     assert (finished.returncode, finished.stderr) == (0, '')
@@ -85,8 +85,8 @@ def test_every_page_is_in_the_site_s_menu():
     assert sorted(listed(nav)) == sorted(page.name for page in [*PAGES[1:], TUTORIAL])
 
 
-def test_rows_of_tables_have_as_many_cells_as_their_head():
-    # WHY: a bar in a cell, such as in |f|, began a further cell.
+def test_rows_of_tables_have_as_many_cells_as_the_header():
+    # WHY: the bars of |f| in a cell were taken for the borders of cells.
     for page in PAGES:
         text = re.sub(FENCE, '', page.read_text(encoding='utf-8'))
         for table in re.findall(r'^\|.*\n(?:\|.*\n)+', text, re.MULTILINE):
@@ -124,7 +124,7 @@ def test_the_tutorial_prints_what_it_shows(monkeypatch):
     assert n_figures == 2
 
 
-def test_messages_on_the_pages_are_those_of_the_source():
+def test_messages_quoted_on_the_pages_are_in_the_source():
     text = ''.join((ROOT / 'docs' / name).read_text() for name in ('recording.md', 'at_home.md'))
     quoted = re.findall(r'^\| `([^`]+)` \|', text, re.MULTILINE)
     assert len(quoted) > 10
@@ -132,6 +132,6 @@ def test_messages_on_the_pages_are_those_of_the_source():
     # Join adjacent string literals, which form one message.
     plain = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
-        # Numbers and '...' stand for values at run time: compare the longest text between.
+        # A number or '...' stands for a value at run time: compare the longest text between them.
         words = max(re.split(r'\d+(?:\.\d+)?|\.\.\.', sentence), key=len).strip(' ,;')
         assert words in plain, sentence

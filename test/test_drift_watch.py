@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts and forecasts of the drift watch agree with simulated units and closed forms."""
+"""Verdicts and forecasts of the drift watch agree with simulations and closed forms."""
 
 import sys
 
@@ -21,12 +21,12 @@ from thermo_comp.unit.gravity import MICRO_G
 
 
 def walked(rate, bound, axes=1, mean=0.0):
-    """Forecast a random walk from `mean`; the variance grows by `rate` per day on each axis."""
+    """Forecast a random walk from `mean`, whose variance grows by `rate` per day on each axis."""
     start = np.full(axes, mean)
     return passage(start, np.zeros((axes, axes)), np.sqrt(rate) * np.eye(axes), bound)
 
 
-def test_the_first_passage_follows_the_reflection_principle():
+def test_the_probability_of_a_first_passage_agrees_with_closed_forms():
     # A random walk of rate r stays within (-c, c) up to t with the probability: sum over k of
     # (-1)^k [N((2 k + 1) c / s) - N((2 k - 1) c / s)], s^2 = r t. In three dimensions a walk of
     # rate r on each axis stays in a ball of radius c up to t with the probability: 2 sum over
@@ -38,27 +38,27 @@ def test_the_first_passage_follows_the_reflection_principle():
     ):
         s = np.sqrt(rate * days)
         inside = norm.cdf((2 * k + 1) * bound / s) - norm.cdf((2 * k - 1) * bound / s)
-        # A share of about 0.5 of 2000 simulated walks has a standard error of 0.011.
+        # A share of about 0.5 among 2000 simulated walks has a standard error of 0.011.
         assert float((-1.0) ** k @ inside) == pytest.approx(1.0 - probability, abs=0.025)
         stays = 2.0 * (-1.0) ** (n + 1) @ np.exp(-((n * np.pi) ** 2) * rate * of_ball / 5000.0)
         assert stays == pytest.approx(1.0 - probability, abs=0.025)
-    # A random walk passes a near bound earlier; a unit that does not age never reaches a bound,
-    # and a unit beyond the bound has passed it.
+    # A random walk passes a nearer bound earlier, and a unit that does not age never passes it.
     assert walked(rate, bound, mean=30.0)[1] < walked(rate, bound)[1]
     assert walked(1e-12, bound) == (np.inf,) * 3
     assert walked(rate, bound, mean=51.0) == (0.0,) * 3
 
 
 @pytest.mark.slow
-def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
-    # WHY: signed errors of opposite attitudes had cancelled: forecasts were 3 to 5 times too long.
-    # WHAT: the days when random walks leave the tolerance lie in the printed interval.
+def test_forecasts_agree_with_the_simulated_future_of_units():
+    # WHY: errors of opposite signs in opposite attitudes cancelled: forecasts were 3 to 5 times
+    # too long.
     shares, ratios = [], []
     for kind in ('fixed', 'up and down', 'faces', 'carried'):
         for rows in field_watch.forecasts(kind, 3, 20).values():
             shares += rows[:, 0].tolist()
             ratios.append(float(np.median(rows[:, 3] / rows[:, 1])))
-    # The printed interval has a probability of 80 %, which 24 rows estimate with an error of 6 %.
+    # The true day must lie in the printed interval with a probability of 80 %, which is estimated
+    # from 24 rows with an error of 6 %.
     assert np.mean(shares) == pytest.approx(0.8, abs=0.12)
     # A unit's median time until it leaves the tolerance is uncertain by a factor of 1.5, the mean
     # of eight such times by 1.3.
@@ -70,14 +70,14 @@ def test_forecasts_agree_with_the_futures_of_units_in_any_attitudes():
     'attitudes', [upright, pytest.param(in_any_attitude, marks=pytest.mark.slow)]
 )
 def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
-    # The RMS error along gravity is 1.5 times the limit from day 20 to 34 and 0.6 times on other
-    # days, with turn-ons of 5 ug and a disturbance on day 12. The logs end on different days.
+    # The RMS error along gravity is 1.5 times the limit from day 20 to day 34, 20 times on day 12
+    # and 0.6 times otherwise. The logs end on different days.
     unit = known()
     limit = LIMIT * np.sqrt(np.mean(series_of(rests(unit, attitudes, no_error), unit).claim ** 2))
 
     def error(day):
         size = 1.5 if 20.0 <= day < 34.0 else 0.6
-        # Equal components of size s give an RMS error of s over all directions of gravity.
+        # A bias error of s on each axis has an RMS component of s along random directions.
         return np.full(3, limit * (20.0 if 12.0 <= day < 13.0 else size))
 
     series = series_of(rests(unit, attitudes, error, 40, turn_on=5.0 * MICRO_G), unit)
@@ -89,15 +89,15 @@ def test_the_verdict_follows_the_true_error_on_each_day(attitudes):
             (0, None) if since is None else (1, str(np.datetime64(first + since, 'D')))
         )
         assert ('outside its claim since' in str(result)) == (since is not None)
-        # In an attitude along the error the error is 0.6 * sqrt(3) = 1.04 times the limit.
+        # With gravity along (1, 1, 1) the error is 0.6 * sqrt(3) = 1.04 times the limit.
         back = [str(np.datetime64(first + day, 'D')) for day in (34, 35)]
         assert (result.inside_since in back) == (n_days > 34)
         assert ('again within its claim since' in str(result)) == (result.inside_since is not None)
-        # For a unit within its claim the forecast is later than the last day of the log.
+        # For a unit within its claim the printed day is later than the last day of the log.
         assert since is not None or f'about {result.last}' not in str(result)
 
 
-def test_the_watch_names_the_day_and_the_class_of_temperature():
+def test_the_drift_watch_states_the_day_and_the_temperature_range():
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )

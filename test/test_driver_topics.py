@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node and `record` read a driver's topics: temperatures in any message, or unstamped."""
+"""The node and `record` read temperatures from number fields of any message, also unstamped."""
 
 import threading
 import time
@@ -51,7 +51,7 @@ def sample(stamp_ns):
 
 
 @pytest.mark.parametrize('is_file', [False, True])
-def test_the_node_finds_the_type_while_it_runs(peer, unit, is_file):
+def test_the_node_finds_the_message_type_of_a_topic_while_it_runs(peer, unit, is_file):
     topics = ','.join(f'{name}={topic}' for name, topic in NAMES.items())
     if is_file:
         (unit.parent / 'lab.yaml').write_text(
@@ -106,7 +106,7 @@ def test_impossible_topics_are_refused(unit, topics, text, capfd):
     assert text in line
 
 
-def test_a_drivers_imu_data_raw_needs_another_output(unit, capfd):
+def test_a_driver_on_imu_data_raw_requires_another_output_topic(unit, capfd):
     calibration = replace(thermal_calibration(), unit=Unit('T-1', 'm/s^2', 160.0, 0.01))
     save_calibration(calibration, unit, overwrite=True)
     command = [
@@ -122,7 +122,7 @@ def test_a_drivers_imu_data_raw_needs_another_output(unit, capfd):
         assert node.node.count_publishers('/imu/compensated') == 1
 
 
-def test_record_writes_fields_of_messages_as_temperatures(peer):
+def test_record_writes_number_fields_of_messages_as_temperatures(peer):
     outputs = {}
     pause, deadline = threading.Event(), time.monotonic() + TIMEOUT
     messages = [
@@ -139,7 +139,7 @@ def test_record_writes_fields_of_messages_as_temperatures(peer):
         sent = []
 
         def wait(_seconds):
-            """Send each message after the previous one has arrived, until all have arrived."""
+            """Send the next message if the previous one has arrived; end after the last one."""
             if len(outputs) == len(sent) < len(messages):
                 role, message = messages[len(sent)]
                 sent.append(role)
@@ -157,7 +157,7 @@ def test_record_writes_fields_of_messages_as_temperatures(peer):
     assert (board.temperature, board.header.stamp.nanosec) == (25.0, 5)
 
 
-def test_a_live_field_reads_what_rclpy_wrote():
+def test_a_number_field_is_read_from_messages_that_rclpy_wrote():
     message = stamped(BatteryState(temperature=25.0, cell_temperature=[1.0, 2.5]), START_NS + 7)
     data = serialize_message(message)
     for path, value in (('temperature', 25.0), ('cell_temperature[1]', 2.5)):

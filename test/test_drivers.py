@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each file of config/drivers fits a bag with the topics and types of the driver."""
+"""With each file of config/drivers the commands read a bag with that driver's topics and types."""
 
 import csv
 import re
@@ -33,7 +33,7 @@ OWN = {
     'float32 mean_temp\n',
     'microstrain_inertial_msgs/msg/MipHeader': 'std_msgs/Header header\nuint8 event_source\n',
 }
-#: Topics of each driver and their types, as in docs/drivers.md, with further topics of a bag.
+#: Topics of each driver with their types (docs/drivers.md), and other topics in a bag.
 LAYOUTS = {
     'microstrain': {'/imu/data': IMU, '/mip/sensor/temperature_statistics': MIP},
     'xsens': {
@@ -52,7 +52,7 @@ LAYOUTS = {
     'bno055': {'/bno055/imu_raw': IMU, '/bno055/imu': IMU, '/bno055/temp': TEMPERATURE},
     'witmotion': {'/imu': IMU, '/temperature': TEMPERATURE, '/magnetometer': MAGNETIC},
     'phidgets': {'/imu/data_raw': IMU, '/temperature': FLOAT, '/imu/mag': MAGNETIC},
-    # PX4 publishes no Imu messages: a node of the user must publish them.
+    # PX4 publishes no Imu messages, so a node of the user must publish /imu/uncompensated.
     'px4': {'/imu/uncompensated': IMU, '/fmu/out/sensor_accel': PX4},
     'mavros': {
         '/mavros/imu/data': IMU,
@@ -67,14 +67,15 @@ LAYOUTS = {
 }
 #: Drivers that publish no temperature.
 LACKS = {'ardupilot', 'realsense', 'mpu6050'}
-#: Drivers whose bags are fitted: one per type of temperature message, one without temperatures.
+#: Drivers whose bags are fitted: one for each type of temperature message, one without readings.
 FITTED = {'xsens', 'mavros', 'px4', 'phidgets', 'ardupilot'}
-#: Six faces and the first face again, for REST_S each, while the board warms by WARMING [K/s].
+#: Seven rests of REST_S [s], on six faces and then on the first face; the board warms by WARMING
+#: [K/s].
 UPS = np.concatenate((np.eye(3), -np.eye(3), [[1.0, 0.0, 0.0]]))
 RATE, REST_S, WARMING = 5, 75, 0.05
 SECONDS = len(UPS) * REST_S
 GRAVITY, MICRO_G = 9.80665, 9.80665e-6
-#: Bias [m/s^2], its slope [m/s^2/K], noise of a sample [m/s^2]: 6 ug in means over 60 s.
+#: Bias [m/s^2], its slope [m/s^2/K], noise of a sample [m/s^2] (6 ug in means over 60 s).
 BIAS, SLOPE, NOISE = np.array([0.05, -0.03, 0.08]), np.array([1e-3, -2e-3, 3e-3]), 1e-3
 
 
@@ -110,7 +111,7 @@ def message(store, kind, stamp_ns, celsius, force):
 
 @pytest.fixture
 def bag(request, tmp_path, store):
-    """Write a tumble with the topics of a driver: samples at 5 Hz, other messages at 1 Hz."""
+    """Write rests with the topics of a driver: samples at 5 Hz, other messages at 1 Hz."""
     path, noise = tmp_path / 'bag', np.random.default_rng(40)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         links = {
@@ -142,7 +143,7 @@ def test_every_driver_has_a_layout_and_a_line_in_the_page():
 @pytest.mark.parametrize(
     ('path', 'bag'), [(path, path.stem) for path in FILES], indirect=['bag'], ids=str
 )
-def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
+def test_every_command_reads_a_bag_with_the_topics_of_the_driver(path, bag, tmp_path, cli):
     names, topics = read_names(path), ('--topics', path)
     has_board = path.stem not in LACKS
     printed = cli('info', bag, *topics).stdout
@@ -163,7 +164,7 @@ def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
     if path.stem in FITTED:
         finished = cli('fit', bag, *topics, '-o', fitted, '--gravity', str(GRAVITY))
         assert ('the bags have no thermometer' in finished.stdout) == (not has_board)
-        # Means over 60 s have a noise of 6 ug; the raw drift is 26 K times 1 to 3 mm/s^2 per K.
+        # Noise of means over 60 s: 6 ug. Drift of raw samples: 26 K times 1 to 3 mm/s^2/K.
         judged = parsed(cli('evaluate', bag, '-c', fitted, *topics, '--json', code=None).stdout)
         left = judged['sections_m_s2']['all']['rms'] / MICRO_G
         assert left < 10.0 if has_board else 500.0 < left < 2500.0
@@ -174,7 +175,7 @@ def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
         cli('replay', bag, '-c', fitted, '-o', tmp_path / 'out.csv', *topics)
         with (tmp_path / 'out.csv').open() as file:
             rows = list(csv.DictReader(file))
-        # The first sample precedes the first reading, and is published without waiting for it.
+        # The first sample precedes the first temperature reading, so it is not corrected.
         assert len(rows) >= SECONDS * RATE - 1
     if not has_board:
         command = 'replay', bag, '-c', tmp_path / 'warm.yaml', '-o', tmp_path / 'o.csv'
@@ -183,7 +184,7 @@ def test_every_command_works_on_a_bag_of_the_driver(path, bag, tmp_path, cli):
 
 
 def warming_unit():
-    """Make a unit whose z bias grows by 1 mm/s^2 per K: the output shows the reading in use."""
+    """Make a unit whose z bias grows by 1 mm/s^2/K, so the output shows the reading in use."""
     return calibration(
         unit=Unit('T-1', 'm/s^2', 160.0, 1.0 / RATE),
         axes=Axes(*[AxisReference(1.0, 0.0)] * 3),
@@ -210,7 +211,7 @@ def test_the_node_uses_the_topics_of_the_driver_s_file(path, tmp_path):
         topics = {topic.partition(':')[0] for name, topic in names.items() if name != 'output'}
         board, _, field = names['board'].partition(':')
         if field:
-            # The message package of the driver is not installed, so `LiveField` must refuse it.
+            # The driver's message package is not installed, so `LiveField` must refuse the topic.
             assert topics - {board} <= heard_topics
             with pytest.raises(ThermoCompError, match=f'{board}: its type .* is not installed'):
                 LiveField(board, layout[board], field)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Exported and imported calibrations agree with the formulas of the other tools."""
+"""Exports and imports agree with the formulas of PX4, ArduPilot, imu_tk, imu_calib and Kalibr."""
 
 import re
 from dataclasses import replace
@@ -51,8 +51,8 @@ def cubic():
 
 
 @pytest.mark.parametrize('to', TOOLS)
-def test_foreign_text_adds_no_line_to_an_export(cubic, to):
-    # WHY: a serial with a line break set a parameter of the vehicle.
+def test_a_serial_with_line_breaks_adds_no_line_to_an_export(cubic, to):
+    # WHY: a serial with a line break added a parameter to the parameter file of a vehicle.
     clean = export_calibration(cubic, to).text
     unit = replace(cubic.unit)
     forged = '7\nINS_TCAL1_ENABLE,0\r1\t1\tTC_A_ENABLE\t0\t6\x1b[2J\u2028x,1'
@@ -90,7 +90,7 @@ def test_the_formula_of_px4_gives_the_bias_of_the_calibration(cubic):
         for celsius in (5.0, 20.0, 33.0, 45.0):
             d = celsius - p['TC_A2_TREF']
             offset = sum(p[f'TC_A2_X{power}_{axis}'] * d**power for power in range(4))
-            # A parameter file of PX4 has nine digits, which determine a float32.
+            # A parameter file of PX4 has nine digits, enough for a number of single precision.
             assert offset == pytest.approx(bias_at(cubic, axis, celsius), rel=1e-8, abs=1e-9)
 
 
@@ -108,7 +108,7 @@ def test_the_formula_of_ardupilot_gives_the_bias_changes_of_the_calibration(cubi
             assert change == pytest.approx(ours, rel=1e-7, abs=1e-9)
 
 
-def test_ardupilot_import_has_no_bias_where_it_was_calibrated(cubic):
+def test_an_imported_ardupilot_bias_is_0_at_its_calibration_temperature(cubic):
     text = (
         export_calibration(cubic, 'ardupilot').text.replace(',', '=') + 'INS_ACC1_CALTEMP=28.0\n'
     )
@@ -137,8 +137,7 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
     px4 = export_calibration(unit, 'px4')
     value = numbers(px4.text, '\t')
     assert value['TC_G_ENABLE'] == 1.0
-    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 from the rate [rad/s], d being the temperature less
-    # TREF [K].
+    # PX4 subtracts X0 + X1 d + X2 d^2 + X3 d^3 from the rate [rad/s]; d: temperature - TREF [K].
     d = celsius[2] - value['TC_G0_TREF']
     for axis in range(3):
         bias = sum(value[f'TC_G0_X{power}_{axis}'] * d**power for power in range(4))
@@ -152,7 +151,7 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
 
     ardupilot = export_calibration(unit, 'ardupilot', number=2).text
     assert 'INS_TCAL2_GYR1_X' in ardupilot
-    # ArduPilot stores constant offsets elsewhere: a cubic is 0 at the calibration temperature.
+    # ArduPilot stores the bias at CALTEMP as another parameter, so its cubic is 0 at CALTEMP.
     found = again(f'{ardupilot}INS_GYR2_CALTEMP,{celsius[3]}\n')
     np.testing.assert_allclose(found, true - true[3], atol=1e-9)
     zeros = re.sub(r'(GYR\d_.),.*', r'\1,0', ardupilot)
@@ -164,7 +163,7 @@ def test_the_bias_of_a_gyroscope_is_exported_and_imported(cubic):
         import_calibration(px4.text.replace('TC_G0_X3_1', 'TC_G0_Y3_1'), serial='7')
 
 
-def test_counts_are_divided_by_the_scale_factor(cubic):
+def test_an_export_of_counts_to_px4_is_divided_by_the_scale_factor(cubic):
     axes = Axes(*(AxisReference(300.0, 300.0 * bias) for bias in (0.1, -0.2, 0.3)))
     scaled = []
     for axis in cubic.static.axes():
@@ -180,7 +179,7 @@ def test_counts_are_divided_by_the_scale_factor(cubic):
         assert numbers(ours.text, '\t')[name] == pytest.approx(value, rel=1e-8, abs=1e-12)
 
 
-def test_scale_drift_is_folded_in_at_an_attitude(cubic):
+def test_an_export_for_a_stated_attitude_contains_the_scale_drift(cubic):
     drifting = replace(cubic.static.z, scale_function=Polynomial((1.0, 1e-4)))
     regime = replace(cubic.static, z=drifting)
     calibration = replace(cubic, static=regime, dynamic=regime)
@@ -191,14 +190,15 @@ def test_scale_drift_is_folded_in_at_an_attitude(cubic):
     assert any(
         re.search(r'scale over temperature is lost: up to 2[45]\d\d ppm', n) for n in plain.notes
     )
-    # With +g on z, a scale drift of 100 ppm/K is an offset drift of 100 ppm/K times 9.81 m/s^2.
+    # If z measures +g, a scale drift of 100 ppm/K is an offset drift of 9.81e-4 m/s^2 per K.
     slope = [numbers(export.text, '\t')['TC_A0_X1_2'] for export in (plain, level)]
     assert slope[1] - slope[0] == pytest.approx(9.81e-4, rel=1e-5)
     assert numbers(plain.text, '\t')['TC_A0_X1_0'] == numbers(level.text, '\t')['TC_A0_X1_0']
 
 
-def test_px4_gets_the_offset_of_readings_in_si(cubic):
-    # WHY: PX4 subtracts the offset from readings in m/s^2; a scale error of 0.5 % is 5 mg at rest.
+def test_an_export_to_px4_contains_the_offset_in_m_s2(cubic):
+    # WHY: PX4 subtracts the offset from readings that it takes as m/s^2. At rest a scale error of
+    # 0.5 % is an error of 5 mg, which the offset for a stated attitude must contain.
     axes = Axes(*(AxisReference(0.995, bias) for bias in (0.1, -0.2, 0.3)))
     calibration = replace(cubic, axes=axes)
     plain = export_calibration(calibration, 'px4')
@@ -208,7 +208,7 @@ def test_px4_gets_the_offset_of_readings_in_si(cubic):
     up = (0.6, 0.0, 0.8)
     level = numbers(export_calibration(calibration, 'px4', up=up).text, '\t')
     for axis in range(3):
-        # At the attitude `up` and the reference temperature a reading less the offset is gravity.
+        # In the attitude `up` at the reference temperature, reading - offset must be gravity.
         d = 20.0 - level['TC_A0_TREF']
         reading = 0.995 * 9.81 * up[axis] + (0.1, -0.2, 0.3)[axis]
         offset = sum(level[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
@@ -262,7 +262,7 @@ def test_files_that_are_no_calibrations_are_refused(text, message):
         import_calibration(text, serial='7')
 
 
-def test_an_absent_set_and_an_empty_range_are_refused(cubic):
+def test_import_refuses_a_missing_parameter_set_and_an_empty_temperature_range(cubic):
     text = export_calibration(cubic, 'px4').text
     with pytest.raises(CalibrationError, match='no set of parameters 1'):
         import_calibration(text, serial='7', number=1)
@@ -271,7 +271,7 @@ def test_an_absent_set_and_an_empty_range_are_refused(cubic):
         import_calibration(empty, serial='7')
 
 
-def test_impossible_arguments_of_export_are_refused(cubic):
+def test_wrong_arguments_of_export_are_refused(cubic):
     for to, given, reason in (
         ('px4', {'number': 4}, r'`number` must be 0\.\.3, got 4'),
         ('ardupilot', {'number': 0}, r'`number` must be 1\.\.3, got 0'),
@@ -311,7 +311,7 @@ RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 
 
 
 def test_the_formula_of_imu_tk_gives_the_same_correction(tumbled):
-    # The header of imu_tk has X' = T K (X - B); a file of imu_tk has 9 + 9 + 3 numbers in rows.
+    # A file of imu_tk has 9 numbers of T, 9 of K and 3 of B for the formula X' = T K (X - B).
     file = export_calibration(tumbled, 'imu_tk')
     numbers = [float(cell) for cell in file.text.split()]
     T, K = np.reshape(numbers[:9], (3, 3)), np.reshape(numbers[9:18], (3, 3))
@@ -319,7 +319,7 @@ def test_the_formula_of_imu_tk_gives_the_same_correction(tumbled):
     assert np.all(np.tril(T, -1) == 0.0)
     assert np.count_nonzero(K - np.diag(np.diag(K))) == 0
     theirs = (RAW - numbers[18:]) @ (T @ K).T
-    # Angles printed with six digits cause errors of 1e-6 times 90 m/s^2.
+    # The notes have angles with six digits: an error of 1e-6 rad times 90 m/s^2.
     np.testing.assert_allclose(theirs, ours(tumbled, RAW) @ turn(file.notes).T, atol=1e-4)
     np.testing.assert_allclose(
         np.linalg.norm(theirs, axis=1), np.linalg.norm(ours(tumbled, RAW), axis=1), rtol=1e-12
@@ -343,14 +343,14 @@ def test_constants_are_unchanged_by_export_and_import(tumbled, to):
     file = export_calibration(tumbled, to)
     back = import_calibration(file.text, serial='7')
     assert back.unit.input == 'counts'
-    # An export to imu_tk rotates the frame of the axes, an import rotates the frame back.
+    # The export to imu_tk rotates the frame of the axes, and the import rotates the frame back.
     np.testing.assert_allclose(ours(back, RAW), ours(tumbled, RAW), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(back.misalignment, tumbled.misalignment, atol=1e-12)
     assert any('hold at 20 degC' in note for note in file.notes)
 
 
 def test_a_file_that_imu_tk_saved_is_read():
-    # A file of imu_tk has columns of six digits; `theirs` is the formula of imu_tk by hand.
+    # The text is a file that imu_tk wrote; `theirs` is the formula of imu_tk, written by hand.
     text = (
         '          1 -0.00354989 -0.00890444\n          0           1 -0.0213032\n'
         '          0           0           1\n\n'
@@ -366,7 +366,7 @@ def test_a_file_that_imu_tk_saved_is_read():
     np.testing.assert_allclose(ours(back, RAW) @ rotation.T, theirs, atol=1e-4)
 
 
-def test_a_full_matrix_becomes_a_triangular_matrix_and_a_rotation():
+def test_an_imported_full_matrix_becomes_a_triangular_matrix_and_a_rotation():
     SM = np.array([[1.02, 0.03, -0.01], [-0.02, 0.99, 0.02], [0.01, -0.03, 1.01]])
     text = f'SM: {SM.ravel().tolist()}\nbias: [0.12, -0.05, 0.2]\n'
     back = import_calibration(text, serial='7')
@@ -383,7 +383,7 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
     back = import_calibration(f'imu0:\n{imu}  update_rate: 200.0\n', serial='7')
     assert back.unit.input == 'm/s^2'
     assert 'no bias' in back.provenance.notes[0]
-    # The reading (1.01, 1.99, 3.06) was computed by hand as M a, with a = (1, 2, 3) m/s^2.
+    # The reading (1.01, 1.99, 3.06) is M a for a = (1, 2, 3) m/s^2.
     np.testing.assert_allclose(ours(back, np.array([[1.01, 1.99, 3.06]])), [[1, 2, 3]], rtol=1e-12)
     with pytest.raises(
         CalibrationError, match='choose an IMU with --number: the file has imu0, imu1'
@@ -391,8 +391,8 @@ def test_kalibr_files_without_bias_and_with_several_imus_are_read():
         import_calibration(f'imu0:\n{imu}imu1:\n{imu}', serial='7')
 
 
-def test_px4_rates_of_different_degree_keep_their_own_reference(cubic):
-    # WHY: an axis without a third power had too few coefficients, which ended in a traceback.
+def test_px4_rate_polynomials_of_different_degree_are_imported(cubic):
+    # WHY: an axis without a third power had too few coefficients, and the import failed.
     rows = [(1e-3, 0.0, 0.0, 0.0), (2e-3, 1e-4, 0.0, 0.0), (0.0, 1e-4, -2e-6, 3e-8)]
     lines = [f'TC_G0_X{p}_{axis}={row[p]!r}' for axis, row in enumerate(rows) for p in range(4)]
     lines += ['TC_G_ENABLE=1', 'TC_G0_TREF=31', 'TC_G0_TMIN=0', 'TC_G0_TMAX=50']
@@ -406,5 +406,5 @@ def test_px4_rates_of_different_degree_keep_their_own_reference(cubic):
             assert ours == pytest.approx(theirs, abs=1e-12)
 
 
-def test_the_command_export_offers_every_tool():
+def test_the_command_export_has_every_tool_as_a_choice():
     assert get_args(Tool) == tuple(TOOLS)

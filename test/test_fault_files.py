@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""If an output cannot be written or a writer is killed, the old or the new file is complete."""
+"""After a full disk or a killed command, an output is the complete old or complete new file."""
 
 import os
 import re
@@ -19,11 +19,11 @@ from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
-#: Bags of a fit that takes half a second, in the working folder.
+#: Bags in the working folder, whose fit takes 0.5 s.
 FIT = ('bags/01.mcap', 'bags/02.mcap')
 HELD_OUT = ROOT / 'bags' / 'held_out.mcap'
 GRAVITY = ('--gravity', '9.80665', '--model', 'golovach')
-#: Arguments of the command for each output, before and after the path of the output.
+#: For each output the arguments of its command, before and after the path of the output.
 COMMANDS = {
     'unit.yaml': (('fit', *FIT, *GRAVITY, '-f', '-o'), ()),
     'page.html': (('report', '-c', 'unit.yaml', '-f', '-o'), ()),
@@ -71,7 +71,7 @@ def test_a_conversion_on_a_full_disk_leaves_no_file(small_disk, tmp_path, cli):
 
 @pytest.mark.parametrize('small_disk', [300], indirect=True)
 def test_a_recording_on_a_full_disk_keeps_what_was_written(small_disk, cli):
-    # The recording is 700 KB of noise, which compresses to more than the disk of 300 KB holds.
+    # The recording is 700 KB of noise, which does not fit on a disk of 300 KB when compressed.
     n = 20000
     stamps = np.arange(n) * 10**8
     samples = np.random.default_rng(1).normal((0.0, 0.0, 2942.0), 3.0, (n, 3))
@@ -108,7 +108,7 @@ def test_output_into_a_read_only_folder_fails_in_one_line(folder, cli, name):
     assert line.startswith(f'thermo_comp: error: {locked / name}: ')
 
 
-#: A script that runs a command and kills itself while the temporary output is open, or complete.
+#: A script that runs a command and kills itself while it writes, or before the final rename.
 KILLED = """
 import os, signal, sys
 point, target = sys.argv[1:3]
@@ -157,10 +157,10 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert output.read_bytes() == old
     (rest,) = set(folder.iterdir()) - listed
-    # The file that a killed command leaves has a hidden name, which no tool takes for an output.
+    # A killed command leaves a file with a hidden name.
     assert rest.name.startswith('.')
     if point == 'before':
-        # If the command is killed just before the rename, the hidden file is complete.
+        # Before the rename the hidden file is complete.
         if name == 'unit.yaml':
             assert load_calibration(rest).unit.serial
         elif name == 'bag.mcap':
@@ -171,8 +171,8 @@ def test_a_killed_command_leaves_the_old_file(folder, name, point):
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'rows.csv'])
-def test_a_terminated_command_leaves_no_file(folder, name):
-    # WHY: a hidden file as large as the bag remained whenever SIGTERM ended a command.
+def test_a_command_ended_by_sigterm_leaves_no_file(folder, name):
+    # WHY: a command that was ended by SIGTERM left a hidden file as large as the bag.
     listed = set(folder.iterdir())
     arguments = [str(word) for word in COMMANDS['bag.mcap'][0]]
     script = KILLED.replace('SIGKILL', 'SIGTERM')

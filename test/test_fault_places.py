@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Faults at the worst times of a ramp are covered by the covariance (compensator without DDS).
+The published covariance covers faults at any time of a ramp (tested without DDS).
 
 WHY: the covariance was large enough for a fault in the middle of a ramp, but not for an equal
-fault at the start of a ramp, nor after a sensor came back with another value. PROMISE: every
-published sample has an error below five claimed standard deviations.
+fault at the start of a ramp, nor if the readings of a sensor returned with another value.
+Every published sample must have an error below five claimed standard deviations.
 """
 
 import math
@@ -48,18 +48,18 @@ SIGMAS = 5.0
     ],
     ids=['both stop early', 'both stop later', 'both freeze', 'case steps', 'both step'],
 )
-def test_no_published_sample_is_wrong_beyond_its_sd(inject):
+def test_every_published_error_is_below_five_claimed_sd(inject):
     stamps, table = corrected(inject(bag()))
     seconds = (stamps - START_NS) * 1e-9
     sd = np.sqrt(table[:, [3, 6, 8]])
     off = (np.abs(table[:, :3] - force_at(seconds)) / sd).max(axis=1)
     assert seconds[off > SIGMAS].tolist() == []
-    # Before the fault the published sd is noise and residual alone, too small to cover any fault.
+    # Before a fault the published sd must be small: it must not always be as large as for a fault.
     assert sd[450:540].max() < 3e-4
 
 
 def settling_s():
-    """Return the time until the board's lag has reduced the rate of a ramp, plus dwell_s [s]."""
+    """Return the time from the end of a ramp to the end of the dynamic regime [s]."""
     detector = unit().detector
     ramp = 60.0 * RAMP_K_S
     return BOARD_LAG_S * math.log(ramp / detector.relaxed_rate_k_min) + detector.dwell_s
@@ -88,7 +88,7 @@ def test_output_recovers_from_transient_faults_within_the_settling_time():
     assert f'after {max(back.values()):.0f} s' in page
 
 
-def test_the_page_has_every_row_and_names_tests_that_are_there():
+def test_the_page_has_every_fault_row_and_names_tests_that_exist():
     named = re.findall(r'`(test_\w+\.py)::(\w+)(?:\[(.+)\])?` \|$', PAGE.read_text(), re.MULTILINE)
     assert [row for *_, row in named if row] == [row.fault for row in ROWS]
     for file, name, _ in named:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node survives restarts, signals, reloads and bad calibration files."""
+"""Restarts, signals, reloads and wrong calibration files of a node process."""
 
 import os
 import signal
@@ -68,7 +68,7 @@ def test_a_node_killed_in_a_ramp_restarts_with_larger_covariance(path):
         assert first.values['memory settled'] == 'False'
         rest = node.play([e for e in events if seconds_of(e[1]) >= 91.0])
     n = len(first.force)
-    # The covariance includes the effect of unknown temperatures before the start of the process.
+    # Lag states are unknown after the start of a process, so the covariance is larger.
     at = round(90.0 * RATE_HZ)
     assert (first.covariance[:, 0, 0] > 4.0 * undisturbed[at : at + n, 3].max()).all()
     assert max(sigmas(first), sigmas(rest)) < SIGMAS
@@ -87,7 +87,7 @@ def truncated(path):
 
 
 def cut_between_keys(path):
-    # WHY: the keys after `misalignment_sd` have defaults, so the cut file was accepted.
+    # WHY: all keys from `misalignment_sd` on have defaults, so a file cut there was accepted.
     content = path.read_bytes()
     path.write_bytes(content[: content.index(b'\nmisalignment_sd:') + 1])
 
@@ -96,7 +96,7 @@ def unreadable(path):
     if os.geteuid():
         path.chmod(0)
     else:
-        # Root may open any file, but no process can read the first byte of /proc/self/mem.
+        # Root can open any file, but nobody can read the first byte of /proc/self/mem.
         path.unlink()
         path.symlink_to('/proc/self/mem')
 
@@ -161,7 +161,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     path = tmp_path / 'fast.yaml'
     fast = unit(unit=Unit('F-1', 'counts', 8388607.0, 1e-3))
     save_calibration(fast, path)
-    # 60 s of samples suffice on any machine; the loop of sending ends with the last answer.
+    # The loop ends with the last answer; 60 s of samples are more than enough.
     events = bag(rate_hz=1000.0, duration_s=60.0)
     n_reloads = 100
     with bench(path) as node:
@@ -195,7 +195,7 @@ def test_many_reloads_at_1_khz_lose_no_sample(tmp_path):
     assert len(heard.force) == n_samples
     seconds = (heard.stamp_ns - START_NS) * 1e-9
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
-    # Due to noise one sample in a million has an error above 5 sd, so the limit is 6 sd.
+    # By noise one sample in a million exceeds 5 sd; there are many samples, so the limit is 6 sd.
     assert (np.abs(heard.force - force_at(seconds)) < (SIGMAS + 1.0) * sd).all()
 
 
@@ -212,13 +212,13 @@ def test_a_signal_while_samples_flow_ends_the_node_cleanly(path, number):
     assert sigmas(heard) < SIGMAS
 
 
-def test_the_slope_of_the_soak_benchmark_has_the_right_error(rng):
+def test_the_slope_of_the_soak_benchmark_has_the_claimed_standard_error(rng):
     time = np.arange(3600.0)
     values = 100.0 + 7.0 * time / 3600.0 + rng.standard_normal(3600)
-    # `slope` leaves out the first tenth of the run, here 360 s.
+    # `slope` leaves out the first 10 % of the run, here 360 s.
     values[:300] += 50.0
     slope, sd = soak.slope(list(zip(time.tolist(), values.tolist(), strict=True)), 60.0)
-    # Sd of the slope: sd of a mean of 60 values / root of the sum of squares of the 54 times.
+    # Sd of the slope: sd of a mean over 60 s / root of the sum of squares of the 54 centred times.
     assert sd == pytest.approx(1.0 / 60**0.5 / (54 * 0.9**2 / 12) ** 0.5, rel=0.3)
     assert abs(slope - 7.0) < 4.0 * sd
     assert soak.slope([(0.0, 1.0), (1.0, 1.0)], 60.0) is None

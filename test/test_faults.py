@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The fault table: each row goes through the compensator and the node's diagnostics, and every number
-is compared with the truth. Rows about the order of arrival are also sent over DDS to the node
-process, whose output must equal that without DDS.
+For each row of the fault table the output of compensator and diagnostics is compared with the
+truth. Rows about the order of arrival are also sent over DDS to a node process, whose output must
+equal that without DDS.
 """
 
 from copy import deepcopy
@@ -25,11 +25,11 @@ from thermo_comp.ros.diagnostics import findings_of
 from thermo_comp.ros.reader import LoadedCalibration
 from thermo_comp.unit.calibration_file import save_calibration
 
-#: Largest error / published sd of a published force that does not count as wrong.
+#: A published force is wrong if its error exceeds this number of published standard deviations.
 SIGMAS = 5.0
-#: Largest difference of a recovered output to the undisturbed output [m/s^2]: 1 ug.
+#: After recovery the output differs from the undisturbed output by at most 1 ug [m/s^2].
 RECOVERED = 9.80665e-6
-#: Rows that also run over DDS, because the order of arrival of messages matters.
+#: Rows that are also tested over DDS, because they depend on the order of arrival of messages.
 OVER_DDS = (
     *('board late by 5 s', 'counts out of order'),
     *('time jumps back', 'temperatures of another clock'),
@@ -37,7 +37,7 @@ OVER_DDS = (
 
 
 class Direct:
-    """A compensator that takes lots of messages without DDS, with the findings of the node."""
+    """A compensator that gets groups of messages without DDS, with the diagnostics of the node."""
 
     def __init__(self):
         self.compensator = Compensator(unit(), CONFIG)
@@ -68,7 +68,7 @@ class Direct:
 
 @cache
 def undisturbed():
-    """Return each lot of the undisturbed bag, an empty last lot, and `Direct` before each lot."""
+    """Return groups of messages of the undisturbed bag, each with the state before the group."""
     run, result = Direct(), []
     for lot in (*lots(bag()), []):
         result.append((lot, deepcopy(run)))
@@ -78,7 +78,7 @@ def undisturbed():
 
 
 def direct(events):
-    """Run events, from a copy of the undisturbed run up to the first lot with a fault."""
+    """Run events; up to the first group with a fault, use the results of the undisturbed run."""
     given, known = list(lots(events)), undisturbed()
     n = next((k for k, lot in enumerate(given) if lot != known[k][0]), len(given))
     run = deepcopy(known[n][1])
@@ -88,7 +88,7 @@ def direct(events):
 
 
 def wrong(row, heard):
-    """Return the times of wrong published samples outside the span `blind` of the row."""
+    """Return times of wrong samples outside `blind`, the span in which a fault is undetectable."""
     seconds = true_seconds(row, heard.stamp_ns)
     sd = np.sqrt(np.diagonal(heard.covariance, axis1=1, axis2=2))
     is_wrong = (np.abs(heard.force - force_at(seconds)) > SIGMAS * sd).any(axis=1)
@@ -112,7 +112,7 @@ def test_fault_row_without_dds(row, reference):
         assert not ((begin <= seconds) & (seconds < end)).any(), (begin, end)
     for level, text in row.says:
         assert heard.says(text, level), (level, text, sorted(set(heard.reports)))
-    # Even wrong output must be finite, with a positive definite covariance.
+    # Forces must be finite and covariances positive definite also in the span `blind`.
     assert np.isfinite(heard.force).all()
     if len(seconds):
         assert np.linalg.eigvalsh(heard.covariance).min() > 0.0

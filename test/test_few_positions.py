@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to few positions: determined parameters are right, the others stay at their prior."""
+"""Fits to few positions: determined parameters are right, undetermined ones keep their prior."""
 
 from dataclasses import replace
 from functools import cache
@@ -25,7 +25,7 @@ MICRO_G = 9.80665e-6
 
 
 def minutes(values):
-    """Return means over 60 s [ug] of values at 1/4 Hz; rows without a temperature are NaN."""
+    """Return means over 60 s [ug] of values [m/s^2] at 1/4 Hz, without the rows with NaN."""
     values = values[~np.isnan(values).any(axis=1)]
     n = len(values) // 15
     return values[: 15 * n].reshape(n, 15, 3).mean(axis=1) / MICRO_G
@@ -36,7 +36,7 @@ def left_by(pair, **options):
     bags = [BAGS / f'fit/0{number}.mcap' for number in pair]
     calibration = tc.fit(bags, gravity=9.80665, **options)
     held_out = tc.read(BAGS / 'held_out.mcap')
-    # Averaging samples and times over 4 s keeps the means over 60 s and saves computing time.
+    # Average samples and times over 4 s: this saves time and does not change means over 60 s.
     n = len(held_out.time_s) // 8
     time_s = held_out.time_s[: 8 * n].reshape(n, 8).mean(axis=1)
     counts = held_out.counts[: 8 * n].reshape(n, 8, 3).mean(axis=1)
@@ -51,13 +51,13 @@ def left_by(pair, **options):
 @pytest.mark.slow
 def test_two_positions_determine_the_thermal_response():
     # Noise of 9 ug/sqrt(Hz) is 1.2 ug in means over 60 s; 128 means determine the sd to 6 %, and
-    # superfluous columns may add 10 %. The median error of all 36 pairs of bags is 1.3 ug
-    # (docs/accuracy.md).
+    # superfluous columns may increase the sd by 10 %. Over all 36 pairs of bags the median sd is
+    # 1.3 ug (docs/accuracy.md).
     assert left_by((1, 2)) == pytest.approx([1.2] * 3, rel=0.3)
 
 
 @pytest.mark.slow
-def test_two_sets_leave_a_lag():
+def test_a_model_without_lags_leaves_a_drift_in_a_third_position():
     assert (left_by((1, 2), model='golovach') > 10.0).all()
 
 
@@ -76,8 +76,8 @@ def one_position():
 
 def turned(rng, ups, rest_s=20.0):
     """
-    Record a triad with bias (0.1, -0.2, 0.3) m/s^2: a rest in each attitude of `ups`, each before
-    a motion.
+    Record a triad with bias (0.1, -0.2, 0.3) m/s^2: a rest in each attitude of `ups`, followed by
+    1 s of motion.
     """
     n = round(100 * rest_s)
     parts = []
@@ -91,7 +91,7 @@ def turned(rng, ups, rest_s=20.0):
 
 @cache
 def tumbled(n):
-    """Fit one recording of n attitudes, with the noise of the fixture `rng`."""
+    """Fit one recording of n attitudes, without a thermometer."""
     return fit([turned(np.random.default_rng(20161), positions(n, 3))], OPTIONS)
 
 
@@ -138,9 +138,9 @@ def test_one_position_leaves_the_scale_at_its_prior(one_position):
     )
 
 
-def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
-    # WHY: norms of one attitude do not separate bias and scale; the fit attributed the drift to
-    # the scale and claimed an sd of 0 for the drift of the bias, whose error was left on two axes.
+def test_after_soaks_in_one_position_the_drift_error_is_within_three_claimed_sd(rng):
+    # WHY: norms in one attitude do not separate bias and scale. The fit attributed the drift to
+    # the scale, and claimed an sd of 0 for the drift of the bias, which was wrong on two axes.
     slope = 0.1 * SLOPE
     bags = []
     for celsius in (5.0, 20.0, 35.0):
@@ -152,9 +152,9 @@ def test_soaks_in_one_position_leave_the_drift_to_the_claimed_sd(rng):
 
 
 @pytest.mark.slow
-def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_each_rest(rng):
-    # WHY: the warm-up of the board, which the sensor does not follow, gave a bias slope of 0, and
-    # differences between the norms of 36 rests were taken for mountings that do not repeat.
+def test_rests_at_three_temperatures_give_the_bias_slope_despite_a_warm_up_of_the_board(rng):
+    # WHY: the sensor does not follow the warm-up of the board. The fit found a bias slope of 0,
+    # and took differences between the norms of rests for mounting offsets.
     bags = []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(8, 3):
@@ -165,21 +165,21 @@ def test_norms_at_three_temperatures_give_the_curve_if_the_board_warms_up_in_eac
     calibration, at = result.calibration, np.array([6.0, 36.0])
     curves = [axis.bias_function for axis in calibration.static.axes()]
     slopes = np.array([np.diff(curve.value(at))[0] / 30.0 for curve in curves])
-    # Each norm has a noise of 1 ug; with a warm-up of 1 K in 600 s its temperature is uncertain
-    # by 0.1 K.
+    # The norm of a rest has a noise of 1 ug, and due to the warm-up by 1 K the sensor's
+    # temperature in a rest is uncertain by 0.1 K.
     np.testing.assert_allclose(slopes, 0.1 * MG * SLOPE, atol=0.002 * MG)
     assert 'misfit' not in names_of(result)
-    # Soaks do not determine the weight of the sensor's lag, which is at most the bias slope: the
-    # claimed sd of the weight is between half of the slope and the slope.
+    # Soaks do not determine the weight of a lag column, which is at most the bias slope: the
+    # claimed sd of this weight is between half of the bias slope and the bias slope.
     variance, layout = np.diag(calibration.posterior.covariance()), parameter_layout(calibration)
     of_lags = [variance[block.response : block.end].sum() for block in layout.bias]
     assert 0.5 < np.sqrt(np.mean(of_lags) / np.mean(slopes**2)) < 1.0
 
 
 @pytest.mark.slow
-def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
-    # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd between rests at
-    # different temperatures. With seed 2 the error exceeds the sd claimed from the drifts alone.
+def test_the_drift_error_of_a_sensor_that_follows_half_of_a_warm_up_is_within_three_claimed_sd():
+    # WHY: a curve fitted to the drifts within rests was wrong by 7 claimed sd over the range of
+    # temperatures. Seed 2 gives an error above the sd that follows from these drifts.
     rng, slopes, bags = np.random.default_rng(2), 0.1 * MG * SLOPE, []
     for celsius in (5.0, 20.0, 35.0):
         for up in positions(6, 3):
@@ -193,9 +193,9 @@ def test_the_warm_up_of_a_board_that_the_sensor_follows_by_half_is_claimed():
     assert (pulls < 3.0).all()
 
 
-def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
-    # WHY: without tilts in the model, a support tilt of 4 urad/K gave the scale factor of an axis
-    # at 0.03 g a slope of 137 ppm/K.
+def test_tilts_of_two_supports_are_not_taken_for_a_scale_slope_of_a_level_axis(rng):
+    # WHY: without tilts in the model, a support tilt of 4 urad/K was fitted as a slope of 137
+    # ppm/K of the scale factor of an axis with a force of 0.03 g.
     bags = []
     for up, tilt in (((1.0, 0.0, 0.03), 4e-6), ((0.0, 1.0, -0.03), -4e-6)):
         rest = Rest(rng, level=tuple(GRAVITY * np.array(up)), sd=0.1 * MG)
@@ -206,13 +206,14 @@ def test_a_tilt_of_two_supports_is_not_the_scale_of_an_axis_across_gravity(rng):
     at = np.array([0.0, 10.0])
     # 15000 samples (noise 0.1 mg) determine the mean bias slope of the two rests to 1 ug/K.
     assert np.diff(z.bias_function.value(at))[0] == pytest.approx(MG, abs=0.01 * MG)
-    # At 0.03 g a slope of 1 ug/K is 33 ppm/K of the scale factor, for two rests 47 ppm/K.
+    # With a force of 0.03 g, an error of 1 ug/K is 33 ppm/K of the scale factor, and the
+    # difference of two rests with such errors is 47 ppm/K; the limit is ten times this.
     assert abs(np.diff(z.scale_function.value(at))[0]) < 10.0 * 47e-6
 
 
 @pytest.mark.slow
-def test_one_tilted_support_is_not_the_scale_of_an_axis_across_gravity():
-    # WHY: a tilt of 17 urad/K gave a scale slope of 817 +- 23 ppm/K, for prior sd up to 200 ppm/K.
+def test_a_tilt_of_one_support_is_not_taken_for_a_scale_slope_of_a_level_axis():
+    # WHY: a support tilt of 17 urad/K was fitted as a scale slope of 817 +- 23 ppm/K.
     rng = rng_of('linear tilts', 1)
     unit = replace(consumer_grade(rng), counts=0.0)
     ups = (1.0, 0.0, 0.03), (0.0, 1.0, 0.0)
@@ -225,12 +226,12 @@ def test_one_tilted_support_is_not_the_scale_of_an_axis_across_gravity():
     slope = parameter_layout(calibration).scale[2].static + 1
     sd = np.sqrt(calibration.posterior.covariance()[slope, slope])
     found = np.diff(calibration.static.z.scale_function.value(np.array([0.0, 1.0])))[0]
-    # No position determines the slope of the scale factor, whose prior sd is at most 100 ppm/K.
+    # The z axis is level in both positions, so the slope of its scale factor keeps its prior sd.
     assert sd < 100e-6
     assert abs(found - 1e-6 * unit.scale_curve[0, 2]) < 3.0 * sd
 
 
-def test_one_position_becomes_parameters_of_an_autopilot(one_position):
+def test_a_calibration_from_one_position_is_exported_to_px4(one_position):
     text = export_calibration(one_position.calibration, 'px4', device_id=1).text
     rows = [line.split() for line in text.splitlines() if line.startswith('1')]
     value = {row[2]: float(row[3]) for row in rows}
@@ -240,11 +241,11 @@ def test_one_position_becomes_parameters_of_an_autopilot(one_position):
         assert np.diff(offset)[0] / 15.0 / MG == pytest.approx(slope, abs=0.2)
 
 
-def test_positions_without_temperature():
+def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slopes():
     result = tumbled(12)
     calibration = result.calibration
     axes = calibration.axes
-    # The noise of 2 mg a sample averages to 50 ug over 12 rests of 20 s.
+    # A sample has a noise of 2 mg, the mean over a rest of 20 s a noise of 50 ug.
     np.testing.assert_allclose([axis.bias for axis in axes], (0.1, -0.2, 0.3), atol=0.005)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], 1.0, atol=0.001)
     assert calibration.response == ()
@@ -256,29 +257,29 @@ def test_positions_without_temperature():
     for bias, scale in zip(layout.bias, layout.scale, strict=True):
         assert sd[bias.static + 1] == pytest.approx(5e-3, rel=0.02)
         assert sd[scale.static + 1] == pytest.approx(2e-4, rel=0.02)
-    # Without a thermometer the unit is assumed to be within 10 K of the reference.
+    # Without a thermometer the temperature is assumed to be the reference, with an sd of 10 K.
     out = calibration.correct([1.0], [[0.1, -0.2, GRAVITY + 0.3]])
     np.testing.assert_allclose(out.specific_force, [[0.0, 0.0, GRAVITY]], atol=0.02)
     left = np.array([0.05, 0.05, np.hypot(0.05, 2e-3 * GRAVITY)])
-    # The covariance is the noise of a sample, 0.02 m/s^2, plus the uncertainty of the tumble.
+    # The sd of an output: 0.02 m/s^2 noise of a sample, and 10 K times the slopes' sd (`left`).
     np.testing.assert_allclose(
         np.sqrt(np.diagonal(out.covariance[0])), np.hypot(left, 0.02), rtol=0.05
     )
 
 
-def test_the_assumed_repeatability_of_the_bias_is_stated(rng):
-    # The nine constants of a triad explain nine norms, whatever the offsets of the mountings.
+def test_a_fit_that_cannot_determine_the_repeatability_of_mountings_reports_its_assumption(rng):
+    # The nine constants of a triad fit nine norms exactly, so nine norms do not show offsets.
     assert 'mountings' in names_of(tumbled(9))
     stated = fit([turned(rng, positions(9, 3))], replace(OPTIONS, mounting_sd=1e-3))
     assert 'mountings' not in names_of(stated)
-    # Twelve positions show how well mountings repeat, but one recording has one turn-on offset.
+    # One recording of twelve positions has one turn-on, twelve recordings have twelve turn-ons.
     assert 'mountings' in names_of(tumbled(12))
     twelve = fit([turned(rng, [up]) for up in positions(12, 3)], OPTIONS)
     assert 'mountings' not in names_of(twelve)
 
 
 def test_counts_of_32_bits_are_fitted(rng):
-    # WHY: a full scale above 1e7 counts was refused after the fit: the limits assumed K = 1.
+    # WHY: a full scale above 1e7 counts was refused, by a limit for samples in m/s^2.
     source = turned(rng, positions(9, 3))
     K = 2.0**31 / (12.0 * GRAVITY)
     options = FitOptions(gravity=GRAVITY, input='counts', full_scale=2.0**31)
@@ -287,11 +288,11 @@ def test_counts_of_32_bits_are_fitted(rng):
     assert axes.x.scale_factor == pytest.approx(K, rel=0.01)
 
 
-def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
-    # WHY: positions of one recording share a turn-on; the claimed bias sd was 1/6 of the error.
+def test_the_bias_sd_of_one_recording_contains_the_sd_of_a_turn_on(rng):
+    # WHY: the claimed bias sd was 1/6 of the error, as if each position had a separate turn-on.
     offsets = 5e-3 * rng.standard_normal((8, 3))
     ups = positions(12, 3)
-    # `least`: sd of turn-ons in the prior, for noise of 0.02 m/s^2 at 100 Hz, or as stated.
+    # `least`: prior sd of turn-ons for a noise of 0.02 m/s^2 at 100 Hz, and the stated sd [m/s^2].
     stated = fit([turned(rng, ups)], replace(OPTIONS, mounting_sd=5e-3))
     for result, least in ((tumbled(12), 1e-3), (stated, 5e-3)):
         calibration = result.calibration
@@ -305,10 +306,9 @@ def test_the_turn_on_that_all_positions_of_a_recording_share_is_claimed(rng):
 
 
 @pytest.mark.slow
-def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
-    # WHY: with three recordings at three temperatures, turn-ons were claimed as an error of the
-    # mean of the turn-ons alone, and mounting offsets as independent: the claimed variances of
-    # the axes were 1.6, 1.8 and 1.9 times the variance of a turn-on.
+def test_the_claimed_variance_of_a_curve_contains_that_of_turn_ons_at_each_temperature(rng):
+    # WHY: for three recordings at three temperatures the claimed variance contained the error of
+    # the mean turn-on offset only: 1.6 to 1.9 times the variance of a turn-on.
     turn_on, ups, dwell = 5e-3, positions(9, 3), 600
     bags = []
     for celsius in (-15.0, 20.0, 55.0):
@@ -321,17 +321,16 @@ def test_turn_ons_at_different_temperatures_are_errors_of_the_curve(rng):
     unit = tc.fit(bags, gravity=GRAVITY, input='m/s^2', mounting_sd=turn_on)
     for bag in (bags[0], bags[2]):
         out = unit.correct(bag.time_s, bag.counts, board=bag.temperatures['board'])
-        # The leverage of the curve at the ends is 5/6 for a line through three equidistant points,
-        # 1 for a parabola; the next turn-on adds its variance. `mounting_sd` may also be the sd of
-        # nine independent mountings: then bias and scale keep a third each of the variance of a
-        # mounting offset.
+        # At the ends of the range a curve through three equidistant points has 5/6 (line) to 1
+        # (parabola) of the variance of a turn-on; the next turn-on adds 1. If `mounting_sd` is the
+        # sd of nine independent mountings, bias and scale add 1/3 each.
         variance = np.diagonal(out.covariance[-dwell:].mean(axis=0)) - 1e-3**2
         assert ((1.0 + 5.0 / 6.0) * turn_on**2 < variance).all()
         assert (variance < (1.0 + 1.0 + 2.0 / 3.0) * turn_on**2).all()
 
 
 def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
-    # WHY: with positions cut into several rests, the fitted mounting sd was 1/20 of the true sd.
+    # WHY: if each position had several rests, the fitted mounting sd was 1/20 of the true sd.
     whole, cut = tumbled(9), fit([turned(rng, np.repeat(positions(9, 3), 5, axis=0))], OPTIONS)
     sd, sd_cut = (done.calibration.static.x.residual_sd_m_s2 for done in (whole, cut))
     # Nine norms do not determine the mounting sd, which stays at its prior in both fits.
@@ -341,8 +340,8 @@ def test_rests_of_one_mounting_do_not_show_how_well_mountings_repeat(rng):
     assert len(cut.fit.selected.score.norms.square) == 9
 
 
-def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
-    # WHY: a fit of twelve recordings, three cut in two, claimed half the true sd of the bias.
+def test_two_bags_without_a_pause_between_them_count_as_one_turn_on(rng):
+    # WHY: if recordings were cut into two bags, the claimed sd of the bias was half the true sd.
     def cut(source, at, pause_s):
         (whole,) = source.blocks()
         arrays = [
@@ -351,7 +350,7 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
         ]
         return [source_of(*part, name=name) for part, name in zip(arrays, 'ab', strict=True)]
 
-    # The second bag begins in the middle of the fifth position.
+    # The second bag begins in the fifth position, so a cut that is not recognised adds a mounting.
     source = turned(rng, positions(9, 3))
     whole = tumbled(9)
     parts, others = (fit(cut(source, 9400, pause_s), OPTIONS) for pause_s in (0.0, 60.0))
@@ -364,19 +363,19 @@ def test_the_parts_of_a_split_recording_share_a_turn_on(rng):
 
 
 def test_a_calibration_has_the_date_of_its_test(rng):
-    # WHY: a calibration fitted today to old bags had the date of today, and no ageing.
+    # WHY: a calibration fitted to old bags had the date of the fit, so no ageing was assumed.
     source = turned(rng, positions(9, 3))
     provenance = tumbled(9).calibration.provenance
     assert provenance.date == provenance.tested == '2023-11-14T22:16:28Z'
     assert provenance.created > provenance.tested
-    # Stamps in seconds since the start of a computer contain no date.
+    # Stamps that count from the start of a computer give no date.
     blocks = [replace(b, accel_stamp_ns=b.accel_stamp_ns - START_NS) for b in source.blocks()]
     undated = fit([replace(source, blocks=lambda: blocks)], OPTIONS).calibration.provenance
     assert (undated.tested, undated.date) == ('', undated.created)
 
 
-def test_a_prior_states_how_well_turn_ons_repeat(rng):
-    # WHY: with a prior sd of mountings of 8 ug, the fitted sd was 43 ug, as without the prior.
+def test_the_sd_of_turn_ons_in_a_prior_is_used_for_six_positions(rng):
+    # WHY: a prior with a mounting sd of 8 ug had no effect: the fitted sd was 43 ug.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=2e-4)).calibration
     assert known.static.x.residual_sd_m_s2 == pytest.approx(2e-4)
     six = [turned(rng, positions(6, 4))]
@@ -385,12 +384,12 @@ def test_a_prior_states_how_well_turn_ons_repeat(rng):
         for prior in (None, known)
     )
     assert alone.static.x.residual_sd_m_s2 > 1e-3
-    # The prior density of the turn-on sd has a scale of a factor of 1.5, and wide tails.
+    # The prior density of ln(turn-on sd) has a width of ln 1.5 and wide tails.
     assert 2e-4 < helped.static.x.residual_sd_m_s2 < 4e-4
 
 
-def test_three_positions_do_not_show_which_constants_have_aged(rng):
-    # WHY: a change of scale was attributed to the bias: error / claimed sd was 2.4.
+def test_an_update_by_three_positions_has_errors_within_the_claimed_sd(rng):
+    # WHY: a change of the scale was attributed to the bias, and errors were 2.4 claimed sd RMS.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=1e-5)).calibration
     scale, bias = 1.0 + 2e-3 * rng.standard_normal(3), 1e-2 * rng.standard_normal(3)
     corners = positions(60, 5)
@@ -399,22 +398,22 @@ def test_three_positions_do_not_show_which_constants_have_aged(rng):
         ups = positions(3, 10 + seed) * scale + bias / GRAVITY
         few = replace(OPTIONS, serial='1', prior=known, allow=('prior',))
         aged = fit([turned(rng, ups)], few).calibration
-        # A calibration fitted without a thermometer must not need a temperature.
+        # All recordings are without a thermometer, so the correction must not need a temperature.
         assert not aged.needs_temperature
         reading = GRAVITY * corners * scale + bias + (0.1, -0.2, 0.3)
         out = aged.correct(np.arange(1.0, len(reading) + 1.0), reading)
         variance = np.diagonal(out.covariance, axis1=1, axis2=2) - 0.02**2
         ratios.append((out.specific_force - GRAVITY * corners) ** 2 / variance)
-    # Both fits share six random changes of scales and biases; their mean square has a relative
-    # sd of 60 %.
+    # Both fits are of a unit with six random changes, of scales and biases: the mean square of six
+    # normal numbers is uncertain by 60 %.
     assert np.mean(ratios) < 3.0
 
 
 @pytest.mark.parametrize('size', [1, 6])
 def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
-    # WHY: misalignments of 20 mrad explained a bias that differs by 1 mg between six faces.
-    # WHY: as independent offsets of the 18 positions, three turn-ons of six faces each left the
-    # misalignments undetermined, with claimed sd of 5 to 12 mrad.
+    # WHY: with a turn-on (sd 1 mg) in each of six faces, the fit found misalignments of 20 mrad;
+    # with three turn-ons of six faces each, the fit assumed 18 independent offsets, and claimed an
+    # sd of the misalignments of 5 to 12 mrad.
     M = np.array([[1.0, 0.0, 0.0], [2e-3, 1.0, 0.0], [-2e-3, 1e-3, 1.0]])
     sensed = np.linalg.inv(M)
     faces = np.vstack((np.eye(3), -np.eye(3)))
@@ -428,16 +427,16 @@ def test_turn_ons_between_six_faces_are_not_taken_for_a_misalignment(rng, size):
     assert np.abs(error).max() < 5e-3
     assert np.abs(error / sd).max() < 3.0
     if size == 1:
-        # The prior sd of a misalignment is 2.5 mrad for the estimate, 10 mrad in the covariance.
+        # The covariance contains the prior sd of a misalignment, 10 mrad.
         assert sd.min() > 5e-3
     else:
         assert np.median(sd) < 4e-3
-        # Three turn-ons show their sd of 1 mg to a factor of two.
+        # Three turn-ons determine the sd of turn-ons, 1 mg, to a factor of two.
         assert 0.4 < calibration.static.x.residual_sd_m_s2 / (1e-3 * GRAVITY) < 2.0
 
 
-def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):
-    # Cross-axis sensitivities of 0.8, -0.6 and 0.5 %, which six faces do not show.
+def test_the_claimed_sd_from_six_faces_contains_the_cross_axis_sensitivity_of_a_mems(rng):
+    # The norms of six faces do not show the cross-axis sensitivities of 0.8, -0.6 and 0.5 %.
     M = np.array([[1.0, 0.0, 0.0], [8e-3, 1.0, 0.0], [-6e-3, 5e-3, 1.0]])
     sensed = np.linalg.inv(M)
     faces = np.vstack((np.eye(3), -np.eye(3)))
@@ -448,12 +447,12 @@ def test_six_faces_claim_the_cross_axis_sensitivity_of_a_mems(rng):
     out = calibration.correct(np.arange(1.0, len(reading) + 1.0), reading)
     sd = np.sqrt(np.diagonal(out.covariance, axis1=1, axis2=2))
     ratio = (out.specific_force - corners)[:, 1:] / sd[:, 1:]
-    # RMS of three random elements of M: within a factor of 2 of their sd in 95 % of the draws.
+    # The RMS of three random numbers is within a factor of 2 of their sd in 95 % of the draws.
     assert 0.5 < np.sqrt(np.mean(ratio**2)) < 2.0
 
 
-def test_six_attitudes_that_hardly_determine_the_scale_factors_leave_them_near_each_other(rng):
-    # The squared components of the attitudes in `up` are almost linearly dependent.
+def test_six_attitudes_that_hardly_determine_the_scale_factors_give_scale_factors_near_1(rng):
+    # The squared components of these attitudes are almost linearly dependent.
     up = [
         [-7, 88, 48],
         [14, -89, -44],
@@ -475,7 +474,7 @@ def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
     assert 'dropped' not in names_of(tumbled(12))
     (block,) = source.blocks()
     stamps = block.accel_stamp_ns
-    # After half of the recording the clock is set back by a quarter of the recording.
+    # In the middle of the recording the clock is set back by a quarter of the recording's length.
     n = len(stamps)
     stamps[n // 2 :] -= stamps[n // 4] - stamps[0]
     blocks = (replace(block, accel_stamp_ns=stamps),)
@@ -484,14 +483,14 @@ def test_samples_after_a_clock_that_was_set_back_are_counted(rng):
     assert f'({n // 4}, 25 % of all)' in message
 
 
-def test_short_rests_have_windows_enough_to_learn_the_noise_from(rng):
-    # WHY: an attitude fits a rest of one window exactly, so the estimated noise was 0.
+def test_rests_of_5_s_determine_the_white_noise(rng):
+    # WHY: with rests of one window of 5 s no residual was left, and the noise was estimated as 0.
     calibration = fit([turned(rng, positions(12, 3), rest_s=5.0)], OPTIONS).calibration
-    # A noise of 0.02 m/s^2 per sample at 100 Hz is a density of 0.002 m/s^2/sqrt(Hz).
+    # A noise of 0.02 m/s^2 per sample at 100 Hz has a density of 0.002 m/s^2/sqrt(Hz).
     np.testing.assert_allclose(calibration.noise_density_m_s2_sqrt_hz, 0.002, rtol=0.3)
 
 
-def test_readings_that_never_change_leave_a_noise(rng):
+def test_a_fit_with_readings_that_never_change_has_a_positive_noise(rng):
     rest = Rest(rng)
     rest.accel[:] = GRAVITY * UP
     noise = fit([rest.source()], OPTIONS).calibration.noise_density_m_s2_sqrt_hz

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Updates from rests in the field agree with truth, a Kalman filter and closed forms."""
+"""Calibrations updated by rests agree with true parameters, a Kalman filter, closed forms."""
 
 import sys
 from dataclasses import replace
@@ -29,8 +29,8 @@ from thermo_comp.unit.gravity import MICRO_G
 from thermo_comp.unit.provenance import Provenance
 
 
-def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
-    # A ramp excites all columns and both sets; expected derivatives of |f| are finite differences.
+def test_derivatives_of_a_rest_by_all_parameters_agree_with_finite_differences():
+    # In a ramp no column is zero, and both coefficient sets have a weight.
     unit = rich_calibration()
     logged = rests(unit, in_any_attitude, no_error, days=1, rate=0.5 / 60.0)
     series = series_of(logged, unit)
@@ -39,13 +39,13 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
     layout = parameter_layout(unit)
     levels = {block.static: axis for axis, block in enumerate(layout.scale)}
     levels |= {block.dynamic: axis for axis, block in enumerate(layout.scale)}
-    # Every second parameter is tested: the block of parameters of a bias or a scale has an odd
-    # length, so each kind of parameter is tested in the bias or in the scale.
+    # Test every second parameter. The block of parameters of a bias or scale has an odd length, so
+    # each kind of parameter is tested either in the bias or in the scale.
     for k in range(0, layout.n_parameters, 2):
         step = 1e-7
         moved = values.copy()
         if k in levels:
-            continue  # a change of K, at the end of the test, tests the scale levels
+            continue  # the derivatives by scale levels are tested below by a change of K
         if k in {block.static for block in layout.bias}:
             continue
         moved[k] += step
@@ -61,18 +61,18 @@ def test_a_rest_differentiates_by_every_parameter_of_a_rich_unit():
         by_level = series.by_level[:, axis + 3] * unit.gravity_m_s2
         assert np.allclose(slope, by_level, atol=1e-4)
         both = series.by_parameter[:, [block.static, block.dynamic]].sum(axis=1)
-        # A change of K equals a change of the scale level of both sets, within a percent.
+        # A relative change of K has the effect of an equal change of the scale level in both sets.
         assert np.allclose(slope, both, atol=0.02 * abs(slope).max())
 
 
-def test_an_update_with_the_true_variances_is_the_kalman_filter():
+def test_an_update_with_the_true_variances_equals_a_kalman_filter():
     process = field_units.Process()
     history = field_units.live('carried', 3, 6, process)
     unit = field_units.calibration()
     series = series_of(history.rests, unit)
     best = field_units.BestFilter(process)
     for k in range(len(series)):
-        # Give the Kalman filter the rests of the series, one by one.
+        # The Kalman filter takes the rests that `series_of` averages to row k, as one measurement.
         first = int(series.n_windows[:k].sum())
         windows = [r for _, r in history.rests[first : first + int(series.n_windows[k])]]
         mean = np.mean([window.mean for window in windows], axis=0) / field_units.K
@@ -94,7 +94,7 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         bias, scale = layout.bias[axis].static, layout.scale[axis].static
         sd = np.sqrt(solved.posterior[bias, bias]) / field_units.K
         expected = best.state[axis] + best.state[15 + axis]
-        # Summing the rests of each start to a few rows causes an error below a fifth of the sd.
+        # The update averages the rests of a turn-on to a few rows: an error below 0.2 sd.
         assert abs(solved.shift[bias] / field_units.K - expected) < 0.2 * sd
         P = best.P[np.ix_([axis, 15 + axis], [axis, 15 + axis])].sum()
         assert sd == pytest.approx(np.sqrt(P), rel=0.1)
@@ -102,8 +102,8 @@ def test_an_update_with_the_true_variances_is_the_kalman_filter():
         assert abs(solved.shift[scale] - expected) < 0.2 * np.sqrt(solved.posterior[scale, scale])
 
 
-def test_updates_of_ageing_units_are_near_the_best_and_claim_their_errors():
-    # Level and carried units age for 30 days by random walks, turn-on offsets and one shock.
+def test_updates_of_ageing_units_have_small_errors_within_the_claimed_sd():
+    # Units in level and in carried platforms age by random walks, turn-on offsets and one shock.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
         process = field_units.Process(shock_day=11.5)
@@ -130,14 +130,14 @@ def test_updates_of_ageing_units_are_near_the_best_and_claim_their_errors():
         if kind == 'level':
             assert abs(updated.ageing.turn_on / (20 * MICRO_G) - 1.0) < 0.5
     before, left = np.sqrt(np.mean(np.square(squares), axis=0)) / MICRO_G
-    # A Kalman filter with the true variances leaves residuals of 12 to 14 ug RMS
+    # A Kalman filter with the true variances leaves |f| - g of 12 to 14 ug RMS
     # (benchmarks/field.py).
     assert before > 100.0
     assert left < 30.0
     assert np.sqrt(np.mean(np.square(ratios))) < 1.4
 
 
-def test_axes_that_no_rest_observes_keep_their_bits():
+def test_an_update_does_not_change_the_constants_of_axes_that_no_rest_observes():
     unit = known()
     updated = update(series_of(rests(unit, upright, jump_of(300.0, 10.0)), unit), unit)
     new = updated.calibration
@@ -145,10 +145,10 @@ def test_axes_that_no_rest_observes_keep_their_bits():
     assert new.axes.x == unit.axes.x
     assert new.axes.y == unit.axes.y
     assert new.axes.z != unit.axes.z
-    # In one attitude a shock and a change of gravity cause equal residuals.
+    # In one attitude a shock of the bias and a change of gravity cause equal changes of |f| - g.
     assert [change.may_be_gravity for change in updated.changes] == [True]
     assert 'or gravity changed' in ' '.join(change_texts(updated))
-    # Upright rests determine the sum of bias and scale of z, 300 ug, to 15 ug (turn-ons of 20 ug).
+    # The jump of the z reading is 300 ug; turn-on offsets (sd 20 ug) leave an error below 15 ug.
     assert updated.axis_changes[2].reading == pytest.approx(300.0 * MICRO_G, abs=15.0 * MICRO_G)
     layout = parameter_layout(unit)
     old_sd, new_sd = (
@@ -172,26 +172,26 @@ def test_a_jump_is_distinguished_from_ageing(rng):
     assert along == pytest.approx(60.0 * MICRO_G, rel=0.4)
 
 
-def test_the_present_sd_of_the_old_calibration_contains_its_ageing(rng):
-    # Random walk: 60 ug per root day times the root of 30 days is 329 ug.
+def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_walk(rng):
+    # After 30 days a random walk of 60 ug per root day has an sd of 329 ug.
     unit = known()
     walk = np.cumsum(60.0 / np.sqrt(3.0) * MICRO_G * rng.standard_normal((90, 3)), axis=0)
     logged = rests(unit, upright, lambda day: walk[round(3 * day)], 30)
     x, y, z = update(series_of(logged, unit), unit).axis_changes
-    # The sd of a bias is 10 ug; a reading of z also has the sd of the scale.
+    # The bias of x has an sd of 10 ug. At rest z reads bias plus scale error, 10 ug each.
     residual = unit.static.x.residual_sd_m_s2
     assert x.claimed_sd == pytest.approx(np.hypot(10.0 * MICRO_G, residual), rel=0.01)
     assert z.claimed_sd == pytest.approx(np.hypot(np.sqrt(200.0) * MICRO_G, residual), rel=0.01)
-    # Rests in one attitude do not separate bias from scale: up to half of the variance goes to the
-    # scale.
+    # Rests in one attitude do not separate bias and scale: the ageing model gives the bias of x
+    # and y between half and all of the variance of the random walk.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The rests determine the bias of z to two sd of a turn-on offset (sd 20 ug).
+    # The sd of z is the change of z that the rests show, within two turn-on offsets (sd 20 ug).
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
 def stepped(history, size, day):
-    """Add a step of gravity [m/s^2] from a day on; the counts of the units are 300 per m/s^2."""
+    """Scale the means of rests from a day on as if gravity had changed by `size` [m/s^2]."""
     return [
         (s, replace(r, mean=tuple(np.array(r.mean) * (1.0 + size / field_units.G * (d >= day)))))
         for (s, r), d in zip(history.rests, history.day, strict=True)
@@ -199,15 +199,15 @@ def stepped(history, size, day):
 
 
 @pytest.mark.parametrize('day', [15, 0])
-def test_another_gravity_is_not_taken_for_three_scales(day):
-    # Random walks are 15 ug and 10 ppm per root day; gravity differs by 300 ug from `day` on.
+def test_a_change_of_gravity_is_not_taken_for_a_change_of_three_scales(day):
+    # Bias and scale walk by 15 ug and 10 ppm per root day; from `day` on gravity is 300 ug larger.
     unit, size = field_units.calibration(), 300.0 * MICRO_G
     history = field_units.live('carried', 2, 30, field_units.Process())
     aged = update(series_of(history.rests, unit), unit)
     result = update(series_of(stepped(history, size, day), unit), unit)
     ((change, found, sd),) = result.solution.gravity
     assert change.time - field_units.DAY_ZERO == pytest.approx(day + 0.4, abs=0.5)
-    # A step before the first rest cannot be distinguished from a walk of 10 ppm of all scales.
+    # The random walks of the scales (10 ppm per root day) limit the sd of the step of gravity.
     assert abs(found - size) < 4.0 * sd < 60.0 * MICRO_G
     for before, after in zip(aged.axis_changes, result.axis_changes, strict=True):
         assert after.scale == pytest.approx(before.scale, abs=30e-6)
@@ -215,14 +215,14 @@ def test_another_gravity_is_not_taken_for_three_scales(day):
     (text,) = (line for line in change_texts(result) if 'as if gravity' in line)
     assert text.startswith('from 2026-')
     assert 'as if gravity were not the stated 9.80665 m/s^2: no scale was changed' in text
-    # If gravity is stated as certain, the step is attributed to the scales of all axes.
+    # If the user states gravity as certain, the update attributes the step to the three scales.
     certain = update(series_of(stepped(history, size, day), unit), unit, is_gravity_certain=True)
     assert certain.solution.gravity == ()
     assert all(axis.scale > 150e-6 for axis in certain.axis_changes)
 
 
 @pytest.mark.parametrize('kind', ['level', 'carried'])
-def test_ageing_is_not_taken_for_another_gravity_or_unit(kind):
+def test_ageing_is_not_taken_for_a_change_of_gravity_or_of_the_unit(kind):
     unit = field_units.calibration()
     for seed in range(5):
         shock_day = np.inf if seed % 2 else 10.0
@@ -236,7 +236,8 @@ def test_ageing_is_not_taken_for_another_gravity_or_unit(kind):
 
 @pytest.mark.parametrize('first', [0, 10])
 def test_samples_of_another_unit_are_refused(first):
-    # All or half of the rests are from a unit with other scales (by percents) and biases (by mg).
+    # All rests, or those after half of the days, are from a second unit, whose scales differ by 1
+    # to 2 % and whose biases differ by 0.3 to 1.4 mg.
     unit = field_units.calibration()
     history = field_units.live('carried', 3, 20, field_units.Process())
     mixed = [
@@ -250,7 +251,7 @@ def test_samples_of_another_unit_are_refused(first):
 
 
 def test_a_changed_curve_is_detected_and_corrected():
-    # The z bias changes by 5 ug/K, and the log has temperatures of 15 to 25 degC.
+    # The slope of the z bias changes by 5 ug/K; the rests are at 15 to 25 degC.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
@@ -267,9 +268,8 @@ def test_a_changed_curve_is_detected_and_corrected():
     assert curves[1] - curves[0] == pytest.approx(5.0 * MICRO_G, abs=1.5 * MICRO_G)
 
 
-def test_the_slopes_over_temperature_age_by_a_fixed_random_walk():
-    # Level rests do not determine the x axis: the sd of its bias slope grows by 1 ug/K per root
-    # year.
+def test_the_sd_of_a_bias_slope_that_no_rest_observes_grows_by_1_ug_per_k_and_root_year():
+    # Upright rests do not show the x axis: the sd of its bias slope grows by 1 ug/K per root year.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )
@@ -281,7 +281,7 @@ def test_the_slopes_over_temperature_age_by_a_fixed_random_walk():
     assert 0.0 < result.axis_changes[2].curve_sd < expected
 
 
-def test_a_start_that_contradicts_all_others_is_left_out():
+def test_a_turn_on_that_contradicts_all_other_turn_ons_is_left_out():
     unit = known()
     logged = rests(unit, upright, jump_of(100.0, 8.0), days=15)
     wrong = logged[80][0]
@@ -294,10 +294,9 @@ def test_a_start_that_contradicts_all_others_is_left_out():
     assert result.axis_changes[2].reading == pytest.approx(100.0 * MICRO_G, abs=20.0 * MICRO_G)
 
 
-def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
-    # A computer without a battery clock starts at the date of its disk image, and the stamps of
-    # the samples are right. First all starts have a date of the disk image, then the last start
-    # alone.
+def test_a_wrong_clock_at_the_start_of_the_node_does_not_change_the_update(tmp_path, rng):
+    # A computer without a battery clock starts with the date of its disk image, while the stamps
+    # of the samples are right. Start times are wrong at no start, all starts, the last start.
     unit = known()
     logged = rests(unit, upright, jump_of(300.0, 10.0))
     image = {start.start_ns: int(1.6e18 + 5e8 * rng.standard_normal()) for start, _ in logged}
@@ -315,8 +314,9 @@ def test_a_wrong_clock_at_the_start_of_the_node_changes_nothing(tmp_path, rng):
         assert updated.judged == expected.judged
 
 
-def test_stamps_in_any_order_give_a_valid_covariance(rng):
-    # The stamps of a third of the starts are wrong by up to 10 days: starts overlap.
+def test_rests_with_stamps_in_wrong_order_give_a_valid_covariance(rng):
+    # The stamps of a third of the turn-ons are wrong by up to 10 days, so rests change their
+    # order.
     unit = known()
     logged = rests(unit, upright, no_error)
     wrong = {s.start_ns: int(rng.choice((0, 0, 864e12 * rng.uniform(-1, 1)))) for s, _ in logged}
@@ -326,7 +326,7 @@ def test_stamps_in_any_order_give_a_valid_covariance(rng):
         assert np.linalg.eigvalsh(covariance).min() > -1e-9 * np.trace(covariance)
 
 
-def test_too_few_starts_are_refused():
+def test_an_update_with_fewer_than_three_turn_ons_is_refused():
     unit = known()
     logged = rests(unit, upright, no_error, days=1)[:8]
     with pytest.raises(FitError, match='rests of 2 starts of the node, at least 3 are needed'):
@@ -352,10 +352,10 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     written = load_calibration(new)
     assert written.provenance.sources[-1].name == 'rests until 2030-01-20T23:12:40, claim aged 1 d'
     assert 'before: 2029-12-31' in written.provenance.notes[-1]
-    # The date of the new file is the date of its last rest, not the date of the command.
+    # The date in the new calibration file is that of its last rest, not that of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # Only the old calibration has a residual on the log; the history shows both calibrations.
+    # The old calibration is judged on the log: it has no rest of the log in it.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'
@@ -380,7 +380,7 @@ def test_an_update_without_gain_writes_no_file(tmp_path, unit_file, cli):
     assert 'recalibration interval' in text
 
 
-def test_mistakes_of_update_end_in_one_sentence(tmp_path, unit_file, cli):
+def test_wrong_arguments_and_logs_of_update_give_a_message(tmp_path, unit_file, cli):
     unit = load_calibration(unit_file)
     other = replace(unit, unit=replace(unit.unit, serial='T-2'))
     log = write_log(tmp_path / 'rests', rests(other, upright, no_error, days=2))
@@ -414,9 +414,8 @@ def with_shares(logged, share):
     return [(s, replace(r, shares=(share,) * len(r.shares))) for s, r in logged]
 
 
-def test_a_rest_differentiates_by_the_unknown_lags_of_its_start():
-    # The unknowns of a start are the initial states of lags; expected derivatives are differences
-    # of |f|.
+def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differences():
+    # At a turn-on the states of lags are unknown; expected derivatives are differences of |f|.
     unit, share, step = rich_calibration(), 0.6, 1e-4
     logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
     series, layout = series_of(logged, unit), Layout(Correction(unit).memory)
@@ -435,9 +434,9 @@ def test_a_rest_differentiates_by_the_unknown_lags_of_its_start():
     assert np.array_equal(settled.noise, series.noise)
 
 
-def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
-    # The residual sd of a calibration is the scatter of starts, which the ageing model estimates:
-    # the noise of a rest leaves it out.
+def test_an_unknown_regime_after_a_turn_on_does_not_increase_the_noise_of_a_rest():
+    # The residual sd of a calibration is the scatter of turn-ons. The ageing model estimates this
+    # scatter, so the noise of a rest must not contain the residual sd.
     unit = field_units.calibration()
     logged = field_units.live('level', 1, 3, field_units.Process()).rests
     unknown = [(s, replace(r, state=(*r.state[:4], 1.0, *r.state[5:]))) for s, r in logged]
@@ -447,10 +446,10 @@ def test_an_unknown_regime_after_a_start_adds_no_scatter_to_rests():
 
 
 @pytest.mark.parametrize('lags', [0.0, 1.0])
-def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
-    # Each start has three rests, the first at once. Per root day the bias has a random walk of 15
-    # ug, the scale of 10 ug; turn-ons are 20 ug, the scatter of rests 3 ug; the initial lag states
-    # have `lags` times the assumed sd, 40 to 100 ug.
+def test_unknown_initial_lag_states_are_not_taken_for_scatter_of_rests(rng, lags):
+    # A turn-on has three rests, in which 100, 70 and 40 % of the initial lag states remain. Sd of
+    # walks per root day: bias 15, scale 10 ug; turn-ons 20 ug, rests 3 ug; initial lag states:
+    # `lags` times the assumed sd (40 to 100 ug).
     unit = rich_calibration()
     each = series_of(with_shares(rests(unit, in_any_attitude, no_error, days=60), 1.0), unit)
     n, names = len(each), [k for k, v in vars(each).items() if isinstance(v, np.ndarray)]
@@ -466,8 +465,8 @@ def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
     residual += np.sqrt(series.noise + (3.0 * MICRO_G) ** 2) * rng.standard_normal(3 * n)
     ageing, _, used = learn(replace(series, residual=residual), unit, float(series.time[0]))
     assert len(used) == 3 * n
-    # Over six simulated units the estimates vary by 20 % (bias walk), 30 % (scale walk) and 15 %
-    # (turn-on).
+    # In six simulations the estimates scattered by 20 % (walk of the bias), 30 % (walk of the
+    # scale) and 15 % (turn-on).
     assert ageing.bias == pytest.approx(15.0 * MICRO_G, rel=0.5)
     assert ageing.scale == pytest.approx(10.0 * MICRO_G, rel=0.7)
     assert ageing.turn_on == pytest.approx(20.0 * MICRO_G, rel=0.35)
@@ -475,7 +474,7 @@ def test_unknown_lags_of_a_start_are_not_scatter_of_rests(rng, lags):
     assert ageing.lags == pytest.approx(lags, abs=0.25)
 
 
-def test_the_newest_of_many_starts_are_used(monkeypatch):
+def test_of_too_many_turn_ons_the_newest_are_used(monkeypatch):
     unit = known()
     series = series_of(rests(unit, upright, no_error), unit)
     everything = rows_of(series, MICRO_G)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A number in a message of any type is read as rosbags reads it."""
+"""A number in a message of any type is read with the value that rosbags reads."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from thermo_comp.recording.reader import open_recording, read_recording
 from thermo_comp.recording.serialized import Messages
 from thermo_comp.recording.topics import Topics
 
-# A SensorAccel message of PX4 has no header, and holds the temperature beside the sample.
+# A SensorAccel message of PX4 has no header, and contains sample and temperature.
 PX4 = {
     'px4_msgs/msg/SensorAccel': (
         'uint64 timestamp\nuint64 timestamp_sample\nuint32 device_id\nfloat32 x\nfloat32 y\n'
@@ -106,12 +106,12 @@ def test_any_number_of_any_message_layout_is_read(store, rows, cells, is_little)
         ('raw[', 'no `raw\\['),
     ],
 )
-def test_a_path_to_no_number_is_refused(store, path, text):
+def test_a_path_that_leads_to_no_number_is_refused(store, path, text):
     with pytest.raises(RecordingError, match=text):
         Field('lab_msgs/msg/Deep', path, store.fielddefs)
 
 
-def test_a_message_that_ends_inside_a_field_is_damaged(store):
+def test_a_message_that_ends_inside_a_field_is_refused_as_damaged(store):
     kind = 'px4_msgs/msg/SensorAccel'
     field = Field(kind, 'temperature', store.fielddefs)
     whole = serialized(
@@ -123,7 +123,7 @@ def test_a_message_that_ends_inside_a_field_is_damaged(store):
         field.read(torn)
 
 
-def test_definitions_come_from_the_bag_or_are_known_or_refused():
+def test_message_definitions_are_those_of_the_bag_or_of_ros():
     known = {'a/msg/B': ('ros2msg', 'float32 t\n'), 'a/msg/C': ('ros2msg', '?')}
     assert Field('a/msg/B', 't', definitions_of('a/msg/B', known)).has_stamp is False
     jazzy = definitions_of('sensor_msgs/msg/BatteryState', {})
@@ -138,7 +138,7 @@ def test_definitions_come_from_the_bag_or_are_known_or_refused():
 
 
 def driver_bag(path, store, storage=StoragePlugin.MCAP):
-    """Write 50 Imu messages with PX4 and Float64 messages between; return the PX4 readings."""
+    """Write 50 Imu messages and some PX4 and Float64 messages; return the PX4 readings."""
     celsius = []
     with Writer(path, version=9, storage_plugin=storage) as bag:
         kinds = {'/imu/data': 'sensor_msgs/msg/Imu', '/case': 'std_msgs/msg/Float64',
@@ -155,7 +155,7 @@ def driver_bag(path, store, storage=StoragePlugin.MCAP):
         level = store.types['geometry_msgs/msg/Quaternion'](0, 0, 0, 1)
         for row in range(50):
             stamp_ns = START_NS + row * 10**7
-            # The clock of the recorder is 1000 s ahead of the clock of the driver.
+            # The clock of the recorder is 1000 s ahead of that of the driver.
             log_ns = stamp_ns + 10**12
             if row % 5 == 0:
                 accel = store.types['px4_msgs/msg/SensorAccel']
@@ -179,8 +179,8 @@ def test_a_bag_with_a_message_type_of_the_driver_is_read(tmp_path, store, storag
     recording = read_recording(tmp_path / 'bag', Topics.named(names))
     assert 'no stamps in board, case' in str(recording.info.chosen)
     board, case = (recording.columns.temperatures[name] for name in ('board', 'case'))
-    # The first board reading precedes all samples and is lost; each later reading has the stamp of
-    # the sample before the reading.
+    # A reading without a stamp gets that of the sample before it; the first reading, before all
+    # samples, is left out.
     assert board.celsius.tolist() == celsius[1:]
     assert board.stamp_ns.tolist() == [START_NS + (row - 1) * 10**7 for row in range(5, 50, 5)]
     assert case.celsius.tolist() == [celsiu - 1.0 for celsiu in celsius]

@@ -3,8 +3,9 @@
 """
 Outputs of commands: no output replaces an input or a file of another kind.
 
-WHY: `--force` destroyed the recordings that a command read; one of two writers lost its result
-silently; an output was readable by everyone whatever the umask, and replaced a link.
+WHY: `--force` overwrote recordings that the command itself read; of two processes that wrote the
+same output one lost its result silently; an output was readable by everyone with any umask, and
+replaced a link instead of the link's target.
 """
 
 import os
@@ -171,7 +172,7 @@ def test_of_two_writers_one_wins(tmp_path, kind):
     assert [path.name for path in tmp_path.iterdir()] == ['out']
 
 
-def test_of_two_writers_one_wins_without_hard_links(tmp_path, monkeypatch):
+def test_only_one_of_two_writers_writes_a_file_without_hard_links(tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError
 
@@ -188,7 +189,7 @@ def test_of_two_writers_one_wins_without_hard_links(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize('mask', [0o022, 0o077])
-def test_the_umask_decides_who_may_read(folder, cli, mask):
+def test_permissions_of_an_output_follow_the_umask(folder, cli, mask):
     with umask(mask):
         save_calibration(calibration(), folder / 'private.yaml')
         cli(*REPLAY, 'raw.mcap', '-o', 'private', code=None, cwd=folder)
@@ -229,7 +230,7 @@ def test_a_writer_that_fails_leaves_no_file(tmp_path):
 
 
 @pytest.mark.parametrize('suffix', ['.db3', '.bag', '.csv', '.MCAP'])
-def test_a_bag_of_another_suffix_is_not_written(folder, cli, suffix):
+def test_a_bag_with_a_wrong_suffix_is_not_written(folder, cli, suffix):
     output = f'out{suffix}'
     finished = cli('convert', 'raw.mcap', '-o', output, code=1, cwd=folder)
     assert f'{output}: cannot be written: {suffix} is none of' in finished.stderr

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits through the public API: a knee in the curve, a thermometer on two topics."""
+"""Fits through the public API: knees in a curve, a doubled thermometer, contradicting bags."""
 
 import numpy as np
 import pytest
@@ -44,23 +44,23 @@ def left_by(groups):
     return unit, float(np.sqrt(np.mean(minutes**2)) / MICRO_G)
 
 
-def test_a_knee_of_the_bias_is_found():
+def test_a_knee_in_the_curve_of_the_bias_is_found():
     unit, left = left_by(('curve', 'bend'))
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
-    # Trial knees are 1 K apart: the fit uses the two trial knees around the true knee.
+    # The fit tries knees every 1 K, and uses the two that are next to the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # A mean slope between the two trial knees instead of the true knee gives an error of at most
-    # 20 ug/K times 0.25 K = 5 ug, within 1 K of the range of 22 K.
+    # Two knees instead of the true one between them give an error of at most 20 ug/K times 0.25 K
+    # = 5 ug, and only in 1 K of the range of 22 K.
     assert left < 1.5
 
 
-def test_a_curve_without_a_knee_has_no_bend(monkeypatch):
+def test_a_curve_without_a_knee_is_fitted_without_a_knee(monkeypatch):
     monkeypatch.setitem(globals(), 'SLOPE', 0.0)
     unit, _ = left_by(('curve', 'bend'))
     assert not [term for term in unit.response if term.group == 'bend']
 
 
-def test_a_thermometer_on_two_topics_counts_once():
+def test_a_thermometer_on_two_topics_is_used_once():
     bags = []
     for copies in (('board',), ('board', 'case')):
         rng = np.random.default_rng(9)
@@ -78,7 +78,7 @@ def test_a_thermometer_on_two_topics_counts_once():
 
 
 def columns_of(slopes, shift=0.0):
-    """Record one position for each of the given bias slopes [ug/K]; shift: of all biases [ug]."""
+    """Simulate a position for each given bias slope [ug/K]; add `shift` [ug] to all biases."""
     rng = np.random.default_rng(10)
     bags = []
     for k, (up, slope) in enumerate(zip(UPS, slopes, strict=False)):
@@ -93,8 +93,8 @@ def columns_of(slopes, shift=0.0):
 def test_a_unit_that_has_changed_is_updated_although_its_drift_contradicts_the_prior(
     shift, monkeypatch
 ):
-    # WHY: the drift excluded all new bags, so that the constants were those of the prior, wrong by
-    # 35 times their claimed sd.
+    # WHY: the drift contradicted the prior, so the update excluded all new bags and kept the old
+    # constants, whose error was 35 times their claimed sd.
     monkeypatch.setitem(globals(), 'KNEE_C', 5.0)
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',)}
     old = tc.fit(columns_of([SLOPE] * len(UPS)), mounting_sd=1e-7, **options)
@@ -118,7 +118,7 @@ def sd_of_a_correction(unit):
 
 
 @pytest.mark.slow
-def test_a_bag_of_another_environment_is_excluded_and_widens_the_claimed_sd():
+def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd():
     options = {'gravity': G, 'input': 'm/s^2', 'groups': ('curve',), 'mounting_sd': 1e-7}
     alone = tc.fit(columns_of([SLOPE] * 4), **options)
     with_another = columns_of([SLOPE] * 4 + [6.0 * SLOPE])
@@ -130,10 +130,10 @@ def test_a_bag_of_another_environment_is_excluded_and_widens_the_claimed_sd():
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'took no part' in note
-        # Over 11 K above the knee the slope of bag r4 exceeds that of the other bags by 100 ug/K
-        # on x and y, and by 50 ug/K on z.
+        # The slope of bag r4 above the knee is greater than that of the others by 100 ug/K on x
+        # and y and 50 ug/K on z; the board is up to 11 K above the knee: an error up to 1.1 mg.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
-        assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 600.0
-    # A further bag with the slope of the first four bags contradicts no other bag.
+        assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 1100.0
+    # A new bag with the same slope as the first four is not reported as another environment.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]

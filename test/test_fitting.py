@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to simulated units agree with the known truth."""
+"""Fits to simulated units agree with the true parameters."""
 
 from dataclasses import replace
 
@@ -60,7 +60,7 @@ def claimed(calibration):
     return sd[bias], sd[scale], sd[layout.misalignment :]
 
 
-# A reading every eight seconds suffices: a ramp of 1.5 K/min changes the board by 0.2 K in 8 s.
+# With a reading every 8 s fits are faster; in a ramp of 1.5 K/min readings differ by 0.2 K.
 OWN_LAGS, PAPER, PLAIN = (
     triad(name, 1).with_thermometers(rate_hz=0.125) for name in ('own-lags', 'paper', 'plain')
 )
@@ -87,20 +87,20 @@ def pulls(found, unit):
 
 @pytest.mark.slow
 def test_the_constants_of_a_fit_are_within_their_claimed_sd(response):
-    # The nine constants have correlated errors, so the largest may be at 4 sd.
+    # The errors of the nine constants are correlated, so one may reach 4 claimed sd.
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0
     assert np.sqrt(np.mean(pull**2)) < 2.0
-    # The claimed sd of bias, scale and M is some ug and ppm, although the drift is 100s of ug.
+    # The drift is some 100 ug; the claimed sd of bias, scale and M are some ug and ppm.
     bias_sd, scale_sd, M_sd = claimed(response.calibration)
     assert (bias_sd / np.array(OWN_LAGS.counts_per_micro_g)).max() < 5.0
     assert scale_sd.max() < 10e-6
     assert M_sd.max() < 5e-6
 
 
-def test_the_fitted_response_leaves_only_noise(response):
+def test_the_residual_of_a_fitted_response_is_the_noise(response):
     row = response.residuals[-1]
-    # White noise of 5 ug / sqrt(Hz) leaves 0.65 ug over 60 s.
+    # White noise of 5 ug/sqrt(Hz) is 0.65 ug in means over 60 s.
     assert row.fitted.rms / MICRO_G < 0.8
     assert row.fitted.rms < row.left_out.rms < 1.5 * row.fitted.rms
     assert row.raw.rms / MICRO_G > 300.0
@@ -110,7 +110,7 @@ def test_the_fitted_response_leaves_only_noise(response):
 def test_fitted_attitudes_have_unit_norm(response):
     up = np.array([position.up for position in response.positions])
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0, rtol=1e-14)
-    # The fit does not know the directions, and estimates each within some urad.
+    # The fit estimates the directions, with errors of some urad.
     np.testing.assert_allclose(up, positions(12, 1), atol=3e-5)
 
 
@@ -120,13 +120,13 @@ def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     assert calibration.response == ()
     assert calibration.provenance.model == 'golovach'
     for row in golovach.residuals[1:]:
-        # The paper's model has a separate curve for each regime, so `one_set` has no residual.
+        # The paper's model has a curve per regime, so it has no residual of a single curve.
         assert not row.one_set.n
         assert row.two_sets.rms < row.raw.rms, row.section
     # The paper's model has a linear static set and a quadratic dynamic set.
     assert calibration.static.x.bias_function.n_free == 1
     assert calibration.dynamic.x.bias_function.n_free == 2
-    # The biases are wrong by at most the peak residual of the paper's model, which is in ramps.
+    # The errors of the biases are below the largest residual of the paper's model.
     left = golovach.residuals[-1].fitted
     bias, scale, M = constants(calibration)
     error = (bias - PAPER.bias_at_reference) / np.array(PAPER.counts_per_micro_g)
@@ -135,7 +135,7 @@ def test_the_paper_s_model_fits_a_unit_of_the_paper_s_physics(golovach):
     np.testing.assert_allclose(M, np.array(PAPER.M)[[1, 2, 2], [0, 0, 1]], atol=3e-5)
 
 
-def test_the_evidence_is_complete(response):
+def test_a_fit_has_all_positions_sources_sections_and_groups(response):
     assert len(response.positions) == 12
     assert all(position.duration_s > 5000.0 for position in response.positions)
     assert all(np.isfinite(position.left_out_rms) for position in response.positions)
@@ -146,21 +146,22 @@ def test_the_evidence_is_complete(response):
     assert {finding.level for finding in response.findings} <= {'advice', 'good'}
     assert 'refusal' not in {finding.level for finding in response.findings}
     judged = {(group.part, group.group) for group in calibration.evidence}
-    # In the unit OWN_LAGS the bias of each axis is a curve over the temperature of a lagging part.
+    # In the unit OWN_LAGS each axis depends on the temperature of a part that lags the board.
     assert {('bias', 'part'), ('scale', 'part')} <= judged
-    # A response term with zero weight serves the covariance only, and needs no row in `evidence`.
+    # A response term without weights exists only for the covariance and has no entry in
+    # `evidence`.
     weighty = [term for term in calibration.response if any((*term.bias, *term.scale))]
     assert {term.group for term in weighty} <= {group for _, group in judged}
 
 
-def test_the_calibration_file_holds_the_fit(response, tmp_path):
+def test_a_written_calibration_is_read_back_unchanged(response, tmp_path):
     path = tmp_path / 'unit.yaml'
     save_calibration(response.calibration, path)
     assert load_calibration(path) == response.calibration
 
 
-def test_the_compensator_has_the_errors_that_the_fit_states(response):
-    # The error in a new attitude is below twice the left-out error, and near its claimed sd.
+def test_the_error_of_the_compensator_is_that_stated_by_the_fit(response):
+    # The recording is in an attitude that was not fitted.
     up = np.array([[0.48, -0.6, 0.64]])
     (record,) = records_of(OWN_LAGS, up, 77)
     compensator = Compensator(response.calibration)
@@ -168,13 +169,13 @@ def test_the_compensator_has_the_errors_that_the_fit_states(response):
     per_window = round(60.0 * RATE_HZ)
     n = len(after.index) // per_window
     force = after.specific_force[: n * per_window].reshape(n, per_window, 3).mean(axis=1)
-    # Leave out the first 45 min, in which errors of the unknown initial lag states dominate.
+    # In the first 45 min the unknown initial lag states cause the largest errors.
     late = force[45:]
     rms = residual_statistics(norm_residual(late, STANDARD_GRAVITY)).rms
     assert rms < 2.0 * response.residuals[-1].left_out.rms
     density = np.array(response.calibration.noise_density_m_s2_sqrt_hz)
     variance = after.covariance[: n * per_window, [0, 4, 8]].reshape(n, per_window, 3).mean(axis=1)
-    # In means of 60 s white noise and rounding average out, errors of the model do not.
+    # A mean over 60 s reduces white noise and rounding; errors of the model stay as they are.
     variance += density**2 / 60.0 - np.array(compensator.thermal.correction.noise)
     error = (force - record.truth.specific_force) / np.sqrt(variance)
     assert 0.5 < np.sqrt(np.mean(error**2)) < 1.6
@@ -185,18 +186,19 @@ def test_six_faces_leave_misalignment_at_its_prior():
     result = fitted(PLAIN, FACES, 2, groups=('curve', 'set'), mounting_sd=repeats)
     _, _, M = constants(result.calibration)
     _, scale_sd, M_sd = claimed(result.calibration)
-    # Six faces do not determine M, which stays at 0 with an sd of 1 mrad.
+    # Six faces do not determine M, which keeps its prior mean 0 and sd 1 mrad.
     np.testing.assert_allclose(M, 0.0, atol=1e-5)
     np.testing.assert_allclose(M_sd, 1e-3, rtol=0.02)
     finding = next(finding for finding in result.findings if finding.name == 'misalignment')
     assert (finding.level, finding.message.startswith('6 positions')) == ('advice', True)
-    # Six faces determine bias and scale but for an error of half the square of M (1 mrad).
+    # Six faces determine bias and scale; M of 1 mrad causes relative errors of M^2 / 2.
     assert scale_sd.max() < 2e-5
     assert np.abs(pulls(result, PLAIN)).max() < 4.0
 
 
-def test_nine_positions_claim_turn_ons_that_their_norms_cannot_show(rng):
-    # WHY: nine constants explain nine norms, and the claimed sd was 3 to 5 times too small.
+def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
+    # WHY: nine constants fit nine norms exactly, whatever the offsets, and the claimed sd of the
+    # constants was 3 to 5 times too small.
     turn_ons = PLAIN.scale_factor * rng.normal(0.0, 50e-6 * STANDARD_GRAVITY, (9, 3))
     records = records_of(PLAIN, positions(9, 1), 1)
     switched_on = [
@@ -205,13 +207,13 @@ def test_nine_positions_claim_turn_ons_that_their_norms_cannot_show(rng):
     ]
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set'))
     found = fit(sources_of(switched_on), options)
-    # From the noise of the unit PLAIN the fit expects turn-ons of some 50 ug. The RMS of
-    # nine errors of unit variance exceeds 1.55 by a chance of 1 %.
+    # For a unit with the noise of PLAIN the prior sd of turn-ons is some 50 ug. The RMS of nine
+    # standard normal errors exceeds 1.55 with a probability of 1 %.
     assert np.sqrt(np.mean(pulls(found, PLAIN) ** 2)) < 1.55
 
 
 @pytest.mark.slow
-def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng):
+def test_compensated_samples_are_refused_and_raw_samples_without_drift_are_fitted(rng):
     # WHY: compensated samples, and a triad without drift, were fitted without a message.
     program = parse_cyclogram('20 10min, 45@1.5 15min, 5@1.5 15min')
     records = records_of(PLAIN, positions(9, 1), 4, program)
@@ -224,7 +226,7 @@ def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng)
         return fit(sources, FitOptions(**options))
 
     def force(counts):
-        # Noise of 5e-4 m/s^2 hides the steps of the counts, as in the output of a compensator.
+        # Noise of 5e-4 m/s^2 is added, so that rounding of the counts is not visible.
         return ((counts - bias) / scale) @ M.T + 5e-4 * rng.standard_normal(counts.shape)
 
     raw = fit_of(lambda counts: counts)
@@ -235,7 +237,7 @@ def test_compensated_samples_are_refused_and_raw_ones_without_drift_are_not(rng)
         fit_of(lambda counts: np.rint(4e5 * force(counts)), full_scale=8388607.0)
 
 
-def test_bags_with_and_without_temperature_contradict_themselves():
+def test_bags_with_and_bags_without_a_thermometer_in_one_fit_are_refused():
     records = records_of(PLAIN, FACES, 5)
     sources = sources_of(records[:3]) + sources_of(records[3:], False, 3)
     with pytest.raises(FitError, match='bag3: no board temperature, which the other bags have'):
@@ -243,7 +245,7 @@ def test_bags_with_and_without_temperature_contradict_themselves():
 
 
 def test_a_switch_of_sets_changes_the_output_by_1_ug_per_second(golovach):
-    # A switch of sets changes the output by 1 ug/s, or by the difference of the sets in 300 s.
+    # The output changes at most by 1 ug/s or, if this is faster, by the difference in 300 s.
     (record,) = records_of(PAPER, positions(1, 5), 905)
 
     def forces(weight):
@@ -254,8 +256,7 @@ def test_a_switch_of_sets_changes_the_output_by_1_ug_per_second(golovach):
         assert {is_dynamic for _, is_dynamic in compensator.take_flags()} == {False, True}
         return corrected.specific_force
 
-    # The outputs of the blend and of either set have equal noise, so their differences give the
-    # weight of the dynamic set.
+    # The three outputs have equal noise, so their differences give the weight of the dynamic set.
     output, static, dynamic = forces(None), forces(0.0), forces(1.0)
     gap = dynamic - static
     size = np.linalg.norm(gap, axis=1)
@@ -264,7 +265,7 @@ def test_a_switch_of_sets_changes_the_output_by_1_ug_per_second(golovach):
     moved = np.abs(weight[per_second:] - weight[:-per_second]) * size[per_second:]
     assert weight[0] == pytest.approx(0.0, abs=1e-6)
     assert weight.max() == pytest.approx(1.0, abs=1e-6)
-    # The difference of the two sets changes by less than 1 % during a transition.
+    # The factor 1.01 allows for a change of the difference of the sets during a transition.
     assert moved.max() / MICRO_G < 1.01 * max(1.0, size.max() / MICRO_G / 300.0)
 
 
@@ -296,7 +297,7 @@ def faces(scale, offset, rng):
     return [short(accel, celsius, name=f'face{k}') for k, accel in enumerate(forces)]
 
 
-def test_accelerations_are_not_taken_for_counts(rng):
+def test_accelerations_given_as_counts_are_refused(rng):
     with pytest.raises(FitError, match=r'norm 9.81 and are not whole numbers: they look like m/s'):
         fit(faces(9.81, 0.01, rng), FitOptions(gravity=9.81))
     with pytest.raises(FitError, match='they look like g, not counts'):
@@ -305,7 +306,7 @@ def test_accelerations_are_not_taken_for_counts(rng):
 
 @pytest.mark.parametrize('n_averaged', [0, 1, 4000])
 def test_counts_of_24_bits_that_a_driver_averages_are_fitted(n_averaged, rng):
-    # WHY: a single fractional sample made all samples exceed the full scale of 16 bits.
+    # WHY: with one fractional sample a full scale of 16 bits was assumed for all samples.
     def counts(up):
         whole = np.rint(4e5 * (up + 1e-3 * rng.standard_normal((4000, 3))))
         whole[:n_averaged] += 0.25
@@ -330,11 +331,11 @@ def test_saturated_samples_are_refused(rng):
 
 
 @pytest.mark.slow
-def test_nine_positions_of_a_mems_unit_do_not_take_its_misalignment_for_mountings():
-    # Misalignments of some mrad or mounting offsets of 5 mg explain the norms of nine positions.
+def test_misalignments_of_a_mems_unit_are_determined_by_nine_positions():
+    # WHY: mounting offsets of 5 mg fit the norms of nine positions as well as misalignments.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
-    # A fit with only the groups of the simulated unit takes half the time of a fit of all groups.
+    # A fit with only the groups of the simulated unit takes half the time.
     options = FitOptions(gravity=STANDARD_GRAVITY, groups=('curve', 'set', 'gradient', 'board'))
     calibration = fit(sources_of(records), options).calibration
     M = np.array(calibration.misalignment)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A board is warmer than its case at rest: effects are even in T_case - T_board about rest."""
+"""If a board heats itself, even effects of T_case - T_board count from its value at rest."""
 
 from itertools import pairwise
 
@@ -16,7 +16,7 @@ from thermo_comp.simulation.campaign import positions
 
 GRAVITY, MICRO = 9.80665, 9.80665e-6
 STEP_S, OWN_HEAT_K = 2.0, 0.6
-#: Noise of a sample [m/s^2]; a window of 60 s has 30 samples.
+#: Noise of a sample [m/s^2]; a window of 60 s contains 30 samples.
 NOISE = 4.0 * MICRO
 
 
@@ -26,7 +26,7 @@ def lagged(values, tau):
 
 
 def recorded(rng, up, name, targets):
-    """Record a unit whose bias is even in T_case - T_board about its value at rest."""
+    """Simulate a unit whose bias is an even function of T_case - T_board less its rest value."""
     corners = [(0.0, targets[0]), (900.0, targets[0])]
     for before, after in pairwise(targets):
         corners += [(corners[-1][0] + 60.0 * abs(after - before), after)]
@@ -46,7 +46,7 @@ def recorded(rng, up, name, targets):
         np.round(celsius + 0.003 * rng.standard_normal(len(time)), 4) for celsius in (board, case)
     )
     accel = force + bias * MICRO + NOISE * rng.standard_normal((len(time), 3))
-    # Every fifth reading (one in 10 s) suffices for ramps of 1 K/min.
+    # One reading in 10 s suffices for ramps of 1 K/min.
     readings = (stamps[::5], board[::5], stamps[::5] + 1, case[::5])
     return source_of(stamps, accel, *readings, name=name)
 
@@ -56,8 +56,7 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     programs = ((20.0, 35.0, 5.0, 20.0), (5.0, 25.0, 12.0), (35.0, 15.0, 30.0))
     bags = [recorded(rng, up, f'p{k}', programs[k % 3]) for k, up in enumerate(positions(4, 3))]
     reduced = [reduce_source(bag, full_scale=None) for bag in bags]
-    # 5000 readings (noise 3 mK) determine T_case - T_board at rest to 0.1 mK; rates from
-    # differences over 120 s add an error.
+    # The error is mainly that of rates from differences over 120 s; noise adds 0.1 mK only.
     assert abs(gradients_at_rest(reduced, ('case',))['case'] + OWN_HEAT_K) < 0.005
     groups = ('curve', 'gradient', 'board', 'gradient_even', 'gradient_even_about_rest')
     about_rest, about_0 = (
@@ -67,14 +66,14 @@ def test_effects_even_about_the_rest_gradient_are_found(rng):
     kept = {column.group for column in about_rest.calibration.response}
     assert 'gradient_even_about_rest' in kept
     assert 'gradient_even' not in kept
-    # Columns even about T_case - T_board = 0 leave a part of the effect.
+    # Columns that are even in T_case - T_board itself cannot describe the whole effect.
     floor = NOISE / np.sqrt(30.0)
     assert about_rest.residuals[-1].fitted.rms < 1.1 * floor
     assert about_0.residuals[-1].fitted.rms > 1.5 * floor
     assert about_0.residuals[-1].left_out.rms > 1.5 * about_rest.residuals[-1].left_out.rms
 
 
-def test_forced_groups_take_part_beside_permitted_groups(rng):
+def test_forced_groups_are_fitted_together_with_permitted_groups(rng):
     bags = [recorded(rng, up, f'p{k}', (20.0, 30.0, 20.0)) for k, up in enumerate(positions(3, 3))]
     options = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), forced=('gradient',))
     assert {column.group for column in fit(bags, options).calibration.response} == {'gradient'}

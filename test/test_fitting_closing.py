@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit estimates the noise of a series, and the condition that ends the dynamic regime."""
+"""A fit estimates correlated noise, and selects the condition that ends the dynamic regime."""
 
 from dataclasses import replace
 
@@ -21,12 +21,12 @@ from thermo_comp.unit.gravity import MICRO_G, STANDARD_GRAVITY
 
 #: Temperatures of a bag: soaks long enough for the board to settle.
 PROGRAM = parse_cyclogram('20 40min, 45@1.5 120min')
-#: Difference of dynamic and static set in each axis [m/s^2], far above a window's noise, 2 ug.
+#: Bias of the dynamic set less that of the static set [m/s^2]; the noise of a window is 2 ug.
 STEP = np.array([120.0, -80.0, 60.0]) * MICRO_G
 
 
 def weight(record, end_condition):
-    """Return the weight of the dynamic set at each sample, with the true sensor settings."""
+    """Return the weight of the dynamic set at each sample, with the true detector settings."""
     tracker = ThermalTracker(replace(DetectorSettings(), end_condition=end_condition))
     readings = sorted(
         (stamp, name, value)
@@ -51,7 +51,7 @@ def weight(record, end_condition):
     ('end_condition', 'options'),
     [('board', {'model': 'golovach'}), ('case', {'groups': ('curve', 'set', 'board')})],
 )
-def test_the_evidence_selects_the_end_condition_of_the_regime(end_condition, options):
+def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_condition, options):
     # A reading every four seconds suffices: the case changes by at most 0.1 K in 4 s.
     unit = triad('plain', 1).with_thermometers(rate_hz=0.25)
     records = []
@@ -61,13 +61,13 @@ def test_the_evidence_selects_the_end_condition_of_the_regime(end_condition, opt
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.end_condition == end_condition
-    # The fit estimates the sensor settings, so its regimes switch at slightly other times.
+    # The fit estimates the settings of the detector: its regimes switch at slightly other times.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 
 
 def uneven(rng):
-    """Make positions of several lengths (one of a single window) with gaps and weights."""
+    """Make positions of 7, 1, 12 and 4 windows, with a gap in the third, and random weights."""
     lengths = (7, 1, 12, 4)
     position = np.repeat(np.arange(len(lengths)), lengths)
     steps = rng.uniform(1.0, 9.0, len(position))
@@ -79,7 +79,7 @@ def uneven(rng):
 
 
 def dense(position, time, weight, noise):
-    """Build the covariance: exponentially correlated noises in each position, and white noise."""
+    """Build the covariance of exponentially correlated noise in each position and white noise."""
     same = position[:, None] == position
     distance = np.abs(time[:, None] - time)
     times_s = [noise.time_s * 10.0**k for k in range(noise.n_times)]
@@ -94,21 +94,21 @@ def dense(position, time, weight, noise):
         *(Noise(1e-2, 30.0, 3), Noise(10.0, 3.0, 4)),
     ],
 )
-def test_products_and_determinant_are_those_of_the_dense_matrix(rng, noise):
+def test_products_and_determinant_equal_those_of_the_dense_matrix(rng, noise):
     position, time, weight = uneven(rng)
     series = rng.standard_normal((len(time), 5))
     whitener = Whitener(position, time)
     white = whitener.filter(series, weight, noise)
     covariance = dense(position, time, weight, noise)
     expected = series.T @ np.linalg.solve(covariance, series)
-    # The tolerance allows for rounding if the condition number of the covariance is below 1e6.
+    # The tolerance allows for rounding at condition numbers of the covariance below 1e6.
     np.testing.assert_allclose(white.T @ white, expected, rtol=1e-9, atol=1e-10)
     determinant = np.linalg.slogdet(covariance)[1]
     assert whitener.log_determinant(weight, noise) == pytest.approx(determinant, abs=1e-9)
 
 
 def drawn(rng, n, steps, noise):
-    """Draw three axes of n positions: white noise of uneven windows, and Gauss-Markov noise."""
+    """Draw n positions on three axes: Gauss-Markov noise plus white noise of varying weight."""
     time = np.cumsum(rng.uniform(20.0, 100.0, steps))
     weight = rng.uniform(0.3, 1.0, steps)
     slow = np.sqrt(noise.ratio) * rng.standard_normal((n, steps, 3))
@@ -121,8 +121,7 @@ def drawn(rng, n, steps, noise):
 
 @pytest.mark.parametrize('noise', [Noise(1.0, 600.0), Noise(0.3, 2000.0), Noise(30.0, 300.0)])
 def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
-    # 240 correlation times determine the variance to sqrt(2 / 240) = 9 %, the correlation time to
-    # 15 %.
+    # 240 correlation times of data determine the variance to 9 % and the time to about 15 %.
     whitener, weight, series = drawn(rng, 9, 300, noise)
     fitted = whitener.estimate(5.0 * series, weight)
     assert 0.5 < fitted.ratio / noise.ratio < 2.0
@@ -130,7 +129,7 @@ def test_variance_ratio_and_correlation_time_are_estimated(rng, noise):
 
 
 def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
-    # By chance slow noise is found in 1 % of white series, but in none of the ten drawn series.
+    # A fit finds Gauss-Markov noise in 1 % of white series; it must find none in these ten.
     assert [
         whitener.estimate(series, weight)
         for whitener, weight, series in (drawn(rng, 5, 100, Noise()) for _ in range(10))
@@ -138,7 +137,7 @@ def test_white_noise_is_not_taken_for_gauss_markov_noise(rng):
 
 
 def test_no_correlation_time_longer_than_a_position_is_estimated(rng):
-    # Correlation times up to a sixth of the length of a position (20 windows of 100 s) are tried.
+    # Only correlation times up to a sixth of a position, which lasts 2000 s, are tried.
     whitener, weight, series = drawn(rng, 12, 20, Noise(100.0, 1e5))
     assert 0.0 < whitener.estimate(series, weight).time_s <= 20.0 * 100.0 / 5.0
     alone = Whitener(np.arange(3), np.zeros(3))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Refusals and advice of a fit, with the numbers in the texts, on simulated tables."""
+"""Refusals and advice of a fit on simulated tables, with the numbers in the messages."""
 
 import re
 from contextlib import nullcontext
@@ -39,7 +39,7 @@ def findings_of(windows, up, *, has_case=True, prior=None):
 
 @pytest.fixture
 def good(rng):
-    """Make windows of 18 positions of 80 min: a ramp up, a ramp down and a soak in each."""
+    """Make windows of 18 positions, each with a ramp up, a ramp down and a soak in 80 min."""
     data, up = table_of(Truth(), 18, rng)
     case = np.interp(data.time, [0.0, 1800.0, 3000.0, 3600.0], [5.0, 45.0, 5.0, 5.0])
     rate = np.interp(
@@ -63,7 +63,7 @@ def good(rng):
     return windows, up
 
 
-def test_a_complete_thermal_test_has_only_good_findings(good):
+def test_a_complete_thermal_test_gives_only_good_findings(good):
     findings = findings_of(*good)
     assert {finding.level for finding in findings.values()} == {'good'}
     assert findings_of(*good, has_case=False)['case'].level == 'advice'
@@ -73,14 +73,14 @@ def test_a_complete_thermal_test_has_only_good_findings(good):
     ('name', 'changed', 'message'),
     [
         ('span', lambda w: {'temperature': 0.1 * w.temperature}, r'\(25 degC advised\): run the'),
-        # WHY: the thermometer of a room was taken for the thermometer of the board.
+        # WHY: the thermometer given as board was that of the room.
         ('span', lambda w: {'temperature': 0.01 * w.temperature}, 'is the thermometer on'),
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
          'no thermometer: the calibration holds at the temperature of the test'),
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
         ('directions', lambda w: {'rate': np.abs(w.rate)}, 'only heating was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
-        # WHY: with soaks at one temperature alone the error was 800 ug, the claimed sd 100 ug.
+        # WHY: with soaks at a single temperature the error was 800 ug, the claimed sd 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},
          r'% of the windows are static, over [56]\.\d of \d\d\.\d K'),
         ('swapped', lambda w: {'gradient': -w.gradient}, r'exchanged, or is the case thermometer'),
@@ -94,9 +94,9 @@ def test_missing_data_of_a_test_are_reported(good, name, changed, message):
     assert name != 'temperature' or set(findings) == {'positions', 'temperature'}
 
 
-def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, rng):
-    # WHY: bags of soaks were refused: the noise of interpolated temperatures enters rate and
-    # gradient, and was taken for a ramp with exchanged sensors.
+def test_the_noise_of_soaks_is_not_taken_for_a_ramp_or_for_exchanged_sensors(good, rng):
+    # WHY: bags of soaks were refused, because noise of the readings in rate and gradient was taken
+    # for ramps with exchanged sensors.
     windows, up = good
     noise = rng.standard_normal(len(windows.rate))
     soaks = 5.0 + 15.0 * (windows.data.position % 3)
@@ -105,12 +105,12 @@ def test_the_noise_of_soaks_is_neither_a_ramp_nor_an_exchange_of_sensors(good, r
     assert 'swapped' not in findings
     assert 'no ramp' in findings['ramps'].message
     assert 'soaks at 3 temperatures' in findings['soaks'].message
-    # A slow drift through the whole temperature range is not a soak.
+    # A slow change over the whole temperature range is not a soak.
     drift = replace(windows, rate=0.0 * windows.rate)
     assert 'soaks' not in findings_of(drift, up)
 
 
-def test_rests_on_a_desk_with_a_prior_of_the_unit_need_no_chamber(good):
+def test_rests_at_room_temperature_are_sufficient_with_a_prior_of_the_unit(good):
     windows, up = good
     room = 22.0 + 0.01 * windows.temperature
     desk = replace(windows, temperature=room, rate=0.0 * windows.rate)
@@ -125,7 +125,7 @@ def test_rests_on_a_desk_with_a_prior_of_the_unit_need_no_chamber(good):
     warm = replace(desk, temperature=desk.temperature + 20.0)
     advised = findings_of(warm, up, prior=prior)['span']
     assert (advised.level, 'the bags reach 42 to 4' in advised.message) == ('advice', True)
-    # A prior of the type of unit has no information about effects of a single unit.
+    # With a prior of units of the type, instead of one of this unit, a chamber is advised.
     of_type = replace(prior, provenance=replace(prior.provenance, model='population'))
     assert {'span', 'ramps'} <= {*findings_of(desk, up, prior=of_type)}
 
@@ -136,7 +136,7 @@ def test_six_faces_do_not_determine_the_misalignment(good):
     assert not determines_misalignment(faces)
     message = findings_of(windows, faces)['misalignment'].message
     assert 'the misalignment keeps its prior' in message
-    # A second rest on a face, two degrees off, is not a new position.
+    # A second rest on a face that differs by 2 degrees does not count as a new position.
     tilted = faces + 0.03
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     assert len(distinct_directions(np.vstack((faces, tilted)))) == 6
@@ -149,14 +149,14 @@ def test_six_faces_do_not_determine_the_misalignment(good):
     assert geometry(flat, with_misalignment=True) == np.inf
 
 
-def test_geometry_is_the_scatter_of_the_parameters(rng):
-    # The expected scatter is that of least-squares fits of nine parameters to noise of the norm.
+def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
+    # Expected: scatter of nine parameters fitted by least squares to a noise of the norm of 1.
     up = positions(12, 5)
     x, y, z = up.T
     jacobian = np.column_stack((x, y, z, x * x, y * y, z * z, x * y, x * z, y * z))
     noise = rng.standard_normal((4000, 12))
     scatter = (noise @ np.linalg.pinv(jacobian).T).std(axis=0).max()
-    # 4000 draws determine the sd of a parameter to 1.1 %.
+    # The sd of 4000 draws is uncertain by 1.1 %.
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
 
 
@@ -185,7 +185,7 @@ def test_the_residual_of_the_fit_is_reported():
     good = judged(100.0, 1.0, 0.2, 1.5)
     assert set(good) == {'residual'}
     assert '100.0 ug RMS raw, 1.5 ug on data left out, 1.0 ug' in good['residual'].message
-    # If no position can be left out, the message has no residual of left-out positions.
+    # Without left-out positions the message has no residual of left-out data.
     assert 'left out' not in judged(100.0, 1.0, 0.2)['residual'].message
 
 
@@ -193,10 +193,10 @@ def test_the_residual_of_the_fit_is_reported():
     ('given', 'name', 'message'),
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
-        # Temperatures of another clock, an hour late: residual 878 ug left out, raw 692 ug.
+        # Temperatures with stamps one hour late left 878 ug on left-out data, 692 ug raw.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out residuals exceed the raw residual'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
-        # WHY: noise, a span of 0.3 K, and different turn-ons each gave false advice.
+        # WHY: noise, a temperature range of 0.3 K and turn-on offsets each gave wrong advice.
         ((1.1, 1.0, 0.1, 1.0, 0.3), 'residual', '1.1 ug RMS raw'),
         ((85.0, 2.6, 50.0, 14.6, 8.6, 2.6, 2.6), 'residual', '2.6 ug in sample'),
         ((3689.0, 980.0, 1500.0, 1793.0, 30.0, 60.0, 40.0), 'misfit', 'mounted or switched on'),
@@ -223,8 +223,8 @@ def test_options_out_of_range_are_refused(change, message):
 
 
 def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
-    # The unit heats itself by 3 K; the board lags the case by 600 s in ramps, and by 1500 s while
-    # a soak settles.
+    # Self-heating makes the board 3 K warmer than the case. The board lags the case by 600 s in
+    # ramps, and by 1500 s at the beginning of a soak.
     windows, _ = good
     t = windows.data.time
     rate = np.where(t < 3000.0, 1.0 / 60.0, 0.02 / 60.0 * np.exp(-(t - 3000.0) / 600.0))
@@ -233,7 +233,7 @@ def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
     middle, sd = soak_gradient(replace(windows, rate=rate, gradient=gradient), None)
     assert middle == pytest.approx(-3.0, abs=0.01)
     assert sd == pytest.approx(0.01, rel=0.2)
-    # Without a soak or without a case thermometer, the gradient of a soak is unknown.
+    # Without a soak or without a case thermometer the gradient in a soak is unknown.
     assert (
         soak_gradient(replace(windows, rate=np.full_like(t, 0.5), gradient=gradient), None) is None
     )
@@ -246,8 +246,8 @@ def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
     ('kappa', 'n', 'is_refused'),
     [((1.0, 1.2, 0.53), 3, True), ((1.0, 1.2, 0.53), 6, False), ((0.9, 1.1, 1.2), 3, False)],
 )
-def test_scale_factors_of_no_triad_need_six_attitudes(kappa, n, is_refused):
-    # WHY: from three attitudes a fit had the scale factors 1.04, 1.19 and 0.53, 0.3 g wrong.
+def test_implausible_scale_factors_from_few_attitudes_are_refused(kappa, n, is_refused):
+    # WHY: a fit to three attitudes found scale factors of 1.04, 1.19 and 0.53, an error of 0.3 g.
     state = SimpleNamespace(kappa=np.array(kappa), up=positions(n, 3))
     prior = SimpleNamespace(informative=None, scale_mean=np.ones(3), scale_sd=0.05)
     fit = SimpleNamespace(posterior=SimpleNamespace(state=state, prior=prior))

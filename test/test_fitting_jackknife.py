@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The claimed sd contains effects that the model lacks, and agrees with a jackknife."""
+"""The claimed sd covers effects that the model lacks, and agrees with a jackknife estimate."""
 
 from dataclasses import replace
 
@@ -31,9 +31,8 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 def ratios_to_sd(seed, effect_sd):
     """
-    Return the errors of the weights divided by the fit's sd, and divided by the claimed sd. In
-    each section of the program an effect that the model lacks changes the biases of all positions
-    equally.
+    Return the errors of the response weights, divided by the fit's sd and by the claimed sd, if
+    the biases change randomly by `effect_sd` from section to section, alike in all positions.
     """
     truth, rng = Truth(), np.random.default_rng(seed)
     windows, up = table_of(truth, 12, rng, n_windows=24)
@@ -51,10 +50,10 @@ def ratios_to_sd(seed, effect_sd):
 
 
 @pytest.mark.parametrize('effect_sd', [0.0, 3.0 * MICRO, 10.0 * MICRO])
-def test_the_claimed_sd_contains_effects_that_the_model_lacks(effect_sd):
+def test_the_claimed_sd_covers_effects_that_the_model_lacks(effect_sd):
     ratios = np.array([ratios_to_sd(seed, effect_sd) for seed in range(10)])
     of_fit, of_claim = np.sqrt(np.mean(ratios**2, axis=(0, 2, 3)))
-    # The RMS of 120 errors, of which those of an axis are correlated, is known to some 15 %.
+    # The RMS of 120 errors, which are correlated within an axis, has an error of about 15 %.
     assert 0.7 < of_claim < 1.3
     if effect_sd:
         assert of_fit > 2.5
@@ -69,8 +68,8 @@ def ratio(path):
     options = FitOptions(gravity=STANDARD_GRAVITY, input='m/s^2')
     short = {'window_s': 1.0, 'cell_s': 0.2, 'min_rest_s': 1.0, 'fewest_windows': FEWEST_WINDOWS}
     whole = reduce_source(source_of(stamps, accel, name=path.stem), full_scale=None, **short)
-    # A jackknife over positions of one recording does not show how well turn-ons repeat, so each
-    # position is fitted as a recording.
+    # The claimed sd of a single recording includes an assumed sd of the bias at turn-on, which a
+    # jackknife does not observe, so each position is fitted as a recording.
     result = fit_bags([replace(whole, intervals=[each]) for each in whole.intervals], options)
     posterior = result.fit.posterior
     calibration, data = result.calibration, result.fit.windows.data
@@ -98,5 +97,5 @@ def test_the_claimed_sd_agrees_with_a_jackknife(real_data):
     if not all(path.is_file() for path in logs):
         pytest.skip('the logs of the MPU-9150 units are not there')
     ratios = [ratio(path) for path in logs]
-    # A jackknife over about 20 positions determines the sd of nine parameters to 15 %.
+    # A jackknife over about 20 positions determines sd with an error of about 15 %.
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4, ratios

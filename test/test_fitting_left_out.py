@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models are compared by their errors on left-out data."""
+"""Models are compared by their errors for data that were left out of the fit."""
 
 from types import SimpleNamespace
 
@@ -13,7 +13,7 @@ MICRO = 9.80665e-6  # a micro-g [m/s^2]
 
 
 def score(drift, norms=(), by_thermometer=0.0):
-    """Return a score with equal drifts in 18 positions and sections, and given norms [ug]."""
+    """Return a score with left-out drifts of equal size and the given errors of |f| [ug]."""
     drifts = Folds(np.full(18, (drift * MICRO) ** 2), np.full(18, 20.0))
     of_norms = Folds((np.array(norms) * MICRO) ** 2, np.full(len(norms), 20.0))
     none = np.zeros((0, 3))
@@ -22,10 +22,10 @@ def score(drift, norms=(), by_thermometer=0.0):
     )
 
 
-def test_few_norms_that_both_models_predict_do_not_decide():
-    # WHY: a MEMS in six faces at three temperatures, with a recording for each, got no curve over
-    # temperature: only four left-out norms were determined with and without the curve, and their
-    # gain of 4.7 was below two standard errors. The error without a curve was 7 mg, not 0.3 mg.
+def test_few_norms_that_both_models_predict_do_not_select_the_model():
+    # WHY: a MEMS was recorded in six faces at three temperatures. Only four left-out values of |f|
+    # could be predicted both with and without a curve over temperature. Their gain was below two
+    # standard errors, so the fit had no curve, and an error of 7 mg instead of 0.3 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
@@ -35,23 +35,23 @@ def test_few_norms_that_both_models_predict_do_not_decide():
 
 
 def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
-    # WHY: readings in steps of 1 K have the same errors in all bags of a program. Bends over the
-    # temperature halved the left-out drift and doubled the error in another program.
+    # WHY: readings in steps of 1 K have equal errors in all bags of one temperature program. Knees
+    # in the curve halved the left-out drift, but doubled the error in another program.
     by_thermometer = 49.0
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # Norms above the thermometer's error still decide: rests at three temperatures need a curve.
+    # If the errors of |f| are larger than the error of the thermometer, they select the curve.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))
-    # With a fine thermometer (5 ug) a drop of the left-out drift from 46 to 20 ug counts.
+    # With a thermometer error of 5 ug a reduction of the left-out drift from 46 to 20 ug counts.
     assert is_better(score(46.0, (), 5.0), score(20.0, (), 5.0))
 
 
-def test_large_mounting_offsets_must_not_spoil_left_out_norms():
-    # WHY: a random walk of the bias of 20 ug per root hour left drifts that mounting offsets of 5
-    # mg explained by scale factors: the evidence was larger, and the error 5 mg.
+def test_a_fit_with_large_mounting_offsets_must_not_increase_left_out_norms():
+    # WHY: a fit with mounting offsets of 5 mg attributed a random walk of the bias (20 ug in an
+    # hour) to scale factors: its evidence was larger, but its error was 5 mg.
     def trial(norm, log_evidence):
         posterior = SimpleNamespace(
             prior=SimpleNamespace(offset_scale=0.0),

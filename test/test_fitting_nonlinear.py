@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to forces beyond 1 g estimate nonlinear terms and the radius of a rotation."""
+"""Fits to forces beyond 1 g determine nonlinear terms and the radius of a rotation."""
 
 import math
 from dataclasses import replace
@@ -49,7 +49,7 @@ SIZES = np.tile([GRAVITY, 30.0, 60.0, 95.0], 6)
 
 
 def table(rng, k2=0.0, kq=0.0, k3=0.0, *, share=0.01, radius_sd=0.0, radius_error=0.0):
-    """Draw windows of 24 positions on a centrifuge; terms of force change by `share` per K."""
+    """Draw windows of 24 positions on a centrifuge; terms grow by 100 * `share` % per K."""
     truth = Truth(on_bias=np.zeros((3, 6)), on_scale=np.zeros((3, 6)), offset_sd=MICRO)
     windows, up = table_of(truth, 24, rng, n_windows=10)
     t = windows.columns[:, 0]
@@ -67,7 +67,7 @@ def table(rng, k2=0.0, kq=0.0, k3=0.0, *, share=0.01, radius_sd=0.0, radius_erro
 
 
 def chosen(rng, **terms):
-    """Fit windows of a centrifuge; return the fit, the chosen terms, and the sd of each kind."""
+    """Fit windows of a centrifuge; return the fit, the chosen terms and their claimed sd."""
     truth, regression, state = table(rng, **terms)
     prior = prior_of(truth, (), nonlinear_sd=starting_sd(regression.forces, OPTIONS))
     posterior = regression.solve(state, prior, n_steps=12)
@@ -76,7 +76,7 @@ def chosen(rng, **terms):
     return truth, selected.posterior, found
 
 
-def test_derivatives_of_nonlinear_terms_equal_differences(rng):
+def test_derivatives_of_nonlinear_terms_agree_with_finite_differences(rng):
     _, regression, state = table(rng, 1e-5, 1e-5, 1e-6, radius_sd=0.01)
     sd = rng.uniform(1e-4, 1e-3, 24)
     regression.forces = replace(regression.forces, sd=sd)
@@ -101,7 +101,7 @@ def test_derivatives_of_nonlinear_terms_equal_differences(rng):
                 )
                 expected = (below - above) / 2e-6
                 derived = derivatives[p, axis, :, column]
-                # Tolerance: rounding of 1e-14 / step of 1e-6, times forces up to 95 m/s^2.
+                # The tolerance is the rounding error: 1e-14 / 1e-6 (step) * 95 m/s^2 (force).
                 scale = np.abs(expected).max()
                 np.testing.assert_allclose(derived, expected, rtol=1e-5, atol=1e-7 * scale + 1e-6)
 
@@ -113,7 +113,7 @@ def test_square_and_cube_are_estimated_within_their_claimed_sd(rng):
     sd = np.sqrt(posterior.variance[places])
     error = posterior.state.nonlinear[:, [0, 2, 3, 5]] - np.array([1e-5, -1e-6, 1e-7, -1e-8])
     assert np.abs(error / sd).max() < 4.0
-    # K2 and K3 are required to be right to 2 %.
+    # The goal for the error of K2 and K3 is 2 %.
     assert np.abs(error[:, :2] / [1e-5, 1e-6]).max() < 0.02
     assert all(term.left_out_gain > 1.0 and term.log_evidence_change > 100.0 for term in terms)
 
@@ -129,7 +129,7 @@ def test_absent_terms_are_pruned_without_effect_on_the_other_parameters(rng):
         )
 
 
-def test_an_odd_square_is_chosen_only_where_it_is_present(rng):
+def test_the_odd_square_is_chosen_only_if_the_unit_has_it(rng):
     _, posterior, terms = chosen(rng, kq=1e-5, share=0.0)
     assert [term.kind for term in terms] == ['odd_square']
     assert posterior.state.nonlinear[:, 1] == pytest.approx(1e-5, rel=0.02)
@@ -145,7 +145,7 @@ def test_the_radius_of_a_rotation_is_estimated(rng):
     assert abs(solution.state.radius[0] - 0.004) < 4.0 * sd
 
 
-def test_a_table_of_sections_states_the_force_of_each_rest():
+def test_a_table_of_sections_is_read_as_begin_end_force_and_sd():
     text = '# begin end |f| sd\n0 100 9.81\n120, 300, 49.05, 0.001  # spun up'
     known = KnownForce('bag', parse_sections(text))
     at = [known.of(a * 10**9, b * 10**9, 0) for a, b in ((10, 90), (150, 250), (310, 400))]
@@ -162,7 +162,7 @@ def test_a_table_of_sections_states_the_force_of_each_rest():
             parse_sections(wrong)
 
 
-def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
+def test_a_force_given_by_the_user_overrides_the_force_in_the_bag(tmp_path):
     stamps = 10**18 + np.arange(0, 20 * 10**9, 10**8)
     rate = np.zeros((200, 3))
     rate[:, 2] = np.where(np.arange(200) < 100, 0.0, 5.0)
@@ -175,7 +175,7 @@ def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
         with BagWriter(tmp_path / f'{name}.mcap', metadata=metadata) as writer:
             writer.write_counts('accel/counts', stamps, rate)
             writer.write_counts('table/rate', stamps, rate)
-    # WHY: a name that begins with a digit, as `record` makes it, was taken for a number.
+    # WHY: a bag name that begins with a digit, as those of `record`, was taken for a number.
     (tmp_path / 'table.txt').write_text('a.mcap 0 5 20\n02.mcap 0 5 25\n')
 
     def read(name, asked=ForceOptions()):  # noqa: B008
@@ -208,7 +208,7 @@ def test_the_user_s_force_overrides_that_of_the_bag(tmp_path):
         read('a', ForceOptions(str(tmp_path / 'bad.txt')))
 
 
-def test_a_constant_rotation_is_a_rest_a_changing_rotation_is_not(rng):
+def test_a_constant_rotation_counts_as_a_rest_and_a_changing_one_does_not(rng):
     time = np.arange(0.0, 240.0, 0.02)
     rate = np.interp(time, [0, 80, 100, 180, 190], [0.0, 0.0, 3.0, 3.0, 0.0])
     force = np.column_stack((0.0 * time, rate**2, 9.8 + 0.0 * time))
@@ -219,7 +219,7 @@ def test_a_constant_rotation_is_a_rest_a_changing_rotation_is_not(rng):
     summed = accumulator.cells()
     still = still_intervals(without_rotation(summed), 3.0)
     edges = [(summed.time[a], summed.time[b - 1]) for a, b in still]
-    # The median of the rate follows a change after 5 s, and cells beside a motion are not still.
+    # The median rate shows a change after 5 s, and cells next to a motion do not count as rest.
     assert len(edges) == 3
     for (a, b), (begun, ended) in zip(edges, ((0, 80), (100, 180), (190, 240)), strict=True):
         assert begun <= a < begun + 8.0
@@ -242,8 +242,8 @@ def source(run, spin, name):
 
 
 @pytest.mark.slow
-def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
-    # For speed the runs have one temperature, and nine mountings at about 1, 3 and 8 g.
+def test_runs_of_a_centrifuge_determine_nonlinear_terms_that_a_later_fit_keeps():
+    # To save time the runs have one temperature, nine mountings, and forces of 1, 3 and 8 g.
     unit = replace(triad('plain', 3), bend=Bend((10.0, -10.0, 10.0), (1.0, 1.0, -1.0)))
     time, rate = steps((150.0,), tuple(np.sqrt([3.0 * G, 8.0 * G])), 150.0, 20.0)
     program = Cyclogram((0.0, 560.0), (20.0, 20.0))
@@ -265,15 +265,14 @@ def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
     judged = judge_bags(result.bags, result.calibration)
     assert [round(size / G, 1) for size in judged.by_force] == [1.0, 3.2, 8.1]
     *_, most = judged.by_force.values()
-    # Noise and rounding are some ug in means of 60 s; uncorrected nonlinear terms 100s of ug.
+    # In means over 60 s noise and rounding are some ug, uncorrected nonlinear terms some 100 ug.
     assert most.rms < 10.0 * MICRO < 100.0 * MICRO < most.raw_rms
     narrow = replace(result.calibration.nonlinearity, force_range_m_s2=(9.0, 5.0 * G))
     outside = judge_bags(result.bags, replace(result.calibration, nonlinearity=narrow))
     assert outside.sections['outside'].n == most.n
     rows = results(evidence_of_fit(result), CertificateInfo(), ())
     assert {'K2 x', 'K3 z'} < {row.quantity for row in rows}
-    # A fit to a later tumble at 1 g with the centrifuge calibration as prior keeps the nonlinear
-    # terms.
+    # A fit to six positions at 1 g with this calibration as prior keeps the nonlinear terms.
     still = [Position(program, position) for position in positions(6, 2)]
     later = arrays(unit, still, 9, rate_hz=2.0)
     tumble = [source(run, None, f'still{k}') for k, run in enumerate(later)]
@@ -285,7 +284,7 @@ def test_runs_of_a_centrifuge_give_a_calibration_over_force_and_a_prior():
         replace(again, unit=replace(again.unit, serial=f'{k}'), gyroscope=None) for k in range(3)
     ]
     assert population(siblings).nonlinearity is None
-    # A fit to a tumble alone leaves the sd of K2 at the bound of the data sheet, and reports so.
+    # A fit to positions at 1 g only keeps the stated sd of K2, and a finding says so.
     alone = fit(tumble, FitOptions(gravity=G, model='golovach', k2_sd=5e-5))
     assert [finding.name for finding in alone.findings].count('nonlinearity') == 1
     (square, *_) = nonlinear_coefficients(alone.calibration)

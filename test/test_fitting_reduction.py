@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples are reduced to cells, still intervals and windows; gravity and sensors are estimated."""
+"""Samples are reduced to cells, rests and windows; thermometer settings are estimated."""
 
 from dataclasses import replace
 
@@ -57,14 +57,14 @@ def still(rng, seconds, level):
     return np.array(level) + 0.3 * rng.standard_normal((int(seconds * RATE_HZ), 3))
 
 
-def test_the_reduction_does_not_depend_on_the_blocks(rng):
+def test_the_reduction_does_not_depend_on_how_samples_are_divided_into_blocks(rng):
     whole = block(np.rint(still(rng, 61.0, (10.0, -3000.0, 50.0))))
     at_once = reduced([whole])
     for n_parts in (2, 7, 50):
         other = reduced(split(whole, n_parts))
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
-            # Blocks change the order in which samples are added, and so the rounding of the sums.
+            # Sums over blocks have a different order of additions, so a different rounding.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
@@ -72,7 +72,7 @@ def test_the_reduction_does_not_depend_on_the_blocks(rng):
 
 @pytest.mark.parametrize('rest_s', [30, 45])
 def test_short_rests_of_slow_samples_are_found(rng, rest_s):
-    # WHY: at 1 Hz a cell of 30 s averaged several attitudes, and |f| of its mean was 0.07 m/s^2.
+    # WHY: at 1 Hz samples were averaged over 30 s, over several attitudes, to |f| = 0.07 m/s^2.
     ups = np.repeat(positions(18, 1), rest_s, axis=0)
     samples = 9.8 * (ups + 5e-6 * rng.standard_normal(ups.shape))
     tumble = ArrayBlock(stamps(len(samples), 1.0), samples)
@@ -80,16 +80,16 @@ def test_short_rests_of_slow_samples_are_found(rng, rest_s):
     assert len(bag.intervals) >= 18
     for interval in bag.intervals:
         size = np.linalg.norm(interval.mean, axis=1)
-        # The noise is 5 ug per sample; a window has ten samples, the last window fewer.
+        # A sample has a noise of 5 ug; a window has ten samples, the last window of a rest fewer.
         np.testing.assert_allclose(size, 9.8, rtol=2e-5)
-    # Without short rests the windows of samples at 1 Hz stay 30 s long.
+    # Samples at 1 Hz in random attitudes, without a rest, keep windows of 30 s.
     alone = replace(tumble, accel=samples[rng.integers(rest_s, size=len(samples))])
     assert reduced([alone], full_scale=None).window_s == 30.0
 
 
 @pytest.mark.parametrize('cycle_s', [0.01, 0.02, 0.04, 0.05, 0.1, 0.3, 1.0])
-def test_the_interval_between_samples_is_exact(rng, cycle_s):
-    # WHY: a sample rate of 10 Hz was stated as 9.9 Hz, since a cell holds 33 or 34 samples.
+def test_the_estimated_interval_between_samples_is_right_to_0_1_percent(rng, cycle_s):
+    # WHY: at 10 Hz a cell has 33 or 34 samples, and the rate was computed as 9.9 Hz.
     n = round(1800.0 / cycle_s)
     kept = rng.random(n) > 2.0 / n  # a few samples are lost
     samples = 9.8 + 0.01 * rng.standard_normal((n, 3))
@@ -117,15 +117,15 @@ def test_positions_in_one_bag_are_separated(rng):
     first, second = reduced([block(accel)]).intervals
     np.testing.assert_allclose(first.mean[0], (0.0, 0.0, 3000.0), atol=0.1)
     np.testing.assert_allclose(second.mean[-1], (3000.0, 0.0, 0.0), atol=0.1)
-    # At most two cells are dropped on either side of the motion.
+    # Up to two cells (1 s) before and after the motion are left out of the rests.
     assert (first.end_ns - first.start_ns) * 1e-9 == pytest.approx(40.0, abs=1.6)
     assert (second.end_ns - second.start_ns) * 1e-9 == pytest.approx(30.0, abs=1.6)
 
 
-def test_a_chamber_whose_compressor_cycles_has_one_position(rng):
-    # WHY: half of the recording was left out, and each pause of the compressor was a position: 18
-    # bags had 1135 positions, and their fit took ten minutes. WHAT: twelve shakes of three times
-    # the noise belong to the rest, and a turn by 300 urad between two shakes is detected.
+def test_vibrations_of_a_compressor_do_not_divide_a_position(rng):
+    # WHY: vibration by the compressor counted as motion, and each pause as a position: 18 bags had
+    # 1135 positions. WHAT: twelve vibrations of three times the noise belong to one rest, in which
+    # a turn by 300 urad is detected.
     accel = still(rng, 720.0, (0.0, 0.0, 3000.0))
     for start in range(3000, 72000, 6000):
         accel[start : start + 3000] += 0.9 * rng.standard_normal((3000, 3))
@@ -137,14 +137,14 @@ def test_a_chamber_whose_compressor_cycles_has_one_position(rng):
 
 
 def test_a_knock_starts_a_new_position(rng):
-    # A knock turns the attitude by 1 count of 3000, which is 300 urad or 20 sd of a cell mean.
+    # The knock turns the unit by 300 urad: x changes by 1 count of 3000, 20 sd of a cell mean.
     accel = still(rng, 60.0, (0.0, 0.0, 3000.0))
     accel[3000:] += (1.0, 0.0, 0.0)
     assert len(reduced([block(accel)]).intervals) == 2
 
 
-def test_a_thermal_drift_is_no_motion(rng):
-    # A drift of 100 ppm/K at 3 K/min is 0.015 counts/s, or 0.02 sd of a cell mean per cell.
+def test_a_thermal_drift_is_not_taken_for_motion(rng):
+    # 100 ppm/K at 3 K/min are 0.015 counts/s; from cell to cell a mean changes by 0.02 of its sd.
     accel = still(rng, 300.0, (0.0, 0.0, 3000.0))
     accel[:, 2] += 0.015 * np.arange(len(accel)) / RATE_HZ
     assert len(reduced([block(accel)]).intervals) == 1
@@ -160,7 +160,8 @@ def test_bad_samples_are_counted_and_left_out(rng):
 
 
 def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
-    # WHY: one reading of -127 degC in 60 gave a thermometer noise of 14 K and 25 times the error.
+    # WHY: with -127 degC in every 60th reading the estimated noise of the thermometer was 14 K,
+    # and the error of the fit 25 times as large as without these readings.
     whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
     whole.board[:] = 20.0 + 0.02 * rng.standard_normal(len(whole.board))
     whole.board[30::60] = -127.0
@@ -171,21 +172,21 @@ def test_readings_of_a_lost_thermometer_are_counted_and_left_out(rng):
     assert noise == pytest.approx(0.02, rel=0.1)
     (finding,) = (f for f in judge_bags([bag], FitOptions(gravity=9.8)) if f.name == 'spikes')
     assert '33 readings' in finding.message
-    # The first and the last reading of a bag are tested for spikes, too.
+    # The first and the last reading may be spikes, too.
     at_ends = np.array([85.0, 20.0, 20.1, 20.2, 20.3, 20.4, -127.0])
     assert np.flatnonzero(is_spike(at_ends)).tolist() == [0, 6]
-    # Slow readings of a fast change are not spikes.
+    # Readings of a temperature that changes by up to 18 K from reading to reading are no spikes.
     assert not is_spike(np.array([-18.0, 0.0, 12.0, 18.0, 20.0, 21.0, 21.0])).any()
 
 
 def test_glitches_are_counted_and_end_no_rest(rng):
-    # WHY: each wrong sample ended a rest, and a fit with 1 % of them took minutes instead of 2 s.
+    # WHY: each wrong sample ended a rest, and with 1 % wrong samples a fit took minutes, not 2 s.
     whole = block(still(rng, 2000.0, (0.0, 0.0, 3000.0)))
     whole.accel[50::100, 1] += 1500.0
-    # A tap on the unit of ten samples is a motion, no glitch, and ends the rest.
+    # A tap that changes ten samples is a motion, and ends the rest.
     whole.accel[100_000:100_010] += 1500.0 * np.array([[-1.0], [1.0]] * 5)
     bag = reduced([whole])
-    # A unit turned by hand for 20 s shakes: none of these samples is a glitch.
+    # While the unit is turned by hand for 20 s, no sample counts as a glitch.
     turned = block(still(rng, 200.0, (0.0, 0.0, 3000.0)))
     turned.accel[9000:11_000] += 600.0 * rng.standard_normal((2000, 3))
     assert reduced([turned]).n_glitches == 0
@@ -196,13 +197,13 @@ def test_glitches_are_counted_and_end_no_rest(rng):
     assert '2000 samples' in finding.message
 
 
-def test_samples_stamped_on_arrival_in_bursts_are_at_rest(rng):
-    # WHY: cells of 30 samples, by the median step of 0.3 ms, were empty between the bursts, and
-    # a unit at rest for 22 min was called worn or driven.
+def test_a_rest_is_found_in_samples_that_arrive_in_bursts(rng):
+    # WHY: the length of a cell followed from the median step of stamps, 0.3 ms, so cells between
+    # bursts were empty, and a unit at rest for 22 min was reported as worn or driven.
     whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
     number = np.arange(len(whole.accel))
     for size in (20, 100, 200):
-        # At a mean rate of 100 Hz the samples of a burst have stamps 0.3 ms apart.
+        # The mean rate is 100 Hz; within a burst the stamps are 0.3 ms apart.
         stamps = (number // size * size + size) * 10_000_000 + number % size * 300_000
         bag = reduced([replace(whole, accel_stamp_ns=whole.accel_stamp_ns[0] + stamps)])
         assert len(bag.intervals) == 1
@@ -210,7 +211,7 @@ def test_samples_stamped_on_arrival_in_bursts_are_at_rest(rng):
         assert bag.n_dropped == 0
 
 
-def test_samples_of_a_message_batch_with_one_stamp_are_named(rng):
+def test_several_samples_with_one_stamp_are_reported(rng):
     whole = block(still(rng, 600.0, (0.0, 0.0, 3000.0)))
     stamps = whole.accel_stamp_ns[np.arange(len(whole.accel)) // 10 * 10]
     bag = reduced([replace(whole, accel_stamp_ns=stamps)])
@@ -229,11 +230,10 @@ def test_stamps_that_do_not_rise_are_left_out(rng):
 
 @pytest.mark.parametrize('n', [0, 1, 70])
 def test_a_few_stamps_that_do_not_rise_are_reported(n, rng):
-    # WHY: `info` reported a clock set back if less than 1 % of the samples were affected, `fit`
-    # did not.
+    # WHY: if less than 1 % of the stamps did not rise, `info` reported this and `fit` did not.
     whole = block(still(rng, 300.0, (0.0, 0.0, 3000.0)))
     cycle_ns = int(np.median(np.diff(whole.accel_stamp_ns)))
-    # The first sample after the clock is set back by n cycles has the stamp of an earlier sample.
+    # The clock is set back by n cycles, so n samples have stamps that have occurred before.
     whole.accel_stamp_ns[20_000:] -= n * cycle_ns
     bag = reduced([whole])
     assert bag.n_dropped == n
@@ -256,7 +256,7 @@ def test_the_reduction_does_not_depend_on_the_origin_of_time(rng):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'cell_s', 'window_s'),
-    # 20 cells of 0.5 s fill a window of 10 s; at 4 Hz and 1 Hz a cell is as long as a window.
+    # At 100 Hz 20 cells of 0.5 s make a window of 10 s; at 4 Hz and 1 Hz a window is one cell.
     [(100.0, 0.5, 10.0), (20.0, 10.0 / 6.0, 10.0), (4.0, 10.0, 10.0), (1.0, 30.0, 30.0)],
 )
 def test_windows_of_a_fit_have_the_stated_length(rate_hz, cell_s, window_s, rng):
@@ -292,7 +292,7 @@ def test_fast_readings_are_averaged(rng):
 
 @pytest.mark.parametrize(
     ('latitude', 'height', 'expected'),
-    # Expected: gravity by WGS 84 at the equator, the pole and 45 degrees, as published.
+    # Expected values: published normal gravity of WGS 84 at the equator, the pole and 45 degrees.
     [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 0.0, 9.8061977694)],
 )
 def test_normal_gravity_agrees_with_published_values(latitude, height, expected):
@@ -301,7 +301,7 @@ def test_normal_gravity_agrees_with_published_values(latitude, height, expected)
 
 
 def test_gravity_falls_with_height():
-    # The free-air gradient is 0.3086 mGal/m, and falls by 0.02 % per km.
+    # The free-air gradient is 0.3086 mGal/m at the surface, 0.02 % less at a height of 1 km.
     fall = normal_gravity(50.0, 0.0) - normal_gravity(50.0, 1000.0)
     assert fall == pytest.approx(3.086e-3, rel=1e-3)
 
@@ -319,7 +319,7 @@ def test_a_gravity_not_found_on_earth_is_refused(gravity):
 
 
 def soak_ramp_soak(quantum, noise, rng):
-    # Three hours at 1 Hz are a soak, a ramp of 1 K/min through a lag of 300 s, and a soak.
+    # Three hours at 1 Hz: a soak, a ramp of 1 K/min after a lag of 300 s, and a soak.
     time = np.arange(0.0, 10800.0)
     air = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     celsius = np.empty_like(air)
@@ -336,7 +336,8 @@ def soak_ramp_soak(quantum, noise, rng):
 def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
     learned = learn_thermometer([soak_ramp_soak(quantum, noise, rng)], ThermometerSettings())
     assert learned.quantum_c == pytest.approx(quantum, rel=1e-6)
-    # With steps only the few edges that are passed slowly, at the end of a ramp, show the noise.
+    # If readings have steps, only edges that are passed slowly, at the end of the ramp, show
+    # noise.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.4 if quantum else 0.1)
     # Means over 60 s determine the lag of the thermometer, 300 s, to a third.
     assert learned.lag_s == pytest.approx(300.0, rel=0.35)
@@ -344,20 +345,20 @@ def test_thermometer_settings_are_estimated_from_readings(quantum, noise, rng):
 
 
 @pytest.mark.parametrize('noise', [0.02, 0.05, 0.09])
-def test_readings_that_flicker_at_the_edges_of_a_degree_show_their_noise(noise, rng):
+def test_readings_that_alternate_at_edges_of_1_k_steps_show_their_noise(noise, rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, noise, rng)], ThermometerSettings())
-    # Each of 30 edges is passed once; the two slowest passes show the noise best.
+    # The readings pass each of 30 edges once; only the two slowest passes show the noise.
     assert learned.noise_sd_c == pytest.approx(noise, rel=0.3)
 
 
-def test_readings_that_never_flicker_have_a_noise_of_a_hundredth_of_their_quantum(rng):
+def test_readings_that_never_alternate_have_a_noise_of_0_01_quanta(rng):
     learned = learn_thermometer([soak_ramp_soak(1.0, 0.0, rng)], ThermometerSettings())
     assert learned.noise_sd_c == pytest.approx(0.01)
 
 
 def test_the_lag_is_at_least_three_reading_intervals(rng):
-    # WHY: the estimate of a thermometer restarts after a pause longer than its lag, so readings
-    # each minute with a lag of 50 s left the rate at 0 in all ramps.
+    # WHY: a pause longer than the lag restarts the estimate of a thermometer: with readings every
+    # 60 s and a lag of 50 s the estimated rate was 0 in all ramps.
     time = np.arange(0.0, 14400.0, 60.0)
     celsius = np.interp(time, [0.0, 3600.0, 5400.0], [5.0, 5.0, 35.0])
     readings = Readings(
@@ -385,14 +386,14 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
     readings = Readings(stamps(n, 1.0), celsius)
     bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
-    # The smallest ramp of the detector is 0.7 times the ramp of 0.15 K/min.
+    # The detector's setting for the smallest ramp is 0.7 of the slowest ramp, 0.15 K/min.
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5
 
 
 @pytest.mark.parametrize('step', [1.0, 16.0, 1.0 / 300.0])
-def test_an_axis_with_a_coarse_quantum_is_at_rest(step, rng):
-    # An axis that is constant, or alternates between two values, is at rest at any quantum.
+def test_a_rest_is_found_at_any_quantum_of_the_samples(step, rng):
+    # Rounded samples are constant, or alternate between two values that differ by a quantum.
     slow = 0.6 * np.sin(np.arange(60 * RATE_HZ) / 900.0)
     accel = 2900.0 + slow[:, None] + 0.05 * rng.standard_normal((len(slow), 3))
     bag = reduced([block(np.round(accel) * step)], full_scale=None)
@@ -400,7 +401,7 @@ def test_an_axis_with_a_coarse_quantum_is_at_rest(step, rng):
     assert bag.n_still_cells == bag.n_cells
 
 
-def test_samples_without_noise_have_the_error_of_rounding(rng):
+def test_the_rounding_sd_without_noise_is_that_of_simulated_rounding(rng):
     level = rng.uniform(-0.5, 0.5, 1000)
     (expected, _, _) = rounding_sd(np.zeros(3), np.zeros(3), np.ones(3))
     # The RMS of 1000 errors has an sd of 2 %.
@@ -416,9 +417,9 @@ def test_a_drift_averages_the_error_of_rounding(rng):
 
 
 @pytest.mark.parametrize('step', [1.0, 0.04])
-def test_steps_of_a_converter_after_a_constant_soak_are_no_rests(rng, step):
-    # WHY: the step of the converter was looked for in the first 20000 samples only, and a bag
-    # that began with a constant soak was cut into a rest for each later step.
+def test_steps_of_a_converter_after_a_constant_soak_do_not_divide_a_rest(rng, step):
+    # WHY: the step of the converter was searched in the first 20000 samples. These were constant,
+    # and each later step of the converter began a new rest.
     rest = Rest(rng, duration_s=3600.0, sd=0.0)
     ramp = np.maximum(rest.time - 1800.0, 0.0) / 1800.0
     rest.accel = np.rint(rest.accel / 0.04 + 6.0 * np.outer(ramp, (1.0, -1.3, 0.7))) * step
@@ -426,8 +427,8 @@ def test_steps_of_a_converter_after_a_constant_soak_are_no_rests(rng, step):
     assert len(bag.intervals) == 1
 
 
-def test_a_turn_is_no_step_of_the_converter(rng):
-    # WHY: the only change of constant samples, a turn, counted as the step of the converter.
+def test_a_turn_between_constant_samples_is_not_taken_for_a_step_of_the_converter(rng):
+    # WHY: the samples change at a turn only, and this change was taken for the converter's step.
     rest = Rest(rng, sd=0.0)
     rest.accel[rest.time > 300.0] = (GRAVITY, 0.0, 0.0)
     bag = reduce_source(rest.source(), full_scale=None)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The regression agrees with dense linear algebra: mode, covariance, evidence, left-out errors."""
+"""Mode, covariance, evidence and left-out errors of the fit agree with dense linear algebra."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ POSE_SD = 1e-4
 
 
 def returned(pose, rng):
-    """Draw attitudes about poses whose components are nearly equal in size, shape (n, 3)."""
+    """Draw attitudes that differ by `POSE_SD` from one of three poses, shape (n, 3)."""
     poses = np.array([[0.577, 0.577, 0.578], [-0.577, 0.578, 0.577], [0.578, -0.577, 0.577]])
     up = poses[pose] + POSE_SD * rng.standard_normal((len(pose), 3))
     return up / np.linalg.norm(up, axis=1, keepdims=True)
@@ -57,7 +57,7 @@ class Dense:
         self.determinant = -2.0 * sum(np.log(np.diag(root)).sum() for root in self.roots)
 
     def state(self, x):
-        """Add x to the mode found by `Regression`."""
+        """Return the state at the mode of `Regression` plus the parameter changes x."""
         layout, at = self.at.layout, self.at.state
         padded = np.append(x, 0.0)
         pose, pose_of = at.pose, at.pose_of
@@ -78,7 +78,7 @@ class Dense:
         )  # fmt: skip
 
     def residual(self, x):
-        """Return all residuals in units of their sd: of the windows, then of the prior."""
+        """Return residual / sd of all windows, then of all parameters from their prior."""
         w, prior, state = self.windows, self.prior, self.state(x)
         rms = np.sqrt(np.mean(w.columns**2, axis=0))
         moved = w.columns.copy()
@@ -104,7 +104,7 @@ class Dense:
             state.tilt.ravel() / prior.tilt_sd,
             state.turn_on.ravel() / prior.turn_on_sd,
             state.start.ravel() / np.sqrt(prior.start_variance_ratio),
-            # The prior sd of the mean initial lag state of all bags is 0.1 of that of one bag.
+            # The mean of the initial lag states over all bags has 0.1 of the prior sd of one bag.
             state.start.mean(axis=0) / (0.1 * np.sqrt(prior.start_variance_ratio)),
         ]
         if len(state.pose):
@@ -119,7 +119,7 @@ class Dense:
         return np.concatenate(parts)
 
     def jacobian(self, x):
-        """Return the Jacobian by central differences of 0.1 sd, with an error of some 1e-9."""
+        """Return the Jacobian by central differences over 0.1 sd, with an error of 1e-9."""
         sd = np.sqrt(self.at.variance)
         columns = []
         for k in range(self.n):
@@ -137,8 +137,8 @@ class Dense:
 def solved(request):
     n_positions, pose_of = request.param
     rng = np.random.default_rng(5)
-    # The table draws an initial lag state per position. Positions of one bag share an initial lag
-    # state, so these states are 0 for bags of several positions.
+    # `table_of` draws an initial lag state per position, but positions of one bag share one state:
+    # for bags of several positions all states are 0.
     truth = Truth(
         start_sd=0.5 if n_positions == 1 else 0.0, noise=Noise(4.0, 2000.0),
         offset_sd=2.0 * MICRO, tilt_sd=2e-7 if pose_of else 5e-6,
@@ -150,8 +150,8 @@ def solved(request):
     bag = windows.position // n_positions
     windows = replace(windows, weight=weight, bag=bag, pose=pose)
     regression, state = begin(windows, up)
-    # Two poses do not determine the triad. Narrow priors of scale and misalignment, and small
-    # tilts, keep products of parameters small, which the derivatives of the regression omit.
+    # The derivatives of the regression omit products of parameter changes. In one or two poses
+    # bias, scale and misalignment are undetermined; narrow priors keep these products small.
     narrow = {'scale_sd': 1e-5, 'misalignment_sd': 1e-5, 'bias_sd': np.full(3, 1e-4)}
     narrow['column_sd'] = column_sd(('curve', 'board'), 1e-2, 1e-5)
     narrow = narrow if pose_of else {}
@@ -159,12 +159,12 @@ def solved(request):
     return regression, prior, mode_of(regression, state, prior)
 
 
-def test_the_mode_is_that_of_the_dense_problem(solved):
+def test_the_mode_agrees_with_a_least_squares_fit_by_dense_matrices(solved):
     regression, prior, mode = solved
     dense = Dense(regression, prior, mode)
     at = dense.residual(np.zeros(dense.n))
     gradient = dense.jacobian(np.zeros(dense.n)).T @ at * np.sqrt(mode.variance)
-    # Gauss-Newton is repeated until the gradient, in units of sd, vanishes.
+    # At the mode the gradient of the objective is zero.
     assert np.abs(gradient).max() < 1e-4
     other = least_squares(
         dense.residual, np.zeros(dense.n), x_scale=np.sqrt(mode.variance), method='trf'
@@ -172,7 +172,7 @@ def test_the_mode_is_that_of_the_dense_problem(solved):
     assert np.abs(other / np.sqrt(mode.variance)).max() < 1e-3
 
 
-def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
+def test_covariance_and_evidence_agree_with_dense_linear_algebra(solved):
     regression, prior, fitted = solved
     np.testing.assert_allclose(regression.start_root @ regression.start_root.T, START, atol=1e-12)
     beside = []
@@ -183,28 +183,29 @@ def test_covariance_and_evidence_are_those_of_the_dense_problem(solved):
         at, jacobian = dense.residual(np.zeros(dense.n)), dense.jacobian(np.zeros(dense.n))
         hessian, sd, n = jacobian.T @ jacobian, np.sqrt(mode.variance), mode.layout.n_unit
         covariance = np.linalg.inv(hessian * np.outer(sd, sd))[:n, :n]
-        # With correlations of 0.999, three of the eight digits of the derivatives are lost.
+        # Parameters with correlations of 0.999 lose three of the eight digits of the derivatives.
         np.testing.assert_allclose(
             mode.covariance / np.outer(sd[:n], sd[:n]), covariance, atol=1e-4
         )
         assert np.diag(covariance) == pytest.approx(1.0, rel=1e-4)
-        # Laplace: -2 ln Z = misfit + ln det of noise, prior, Hessian; directions have no prior.
+        # Laplace: -2 ln Z = misfit + ln det(noise), ln det(prior), ln det(Hessian). Directions of
+        # the attitudes have no prior.
         precision = regression.precision(wide, mode.layout)
         known = np.log(precision[precision > 0.0]).sum()
         determinants = dense.determinant + np.linalg.slogdet(hessian)[1] - known
         beside.append(mode.log_evidence + 0.5 * (at @ at + determinants))
-    # The prior of the mean initial lag state adds a constant, equal for both values of
-    # `start_variance_ratio`.
+    # The evidence contains a constant from the prior of the mean initial lag state, which does not
+    # depend on `start_variance_ratio`.
     assert beside[1] == pytest.approx(beside[0], abs=1e-3)
 
 
-def test_without_noise_the_regression_gives_the_truth(rng):
+def test_the_regression_of_windows_without_noise_gives_the_true_parameters(rng):
     truth = Truth(sigma=np.full(3, 1e-9 * MICRO))
     windows, up = table_of(truth, 12, rng)
     regression, state = begin(windows, up)
     prior = replace(prior_of(truth), sigma=np.full(3, MICRO))
     mode = mode_of(regression, state, prior).state
-    # The priors shift the result by 1e-6 of the sd, which is of the order of 1 ug.
+    # The priors shift the result by 1e-6 of its sd, which is about 1 ug.
     np.testing.assert_allclose(mode.kappa, truth.kappa, atol=1e-9)
     np.testing.assert_allclose(mode.bias, truth.bias, atol=1e-8)
     np.testing.assert_allclose(mode.misalignment, truth.misalignment, atol=1e-8)
@@ -213,15 +214,14 @@ def test_without_noise_the_regression_gives_the_truth(rng):
         weights = mode.weights[part] / regression.rms
         np.testing.assert_allclose(weights, truth.weights[part], atol=atol)
     np.testing.assert_allclose(mode.start, 0.0, atol=1e-2)
-    # `Regression.force` corrects windows by inverting the model, as the compensator does.
+    # `Regression.force` inverts the model, so it gives the true force of each window.
     force = regression.force(mode)
     np.testing.assert_allclose(force, GRAVITY * up[windows.position], atol=1e-7)
 
 
-def test_the_claimed_sd_of_the_regression_is_the_scatter_of_errors():
-    # With true priors the inverse Hessian is the Cramer-Rao bound, and errors / sd have an RMS of
-    # 1. Over 36 units with 33 correlated parameters each, the RMS of errors / sd scatters by at
-    # most 13 %.
+def test_errors_of_the_regression_divided_by_the_claimed_sd_have_an_rms_of_1():
+    # With the true prior sd, the inverse Hessian is the covariance of the errors. For 36 units
+    # with 33 correlated parameters each, the RMS of error / sd is uncertain by at most 13 %.
     rng = np.random.default_rng(11)
     truth = Truth(noise=Noise(0.5, 1000.0), offset_sd=MICRO, start_sd=0.3)
     errors = []
@@ -236,7 +236,7 @@ def test_the_claimed_sd_of_the_regression_is_the_scatter_of_errors():
 
 
 def refit_of(whole, regression, prior, kept):
-    """Fit the rows `kept` alone; weights stay in units of the RMS of the whole table."""
+    """Fit only the rows `kept`; return weights in units of the column RMS of the whole table."""
     windows = regression.windows
     rest = Regression(rows_of(windows, np.flatnonzero(kept)), GRAVITY, NOMINAL)
     units = rest.rms / regression.rms
@@ -249,14 +249,14 @@ def refit_of(whole, regression, prior, kept):
     return replace(mode, weights=mode.weights / units)
 
 
-#: With LINEAR groups the problem is linear in everything except directions, which are determined
-#: to some urad: a left-out score is exact except for rounding. With PRODUCTS a score, found by one
-#: or two linear steps, neglects the product of the changes of initial lag state and of its weight.
+#: The left-out score is computed by linear steps from the fit to all rows. With the groups LINEAR
+#: the model is linear in all parameters but directions, and the score is exact. With PRODUCTS the
+#: score neglects the product of the changes of an initial lag state and of its weight.
 LINEAR, PRODUCTS = ('curve',), ('curve', 'board')
 
 
 def scored(groups, n, rng, *, n_windows, step_s, **changes):
-    """Fit a unit with errors of the given groups; return table, fit and left-out score."""
+    """Fit a unit with effects of the given groups; return table, fit and left-out score."""
     used = np.isin(GROUPS, groups)
     truth = Truth(on_bias=Truth().on_bias * used, on_scale=Truth().on_scale * used, start_sd=0.3,
                   **changes)  # fmt: skip
@@ -268,7 +268,7 @@ def scored(groups, n, rng, *, n_windows, step_s, **changes):
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.2)])
-def test_the_left_out_error_of_a_position_is_that_of_a_fit_without_it(rng, groups, tolerance):
+def test_the_left_out_error_of_a_position_is_that_of_a_fit_to_all_others(rng, groups, tolerance):
     windows, _, regression, prior, whole, score = scored(
         groups, 14, rng, n_windows=20, step_s=240.0, offset_sd=3.0 * MICRO,
         noise=Noise(0.1, 1000.0),
@@ -288,7 +288,7 @@ def test_the_left_out_error_of_a_position_is_that_of_a_fit_without_it(rng, group
 
 
 @pytest.mark.parametrize(('groups', 'tolerance'), [(LINEAR, 0.002), (PRODUCTS, 0.05)])
-def test_the_left_out_error_of_a_section_is_that_of_a_fit_without_it(rng, groups, tolerance):
+def test_the_left_out_error_of_a_section_is_that_of_a_fit_to_all_others(rng, groups, tolerance):
     windows, up, regression, prior, whole, score = scored(
         groups, 12, rng, n_windows=24, step_s=200.0
     )
@@ -302,7 +302,7 @@ def test_the_left_out_error_of_a_section_is_that_of_a_fit_without_it(rng, groups
         size = np.sqrt(np.mean(expected**2))
         assert score.sections.square[section] == pytest.approx(size**2, rel=2.0 * tolerance)
     assert score.sections.rms == pytest.approx(np.sqrt(score.sections.square.mean()))
-    # A table of one position has no left-out position: its score is the drift of the sections.
+    # With one position no position can be left out: the score is the drift of left-out sections.
     alone, state = begin(rows_of(windows, np.arange(24)), up[:1])
     alone_score = score_of(alone, alone.solve(state, prior))
     assert np.isnan(alone_score.positions.rms)
@@ -320,8 +320,8 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
     score = score_of(regression, mode)
     assert np.isnan(score.force).all()
     assert np.isnan(score.norms.square).all()
-    # The score of the drift is finite, as it needs neither bias nor scale; M keeps its prior value
-    # and prior sd.
+    # The drift of a left-out position does not depend on bias and scale, so its score is finite.
+    # M keeps its prior mean and sd.
     assert np.isfinite(score.positions.square).all()
     np.testing.assert_allclose(mode.state.misalignment, 0.0, atol=1e-6)
     places = mode.layout.misalignment
@@ -330,7 +330,7 @@ def test_a_position_that_alone_determines_a_parameter_has_no_left_out_norm(rng):
 
 @pytest.mark.parametrize('seed', [0, 1, 5, 7, 8, 11])
 def test_no_step_of_the_solver_increases_the_objective(seed):
-    # The bags start far from thermal equilibrium: products of initial lag state and weight matter.
+    # The bags start far from thermal equilibrium, so products of lag state and weight are large.
     rng = np.random.default_rng(seed)
     truth = Truth(start_sd=5.0, sigma=np.full(3, 5.0 * MICRO))
     windows, up = table_of(truth, 4, rng, n_windows=12, step_s=400.0)
@@ -347,16 +347,16 @@ def test_no_step_of_the_solver_increases_the_objective(seed):
 def test_excluded_columns_get_zero_weight(solved):
     regression, prior, mode = solved
     narrow = replace(prior, column_sd=prior.column_sd * [[1, 1, 0, 0, 0, 0], 6 * [1]])
-    # Excluded columns get zero weight even without a step of the solver.
+    # Columns with a prior sd of 0 get zero weight, even if the solver makes no step.
     state = regression.solve(mode.state, narrow, n_steps=0).state
     assert not state.weights[0, :, 2:4].any()
     np.testing.assert_array_equal(state.weights[1], mode.state.weights[1])
 
 
 def test_published_huygens_coefficients_come_back(rng):
-    # Huygens HASI accelerometer: sf = 1.30675e-3 - 1.35046e-7 T + 4.02821e-10 T^2 [A/g] and
-    # offset = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. The test samples the
-    # curves on a chamber's program, fits t from 20 degC and counts of 1 pA, and converts back.
+    # Huygens HASI accelerometer: sf = 1.30675e-3 - 1.35046e-7 T + 4.02821e-10 T^2 [A/g] and offset
+    # = -8.9642327e-4 + 3.83652e-6 T - 7.61e-9 T^2 [g], T in kelvin. The test computes counts of 1
+    # nA from these curves over a chamber program, fits them, and converts the result back.
     sf, offset = (1.30675e-3, -1.35046e-7, 4.02821e-10), (-8.9642327e-4, 3.83652e-6, -7.61e-9)
     counts_per_ampere = 1e9
     windows, up = table_of(Truth(misalignment=np.zeros(3)), 12, rng)
@@ -386,7 +386,7 @@ def test_published_huygens_coefficients_come_back(rng):
         got = np.polynomial.Polynomial(scale)(shifted).coef * GRAVITY / counts_per_ampere
         printed = [f'{got[0]:.5e}', f'{got[1]:.5e}', f'{got[2]:.5e}']
         assert printed == ['1.30675e-03', '-1.35046e-07', '4.02821e-10']
-        # The fitted bias / counts per g is the published offset [g].
+        # The published offset [g] is the fitted bias / (counts per g).
         bias = K0 * polynomial.polyval(
             t[:40], np.append(mode.bias[axis], mode.weights[0, axis] / regression.rms)
         )
@@ -398,9 +398,9 @@ def test_published_huygens_coefficients_come_back(rng):
 
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(0.5, 1500.0)])
-def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
-    # In a linear problem S is the inverse covariance of the weights of inactive columns, and
-    # S^-1 Q is the estimate of the weights.
+def test_scores_of_inactive_columns_agree_with_a_fit_in_which_they_are_active(noise):
+    # In a linear problem S is the inverse covariance of the weights that inactive columns would
+    # have in a fit with these columns, and S^-1 Q is the estimate of these weights.
     truth, asked = Truth(noise=noise), np.isin(GROUPS, ('board', 'idle'))
     windows, up = table_of(truth, 12, np.random.default_rng(4), n_windows=30)
     regression, state = begin(without_starts(windows), up)
@@ -430,10 +430,9 @@ def test_inactive_columns_have_the_scores_of_a_fit_with_them(noise):
     assert not inactive.chosen(wide, asked, 1e9, 9).any()
 
 
-def test_inactive_columns_share_the_initial_lag_states_of_the_active_ones(solved):
-    # WHY: the prior on the sum of the initial lag states was left out, and the information S on an
-    # inactive column was too large by a factor of 50 for a scale factor whose bias has the same
-    # lag.
+def test_inactive_and_active_columns_share_initial_lag_states(solved):
+    # WHY: the prior of the sum of the initial lag states was left out. If the bias has the lag of
+    # an inactive column of the scale, the information S on this column was 50 times too large.
     regression, prior, mode = solved
     of_scale = np.isin(GROUPS, ('board',)) * [[0.0], [1.0]]
     without = replace(prior, column_sd=np.where(of_scale > 0.0, 0.0, prior.column_sd))
@@ -450,7 +449,7 @@ def test_inactive_columns_share_the_initial_lag_states_of_the_active_ones(solved
     )
 
 
-def test_only_a_matrix_made_indefinite_by_rounding_gets_more_jitter(rng):
+def test_only_a_matrix_made_indefinite_by_rounding_gets_diagonal_jitter(rng):
     root = rng.standard_normal((3, 3))
     good, bad = root @ root.T, np.ones((3, 3)) - 1e-10 * np.eye(3)
     factor = factored(np.stack((good, bad)))
@@ -470,7 +469,7 @@ def test_tangent_basis_is_orthonormal(rng):
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-14)
 
 
-def test_an_axis_that_reads_one_value_is_refused():
+def test_an_axis_with_equal_means_in_all_positions_is_refused():
     means = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     with pytest.raises(FitError, match='reads the same in all positions'):
         constant_calibration(means, GRAVITY, 1e-3)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Selected model, prior sd, noises and claimed sd are right for tables with known truth."""
+"""Selected model, prior sd, noises and claimed sd agree with the truth of simulated tables."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ IDLE = np.array(GROUPS) == 'idle'
 
 
 def constants(truth):
-    """Return the prior of a fit without columns, with wrong noise parameters."""
+    """Return an initial prior without columns, whose noise parameters are not the true ones."""
     return prior_of(
         truth, (), offset_sd=MICRO, offset_scale=30.0 * MICRO, sigma=np.full(3, 5.0 * MICRO),
         noise=Noise(), misalignment_sd=1e-3,
@@ -75,7 +75,7 @@ def calm():
     return *selected_of(truth, windows, up), truth
 
 
-def test_columns_that_explain_nothing_are_not_chosen(calm):
+def test_columns_without_an_effect_are_not_chosen(calm):
     regression, chosen, _ = calm
     np.testing.assert_array_equal(chosen.posterior.prior.column_sd > 0.0, [~IDLE, ~IDLE])
     assert chosen_groups(chosen) == {'curve', 'board'}
@@ -86,15 +86,15 @@ def test_columns_that_explain_nothing_are_not_chosen(calm):
     assert not chosen.posterior.state.weights[..., IDLE].any()
 
 
-def test_tried_models_show_their_left_out_errors(calm):
+def test_each_tried_model_has_a_left_out_error(calm):
     _, selected, truth = calm
     rms = {trial.groups: trial.score.rms for trial in selected.trials}
-    # The first trial has constants alone; its error is the effect of temperature.
+    # The first trial fits only constants; its left-out error is the effect of temperature.
     assert [*rms][:2] == [(), ('curve',)]
     assert rms[()] > 2.0 * rms['curve',] > 10.0 * rms['curve', 'board']
     (chosen,) = (trial for trial in selected.trials if trial.is_chosen)
     assert chosen.score is selected.score
-    # The left-out error is the white noise plus the uncertainty of the fit to the other windows.
+    # The left-out error is white noise plus the error of the fit, at most 15 % in total.
     assert 1.0 < selected.score.rms / truth.sigma[0] < 1.15
     assert all(is_better(trial.score, selected.score) for trial in selected.trials[:2])
 
@@ -110,8 +110,8 @@ def test_a_forced_group_stays_in_the_model(calm):
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen):
-    # The evidence favours the group 'idle' in all cases; left-out data reject a group that acts in
-    # one bag or section only.
+    # The evidence favours the group 'idle' in all cases; the left-out error favours it only if it
+    # has an effect in all bags and sections.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -126,9 +126,9 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen
 
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
-def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, step_s):
-    # WHY: a bias that follows only a lagged temperature needs 'curve' and 'board' together: with
-    # 'curve' alone the fit does not improve.
+def test_a_lag_is_found_although_a_curve_without_it_does_not_help(n_positions, step_s):
+    # WHY: a bias that depends on a lagged temperature only needs the groups 'curve' and 'board'
+    # together; the group 'curve' without 'board' was rejected, and so the lag was not found.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])
     truth = Truth(on_bias=on_bias, on_scale=np.zeros((3, 6)))
@@ -140,13 +140,13 @@ def test_a_part_that_lags_is_found_although_no_curve_helps_alone(n_positions, st
     assert chosen.score.rms < 1.2 * truth.sigma[0]
 
 
-def test_noise_parameters_are_estimated(noisy):
+def test_estimated_noise_parameters_agree_with_the_true_ones(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
-    # 1080 windows per axis determine the white noise to 3 %, slightly worse with the slow noise.
+    # 1080 windows per axis determine the sd of white noise to 3 %, with slow noise less well.
     np.testing.assert_allclose(prior.sigma, truth.sigma, rtol=0.15)
-    # Positions last only six correlation times of the slow noise, and curves absorb a part of it.
+    # A position lasts six correlation times of the noise, and the curves fit part of the noise.
     assert 0.5 < prior.noise.ratio / truth.noise.ratio < 2.0
     assert 0.5 < prior.noise.time_s / truth.noise.time_s < 2.0
     # 54 means less 45 unknowns (directions, scale, bias, M) determine the mounting sd to 24 %.
@@ -155,11 +155,10 @@ def test_noise_parameters_are_estimated(noisy):
 
 @pytest.mark.slow
 def test_flicker_noise_has_several_correlation_times():
-    # WHY: with a single correlation time the initial lag states and the tilts explained the slower
-    # processes, and the errors of the biases were 1.9 claimed sd.
-    # Flicker noise with a shortest correlation time below that of the candidates, 3 windows, was
-    # taken for noise of one correlation time: the two noise models were compared before the search
-    # of variances.
+    # WHY: with a single correlation time, initial lag states and tilts fitted the slower part of
+    # flicker noise, and the errors of the biases were 1.9 claimed sd RMS.
+    # WHY: flicker noise whose shortest correlation time is below 3 windows was taken for noise of
+    # one correlation time, because its variance was not yet estimated at the comparison.
     errors = []
     for seed, time_s in ((0, 400.0), (5, 400.0), (6, 400.0), (6, 180.0)):
         truth = Truth(noise=Noise(4.0, time_s, 3))
@@ -168,17 +167,16 @@ def test_flicker_noise_has_several_correlation_times():
         noise = chosen.posterior.prior.noise
         assert noise.n_times == truth.noise.n_times
         if regression.whitener.shows(time_s):
-            # The shortest correlation time is determined to 10 %; steps of the search are 30 %.
+            # The data determine the shortest correlation time to 10 %; candidates differ by 30 %.
             assert 0.6 < noise.ratio / truth.noise.ratio < 1.6
             assert 0.6 < noise.time_s / truth.noise.time_s < 1.6
         errors.append(truth.errors(regression, chosen.posterior)['bias'])
-    # The limit of the RMS is the 1 % point of a chi-square of twelve errors.
+    # The RMS of twelve standard normal errors exceeds 1.48 with a probability of 1 %.
     assert np.sqrt(np.mean(np.square(errors))) < 1.48
 
 
-def test_rounding_excludes_no_correlation_time_from_the_search():
-    # WHY: 10**log10(180) is below 180: the search left out 180 s, and the variance ratio kept its
-    # estimate from residuals.
+def test_rounding_removes_no_correlation_time_from_the_search():
+    # WHY: 10**log10(180) is rounded to less than 180, so the search left out a candidate, 180 s.
     whitener = Whitener(np.zeros(300, np.int64), 60.0 * np.arange(300))
     assert whitener.times_s[0] == 180.0
     for time_s in whitener.times_s:
@@ -192,9 +190,9 @@ def test_white_noise_is_not_taken_for_slow_noise(calm):
     assert chosen.posterior.prior.noise == Noise()
 
 
-def test_prior_sds_are_those_of_the_weights(calm):
-    # At the fixed point sd^2 = sum of squared weights / effective parameters (here 3 per column);
-    # a hyperprior (sd: factor of ten) shifts log sd by 1 / (2 x 3 x 5.3) of the way to its centre.
+def test_the_estimated_prior_sd_of_a_column_is_the_rms_of_its_true_weights(calm):
+    # sd^2 = sum of squared weights / effective parameters (3 per column). A hyperprior with an sd
+    # of ln 10 moves ln sd towards its centre by 1 / (2 x 3 x 5.3) of the distance.
     regression, chosen, truth = calm
     true = np.sqrt(np.mean((truth.on_bias * regression.rms) ** 2, axis=0))
     np.testing.assert_allclose(chosen.posterior.prior.column_sd[0, :4], true[:4], rtol=0.25)
@@ -203,8 +201,8 @@ def test_prior_sds_are_those_of_the_weights(calm):
         assert len(group.prior_sd) == 2
 
 
-def test_the_prior_sd_of_slopes_is_limited_by_data_sheets():
-    # For a unit with ten times the steepest plausible slope the prior sd stays at its limit.
+def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
+    # The slope of the unit is ten times the limit of the prior sd.
     truth = Truth(on_bias=10.0 * STEEPEST[0] * np.outer([1.0, -1.0, 1.0], np.arange(6) == 0))
     windows, up = table_of(truth, 12, np.random.default_rng(2), n_windows=20)
     regression, state = begin(windows, up)
@@ -216,19 +214,19 @@ def test_the_prior_sd_of_slopes_is_limited_by_data_sheets():
     assert per_kelvin == pytest.approx(STEEPEST[0])
 
 
-def test_the_truth_of_a_table_is_within_the_claimed_sd(noisy):
+def test_true_parameters_of_a_table_agree_with_the_fit_within_the_claimed_sd(noisy):
     regression, chosen, truth = noisy
     errors = truth.errors(regression, chosen.posterior)
-    # Pruned weights have no sd; the true weights of the idle columns are 0.
+    # Weights that the fit pruned have no sd and no entry here.
     every = np.concatenate([*errors.values()])
-    # 30 errors determine the RMS of error / sd to 13 %; estimated prior sd lower the RMS.
+    # The RMS of 30 values of error / sd is uncertain by 13 %; estimated prior sd lower the RMS.
     assert len(every) > 20
     assert 0.5 < np.sqrt(np.mean(every**2)) < 1.5
     assert np.abs(every).max() < 4.0
 
 
-def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_without_it():
-    # The Savage-Dickey ratio equals the loss of evidence exactly, except for the directions.
+def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_if_the_group_is_removed():
+    # In linear problems the Savage-Dickey ratio is the loss of evidence; directions are nonlinear.
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -249,7 +247,7 @@ def test_the_bayes_factor_of_a_group_is_the_loss_of_evidence_without_it():
     assert falls['bias', 'idle'] < 0.5
 
 
-def test_with_a_calibration_as_prior_the_loss_is_that_of_keeping_its_values():
+def test_with_an_informative_prior_the_bayes_factor_compares_with_weights_at_the_prior_mean():
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(8))
     regression, state = begin(without_starts(windows), up)
@@ -272,7 +270,7 @@ def test_with_a_calibration_as_prior_the_loss_is_that_of_keeping_its_values():
         assert row.log_evidence_change == pytest.approx(fall, rel=0.01, abs=0.02), row
 
 
-def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
+def test_the_contribution_of_a_group_is_the_rms_of_its_effect(calm):
     regression, chosen, truth = calm
     columns = regression.windows.columns[:, 2:4]
     evidence = group_evidence(regression, chosen.posterior)
@@ -283,11 +281,11 @@ def test_the_contribution_of_a_group_is_the_effect_it_has(calm):
 
 
 @pytest.mark.parametrize('noise', [Noise(), Noise(4.0, 2000.0)])
-def test_noise_alone_is_no_effect_that_the_model_lacks(noise):
+def test_noise_is_not_reported_as_an_effect_that_the_model_lacks(noise):
     truth = Truth(noise=noise)
     windows, up = table_of(truth, 12, np.random.default_rng(1))
     _, chosen = selected_of(truth, without_starts(windows), up)
-    # The left-out drift is the noise, which must be doubled to count as a missing effect.
+    # An effect counts as missing if the left-out drift is twice the estimated noise.
     assert not chosen.lacks_effects
     calmer = replace(chosen.posterior.prior, sigma=0.3 * chosen.posterior.prior.sigma)
     assert replace(chosen, posterior=replace(chosen.posterior, prior=calmer)).lacks_effects
@@ -302,7 +300,7 @@ def test_outliers_do_not_shift_the_fit(calm):
     dirty.mean[struck] += 1000.0 * rng.normal(0.0, 200.0 * MICRO, (len(struck), 3))
     _, other = selected_of(truth, dirty, calm[1].posterior.state.up)
     sd = np.sqrt(calm_fit.posterior.variance[calm_fit.posterior.layout.bias])
-    # 2 % outliers of 100 sd, each down-weighted to 3 sd, shift the bias by less than 1 sd.
+    # 2 % of the windows have errors of 100 sd; down-weighting reduces their effect to 3 sd each.
     assert np.abs((other.posterior.state.bias - calm_fit.posterior.state.bias) / sd).max() < 1.0
     np.testing.assert_allclose(other.posterior.prior.sigma, truth.sigma, rtol=0.2)
     used, used_with_outliers = (
@@ -311,9 +309,9 @@ def test_outliers_do_not_shift_the_fit(calm):
     np.testing.assert_array_equal(used_with_outliers, used)
 
 
-def test_means_that_take_few_values_are_no_outliers():
-    # If a converter adds its rounding remainder to the next sample, most means are equal and some
-    # differ by a count.
+def test_quantised_window_means_are_not_down_weighted_as_outliers():
+    # If a converter adds its rounding remainder to the next sample, most window means are equal,
+    # and a few differ by one step: a difference of one step is no outlier.
     windows, up = table_of(Truth(), 9, np.random.default_rng(2))
     regression, state = begin(windows, up)
     prior = prior_of(Truth(), (), offset_sd=1e-9)
@@ -332,7 +330,7 @@ def test_means_that_take_few_values_are_no_outliers():
     np.testing.assert_array_equal(np.delete(changed, 100), 1.0)
 
 
-def test_of_two_almost_equal_columns_the_better_stays():
+def test_of_two_almost_equal_columns_the_true_one_is_selected():
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(6), n_windows=50)
     columns = windows.columns.copy()
@@ -346,7 +344,7 @@ def test_of_two_almost_equal_columns_the_better_stays():
 
 
 @pytest.mark.parametrize(('start_sd', 'lower', 'upper'), [(0.0, 0.0, 0.15), (1.0, 0.8, 1.0)])
-def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, upper):
+def test_the_variance_of_initial_lag_states_is_estimated(start_sd, lower, upper):
     truth = Truth(start_sd=start_sd)
     windows, up = table_of(truth, 18, np.random.default_rng(9), n_windows=60)
     _, chosen = selected_of(truth, windows, up)
@@ -355,9 +353,9 @@ def test_the_distribution_of_initial_lag_states_is_estimated(start_sd, lower, up
 
 
 @pytest.mark.parametrize('offset', [0.0, 30.0])
-def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, offset):
-    # A unit may differ from the mean of a prior by 0 or by 30 sd: the evidence selects the prior
-    # with the sd that fits.
+def test_the_evidence_selects_the_sd_of_an_informative_prior(calm, offset):
+    # The unit differs from the prior's mean by 0 or by 30 sd; candidates are the prior, and the
+    # prior with 100 times the sd.
     _, selected, truth = calm
     state = selected.posterior.state
     regression, _ = begin(calm[0].windows, state.up)
@@ -376,11 +374,11 @@ def test_the_evidence_sets_the_weight_of_an_informative_prior(calm, offset):
     chosen = fit_all(regression, state, prior, fixed, priors)
     assert chosen.posterior.prior.informative is priors[int(offset > 0.0)]
     curve = unit_of(chosen.posterior.state, layout)[places]
-    # With the right prior the fitted curve agrees with the true curve.
+    # With the selected prior the error of the fitted curve is below two claimed sd.
     assert np.abs(curve - true).max() < 2.0 * np.sqrt(chosen.posterior.variance[places]).max()
 
 
-def test_tilts_of_supports_are_estimated_apart_from_the_unit():
+def test_thermal_tilts_of_supports_are_separated_from_the_drift_of_the_unit():
     truth = Truth(tilt_sd=5e-6)
     windows, up = table_of(truth, 12, np.random.default_rng(0), n_windows=60)
     stiff = replace(windows, tilt=windows.tilt[:, :0])
@@ -391,15 +389,15 @@ def test_tilts_of_supports_are_estimated_apart_from_the_unit():
         return chosen, float(np.sqrt(np.mean((table.columns @ missed.T) ** 2)))
 
     chosen, left = drift_left(windows)
-    # Tilts of 12 positions x 2 angles x 2 columns determine their sd to 10 %.
+    # 12 positions with 2 angles and 2 columns each determine the sd of tilts to 10 %.
     assert 0.7 < chosen.posterior.prior.tilt_sd / truth.tilt_sd < 1.3
-    # A tilt of 5 urad changes an axis by 5 ug; 720 windows give 0.1 ug of noise per weight.
+    # A tilt of 5 urad changes a level axis by 5 ug; 720 windows give weights to 0.1 ug.
     assert left < 0.5 * MICRO
     assert drift_left(stiff)[1] > 1.0 * MICRO
 
 
-def test_a_stiff_support_gets_no_tilt(calm):
-    # The estimated tilt is below the noise of the mean of 60 windows with a noise of 2 ug each.
+def test_the_estimated_tilt_of_a_stiff_support_is_below_the_noise(calm):
+    # A mean over 60 windows with a noise of 2 ug each does not show a smaller tilt.
     _, chosen, truth = calm
     hidden = truth.sigma[0] / np.sqrt(60.0)
     tilt = GRAVITY * chosen.posterior.state.tilt
@@ -418,25 +416,26 @@ def claimed(n_positions, gravity_sd=0.0):
     return claim.covariance, selection.posterior.covariance
 
 
-def test_the_claimed_sd_is_larger_if_positions_do_not_determine_the_mounting():
+def test_the_claimed_bias_sd_of_nine_positions_includes_undetermined_mounting_offsets():
     ratios = []
     for n in (9, 24):
         claim, fitted = claimed(n)
         assert np.linalg.eigvalsh(claim).min() > 0.0
-        # The parameters of `claim` are, per axis, kappa (relative scale) and then the bias.
+        # Each axis has k rows in the covariance: kappa (relative scale), bias, and weights.
         k = (len(claim) - 3) // 3
         at = 1 + k * np.arange(3)
         ratios.append(np.sqrt(np.diag(claim)[at].mean() / np.diag(fitted)[at].mean()))
-    # Nine positions have no redundancy: mounting offsets of tens of ug cannot be excluded.
+    # Nine norms determine nine constants without redundancy, so the claimed sd must include
+    # mounting offsets of tens of ug.
     assert ratios[0] > 3.0 * ratios[1]
     assert 0.8 < ratios[1] < 1.5
 
 
-def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
+def test_the_sd_of_gravity_adds_a_common_error_to_all_scale_factors():
     (without, _), (within, _) = claimed(12), claimed(12, 5e-4)
     added = within - without
     kappa = np.arange(3) * ((len(without) - 3) // 3)
-    # An error of g adds its relative size to the error of K in each axis, and nothing elsewhere.
+    # A relative error of gravity is a relative error of K in each axis, and of nothing else.
     both = np.ix_(kappa, kappa)
     np.testing.assert_allclose(added[both], (5e-4 / GRAVITY) ** 2, rtol=2e-3)
     correlation = added[both] / np.sqrt(np.outer(np.diag(added)[kappa], np.diag(added)[kappa]))
@@ -445,9 +444,9 @@ def test_the_error_of_gravity_is_that_of_all_scale_factors_at_once():
     assert not added.any()
 
 
-def test_the_drifts_of_scale_factors_show_how_well_turn_ons_repeat():
-    # WHY: nine constants explain the norms of nine positions, so the fit kept an offset sd of 5 ug
-    # instead of 300 ug, with constants wrong by 75 claimed sd.
+def test_the_drift_of_scale_factors_determines_the_sd_of_turn_on_offsets():
+    # WHY: nine constants fit the norms of nine positions exactly, so the estimated offset sd was
+    # 5 ug instead of 300 ug, and the constants were wrong by 75 claimed sd.
     truth = Truth(
         offset_sd=300.0 * MICRO,
         sigma=np.full(3, 0.5 * MICRO),
@@ -458,9 +457,9 @@ def test_the_drifts_of_scale_factors_show_how_well_turn_ons_repeat():
     candidates = candidates_of(windows, ('curve', 'board'))
     candidates = replace(candidates, typical=candidates.typical * ~IDLE)
     posterior = select(regression, state, constants(truth), candidates).posterior
-    # The drifts determine the 27 offsets, except for 9 combinations that the constants explain.
-    # The offset sd is uncertain by 1 / sqrt(2 * 18), 17 %; the tolerance is three times 17 %.
+    # Changes of |f| with the scale factors determine the 27 offsets, except for 9 combinations
+    # that equal changes of constants. 18 offsets determine their sd to 1 / sqrt(2 * 18), 17 %.
     assert posterior.prior.offset_sd == pytest.approx(300.0 * MICRO, rel=0.5)
     for errors in truth.errors(regression, posterior).values():
-        # The RMS of three independent errors in units of their sd exceeds 2 by a chance of 0.7 %.
+        # The RMS of three standard normal errors exceeds 2 with a probability of 0.7 %.
         assert np.sqrt(np.mean(errors**2)) < 2.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Windows, curves and the conversion to a file: the fit corrects as the compensator does."""
+"""Window columns equal those of the compensator, and a calibration file equals the fit."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -57,7 +57,7 @@ def windows_of(bags):
     )
 
 
-def test_memory_on_a_grid_equals_memory_stepped_reading_by_reading(rng):
+def test_lag_states_on_a_grid_equal_those_updated_by_each_reading(rng):
     spec = MemorySpec(
         ('case', 'tip'),
         (('board', 60.0), ('board', 900.0), ('case', 240.0), ('tip', 7680.0)),
@@ -75,11 +75,11 @@ def test_memory_on_a_grid_equals_memory_stepped_reading_by_reading(rng):
             bank_.step(stamp, float(gradient[k]))
         row = memory.at(stamp, float(board[k]), [float(g[k]) for g in gradients])
         if k % 100 == 99:
-            # Grid and stream add equal terms in different orders, so results differ by rounding.
+            # Both computations add equal terms in different orders, so results differ by rounding.
             np.testing.assert_allclose(on_grid[k], row, atol=1e-9)
 
 
-def test_columns_of_the_fit_are_those_of_the_tracker(bags):
+def test_columns_of_the_fit_equal_those_of_the_tracker(bags):
     # The expected columns come from a tracker that gets readings and samples one by one.
     windows = windows_of(bags)
     spec = memory_of(bank())
@@ -108,23 +108,23 @@ def test_columns_of_the_fit_are_those_of_the_tracker(bags):
     mean = np.array([phi[np.abs(seconds - t) <= 30.0].mean(axis=0) for t in time])
     scale = np.sqrt(np.mean(phi**2, axis=0)) + 1e-9
     late = time > 300.0
-    # The tolerance allows for plays that reverse at other times: lags in the fit follow readings,
-    # lags of the tracker follow estimates.
+    # Lags in the fit follow readings, lags of the tracker follow temperature estimates, so play
+    # operators reverse at slightly different times.
     np.testing.assert_allclose(rows[late, n_sets:] / scale, mean[late] / scale, atol=0.05)
 
 
-def test_columns_of_sets_and_start_states_by_hand(bags):
+def test_columns_of_sets_and_of_initial_lag_states_agree_with_formulas(bags):
     windows = windows_of(bags)
     data = windows.data
     t, w = windows.temperature - 20.0, windows.weight
     assert data.groups[:6] == ('curve',) * 3 + ('set',) * 3
-    # A mean of t^2 over 60 s is the square of the mean, except for the change of t at 1 K/min.
+    # Within 60 s t changes by 1 K, so the mean of t^2 differs from the square of the mean.
     np.testing.assert_allclose(data.columns[:, 0], t, atol=1e-9)
     np.testing.assert_allclose(data.columns[:, 1], t * t, atol=0.3)
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
-    # An initial lag state decays with the time constant of the lag; in a product t multiplies the
-    # state.
+    # An initial state of a lag decays with the time constant of the lag; the column of a product
+    # with t is t times this.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
@@ -139,7 +139,7 @@ def test_columns_of_sets_and_start_states_by_hand(bags):
 
 @pytest.mark.parametrize('name', ['board', 'case'])
 @pytest.mark.parametrize('is_stuck', [False, True])
-def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
+def test_windows_with_a_silent_or_stuck_thermometer_are_left_out(bags, name, is_stuck):
     # The thermometer is silent, or repeats a value, from 900 s to 2200 s, in both ramps.
     bag, start, stop = bags[0], 900.0, 2200.0
     readings = bag.temperatures[name]
@@ -152,8 +152,8 @@ def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
         readings = Readings(readings.stamp_ns[~lost], readings.value[~lost])
     message = replace(bag, temperatures={**bag.temperatures, name: readings})
     windows = windows_of([message])
-    # A silent thermometer counts as missing after 60 s (time-out), 5 intervals and a window; a
-    # stuck thermometer after 600 s.
+    # A silent thermometer counts as missing after 120 s (60 s time-out, 5 intervals, a window), a
+    # stuck one after 600 s.
     seen_s = 600.0 if is_stuck else 120.0
     assert not ((windows.data.time > start + seen_s) & (windows.data.time < stop)).any()
     whole = windows_of([bag])
@@ -163,7 +163,7 @@ def test_windows_without_a_thermometer_are_left_out(bags, name, is_stuck):
     np.testing.assert_array_equal(windows.data.columns[both], whole.data.columns[kept])
 
 
-def test_the_derivative_of_a_column_by_its_lag_equals_differences():
+def test_the_derivative_of_a_column_by_its_lag_agrees_with_differences():
     # The expected derivatives are differences of columns with lags shifted by a microkelvin.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
@@ -192,7 +192,9 @@ def test_the_derivative_of_a_column_by_its_lag_equals_differences():
         ({'static_curve': 'linear', 'dynamic_curve': 'linear'}, Polynomial, 1, False),
     ],
 )
-def test_curves_of_the_fit_by_hand(bags, options, static, dynamic, is_shared):
+def test_curve_columns_of_a_fit_are_powers_of_temperature(
+    bags, options, static, dynamic, is_shared
+):
     sets = sets_of(replace(OPTIONS, **options), bags)
     assert isinstance(sets.static, static)
     assert sets.is_shared == is_shared
@@ -247,8 +249,8 @@ def states_of(windows, calibration):
     return states.T
 
 
-def test_the_calibration_file_corrects_as_the_regression(fitted):
-    # Powers of means over a minute differ from means of powers by some ppm at 1 K/min.
+def test_a_calibration_file_corrects_windows_like_the_regression(fitted):
+    # In ramps of 1 K/min powers of means over 60 s differ from means of powers by some ppm.
     result, _ = fitted
     windows, calibration = result.fit.windows, result.calibration
     state, prior = result.fit.posterior.state, result.fit.posterior.prior
@@ -266,8 +268,8 @@ def test_the_calibration_file_corrects_as_the_regression(fitted):
     assert prior.sigma.min() > 0.0
 
 
-def test_the_covariance_of_the_file_is_that_of_the_regression(fitted):
-    # The calibration file must give bias, K and M the sd that the regression claims.
+def test_the_posterior_of_a_file_has_the_sd_of_the_regression(fitted):
+    # The posterior in the file must have the sd of bias, K and M that the regression claims.
     result, claim = fitted
     calibration = result.calibration
     layout = parameter_layout(calibration)
@@ -288,7 +290,7 @@ def test_the_covariance_of_the_file_is_that_of_the_regression(fitted):
     np.testing.assert_allclose(by_file[-3:][[0, 2]], sd[places], rtol=1e-4)
 
 
-def test_sections_and_column_scales_in_kelvins_by_hand(bags):
+def test_sections_and_kelvins_of_columns_agree_with_formulas(bags):
     windows = windows_of(bags)
     data, t = windows.data, windows.temperature - 20.0
     for p in range(data.n_positions):
@@ -296,7 +298,7 @@ def test_sections_and_column_scales_in_kelvins_by_hand(bags):
         assert (np.diff(section) >= 0).all()
         assert np.ptp(np.bincount(section, minlength=N_SECTIONS)) <= 2
     rms = np.sqrt(np.mean(data.columns**2, axis=0))
-    # `kelvins` of a column: its RMS divided by its largest slope, 1 for t and 2 t for t^2.
+    # `kelvins` is the RMS of a column / the largest slope of its power: 1 for t, 2 t for t^2.
     lines = [0, *(k for k, column in enumerate(bank(), start=6) if column.group == 'board')]
     np.testing.assert_allclose(data.kelvins[lines], rms[lines], rtol=1e-6)
     assert data.kelvins[1] == pytest.approx(rms[1] / (2.0 * np.abs(t).max()), rel=0.02)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A run over a fleet survives bad bags, refusals, dead workers and interruptions."""
+"""A run over a fleet ends with all results despite bad bags, refusals and killed workers."""
 
 import csv
 import json
@@ -49,7 +49,7 @@ def contents(folder):
 
 @pytest.fixture(scope='module')
 def fleet(tmp_path_factory):
-    """Write three units: one has a corrupt bag, one has its thermometers exchanged."""
+    """Write three units: one without faults, one with a corrupt bag, one with swapped sensors."""
     folder = tmp_path_factory.mktemp('fleet') / 'bags'
     write_unit(folder / 'A' / 'good', 1)
     damage(write_unit(folder / 'A' / 'torn', 2, 7)[2])
@@ -58,14 +58,14 @@ def fleet(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client, fleet, tmp_path):
+def test_all_units_are_fitted_despite_a_killed_worker_and_only_once(client, fleet, tmp_path):
     out = tmp_path / 'out'
     collected = []
 
     def report(_n, _total, row):
         if row is None:
             return
-        # Two workers are fitting a unit each when the first result arrives.
+        # When the first result arrives, two workers are at work.
         if not collected:
             os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
         collected.append(str(row['name']))
@@ -93,7 +93,7 @@ def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client,
     assert again.rows == result.rows
     assert contents(out / 'units') == before
 
-    # A test whose bags have changed under the same names is fitted again.
+    # A unit is fitted again if the modification time of a bag has changed.
     os.utime(fleet / 'A/good/01.mcap', ns=(0, 0))
     touched = fit_fleet(str(fleet), out, OPTIONS, client=client)
     assert touched.n_done == 1
@@ -109,19 +109,19 @@ def test_other_units_finish_if_workers_die_and_a_second_run_does_nothing(client,
 
 
 @pytest.mark.slow
-def test_paths_with_dots_never_lead_out_of_the_folder(client, tmp_path):
+def test_results_of_units_with_dots_in_their_names_stay_in_the_output_folder(client, tmp_path):
     fleet = tmp_path / 'fleet'
     for seed, name in enumerate(('one', '..two', 'three..')):
         write_unit(fleet / name, seed, 2)
     result = fit_fleet(str(fleet / '..' / 'fleet'), tmp_path / 'out', OPTIONS, client=client)
-    # A folder whose name begins with a dot is hidden.
+    # A folder whose name begins with a dot is hidden, so it is not a unit.
     assert [row['name'] for row in result.rows] == ['one', 'three..']
     made = {path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob('*.yaml')}
     assert made == {('out', 'units')}
 
 
 def test_unreadable_bags_leave_earlier_results_in_place(client, tmp_path):
-    # WHY: after a bad mount a second run deleted calibrations and certificates that were good.
+    # WHY: when bags could not be read, a second run deleted the results of the first run.
     bags = write_unit(tmp_path / 'bags' / 'unit', 1)
     options = replace(OPTIONS, certificates=True)
     first = fit_fleet(str(tmp_path / 'bags'), tmp_path / 'out', options, client=client)
@@ -173,7 +173,7 @@ def children_of(pid):
 
 
 def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
-    # WHY: on Ctrl-C each starting worker, and Dask, printed a traceback.
+    # WHY: after Ctrl-C each starting worker and Dask printed a traceback.
     write_unit(tmp_path / 'bags' / 'u', 1, 1)
     words = ['fleet', 'fit', 'bags', '-o', 'out', '--gravity', '9.81', '--workers', '1']
     process = subprocess.Popen(
@@ -182,16 +182,16 @@ def test_ctrl_c_while_workers_start_prints_no_traceback(tmp_path):
         stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
     pause = threading.Event()
-    # Wait for the first worker, a child of the fork server.
+    # The first worker is a child of the fork server, which is a child of the command.
     while not any(map(children_of, children_of(process.pid))):
         assert process.poll() is None
         pause.wait(0.01)
-    # A terminal sends SIGINT to all processes of the group.
+    # Ctrl-C in a terminal sends SIGINT to all processes of the group.
     os.killpg(process.pid, signal.SIGINT)
     printed, _ = process.communicate(timeout=60)
     assert process.returncode == 130
     printed = printed.splitlines()
-    # Ctrl-C may arrive before or after the fit of the first unit has begun.
+    # SIGINT may arrive before or after the fit of the first unit has begun.
     assert printed in (
         [f'thermo_comp: interrupted: {state}; the same command continues the run in out']
         for state in ('no test has begun', '0 of 1 test done')
@@ -217,12 +217,11 @@ class TestScheduler:
         ):
             pass
 
-    def test_a_scheduler_of_equal_version_is_used(self, client, fleet, tmp_path, monkeypatch):
+    def test_workers_with_another_version_are_refused(self, client, fleet, tmp_path, monkeypatch):
         address = client.cluster.scheduler_address
         refused = str(fleet / 'B')
         result = fit_fleet(refused, tmp_path / 'out', OPTIONS, scheduler=address)
         assert [row['verdict'] for row in result.rows] == ['refused']
-        # Workers with another version of thermo_comp are refused: results could differ.
         monkeypatch.setattr('thermo_comp.fleet.work.__version__', '9.9')
         with pytest.raises(ThermoCompError, match=r'runs thermo_comp \d+\.\d+\.\d+, not 9\.9'):
             fit_fleet(refused, tmp_path / 'other', OPTIONS, scheduler=address)
@@ -247,7 +246,7 @@ class _Future:
         (_Future('lost'), 'the connection to the Dask scheduler was lost'),
     ],
 )
-def test_a_failed_task_is_a_row_that_the_next_run_repeats(future, problem, fleet, tmp_path):
+def test_the_next_run_repeats_a_failed_task(future, problem, fleet, tmp_path):
     unit = find_units(Storage(str(fleet)))[0]
     outcome = outcome_of(future, unit)
     assert outcome is not None
@@ -257,7 +256,7 @@ def test_a_failed_task_is_a_row_that_the_next_run_repeats(future, problem, fleet
     assert results.look_up(unit, OPTIONS) is None
 
 
-def test_a_fleet_without_dask_says_what_to_install(tmp_path, monkeypatch, capsys):
+def test_without_dask_fleet_fit_names_the_package_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'distributed', None)
     assert command(tmp_path, tmp_path / 'out', '--gravity', '9.81') == 1
     assert capsys.readouterr().err == (
@@ -270,7 +269,7 @@ def command(folder, out, *options):
     return run_command(['fleet', 'fit', str(folder), '-o', str(out), *options])
 
 
-def test_mistakes_of_fleet_fit_end_in_one_line(tmp_path, capsys):
+def test_wrong_arguments_of_fleet_fit_give_a_message(tmp_path, capsys):
     assert command(tmp_path, tmp_path / 'out') == 2
     assert 'give --gravity, or --latitude and --height' in capsys.readouterr().err
     assert command(tmp_path, tmp_path / 'out', '--gravity', '-1') == 1
@@ -303,7 +302,7 @@ def test_a_unit_without_a_calibration_gives_exit_code_1(client, tmp_path, capsys
     assert (data['n_fitted'], data['n_done'], data['verdicts']) == (0, 0, {'refused': 1})
 
 
-def test_other_options_fit_a_unit_again(client, fleet, tmp_path):
+def test_a_unit_is_fitted_again_with_other_options(client, fleet, tmp_path):
     refused = fleet / 'B'
     fit_fleet(str(refused), tmp_path / 'out', OPTIONS, client=client)
     other = replace(OPTIONS, fit=replace(OPTIONS.fit, min_rest_s=4.0))
@@ -311,9 +310,8 @@ def test_other_options_fit_a_unit_again(client, fleet, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
-    # WHY: one position in the chamber does not separate bias from scale: a unit with one position
-    # needs the prior of its siblings.
+def test_the_prior_of_siblings_reduces_the_scale_error_of_a_unit_with_one_bag(client, tmp_path):
+    # Unit 0 has a single position, which does not separate bias and scale; units 1 to 3 have nine.
     kind = unit_preset('mems', 1)
     siblings = [sibling(kind, number) for number in range(4)]
     for number, unit in enumerate(siblings):
@@ -332,7 +330,7 @@ def test_the_prior_of_siblings_helps_a_unit_that_lacks_data(client, tmp_path):
     assert contents(tmp_path / 'out' / 'units') == before
     assert [bool(row['prior']) for row in helped.rows] == [True, False, False, False]
     (before_row, *_), (row, *_) = alone.rows, helped.rows
-    # The scale error of one axis may be small by chance, so the norm over all axes is compared.
+    # Compare the norm of the errors of three axes, as one error may be small by chance.
     scale = np.array(siblings[0].scale_factor)
     errors, sds = (
         [
@@ -358,8 +356,8 @@ def with_stuck_bit(bit):
 
 
 @pytest.mark.slow
-def test_a_prior_does_not_repair_units_that_contradict_themselves(client, tmp_path):
-    # WHY: with the larger uncertainty of a prior, a unit with a stuck bit was judged valid.
+def test_units_with_a_stuck_bit_are_not_fitted_again_with_the_prior(client, tmp_path):
+    # WHY: with the prior the claimed sd was larger, so a unit with a stuck bit was judged valid.
     kind = unit_preset('mems', 1)
     faults = {0: with_stuck_bit(7), 4: with_stuck_bit(10)}
     for number in range(5):
@@ -386,7 +384,7 @@ def test_a_prior_does_not_repair_units_that_contradict_themselves(client, tmp_pa
         ('no better than raw', 0, False),
         ('thermometers exchanged or loose: not judged', 1, False),
         ('thermometers exchanged or loose: not judged', 0, False),
-        # A refusal is of contradictory data if `is_whole` is None, and of missing data if it is 0.
+        # 'refused': for contradictory data `is_whole` is None, for missing data it is 0.
         ('refused', None, False),
         ('refused', 0, True),
         ('failed', None, False),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bags of a fleet are found and read in every kind of storage."""
+"""The bags of a fleet are found and read on a disk and in other storage."""
 
 import shutil
 import tempfile
@@ -60,7 +60,7 @@ def to_sqlite(path, target):
 
 
 class TestElsewhere:
-    def test_a_fleet_in_memory_gives_the_bits_of_one_on_disk(self, unit, memory):
+    def test_a_fleet_in_memory_and_a_fleet_on_disk_give_equal_calibrations(self, unit, memory):
         fs, url = memory
         fs.put(f'{unit}/', f'{url}/unit/', recursive=True)
         (here,), (there,) = find_units(Storage(str(unit.parent))), find_units(Storage(url))
@@ -94,7 +94,7 @@ class TestElsewhere:
         assert outcome.hashes == {f'unit/{name}': digest(path.with_name(name))}
         assert list((tmp_path / 'scratch').iterdir()) == []
 
-    def test_a_unit_whose_bag_vanished_is_not_final(self, memory):
+    def test_the_result_of_a_unit_with_a_missing_bag_is_not_final(self, memory):
         _, url = memory
         gone = {'unit/a.mcap': [StoredFile('unit/a.mcap', 5, '')]}
         outcome = process_unit(FoundUnit('unit', '', gone), url, OPTIONS)
@@ -113,7 +113,7 @@ class TestDiscovery:
         [
             (['u/1.mcap', 'u/2.mcap', 'u/notes.txt'], ['u/1.mcap', 'u/2.mcap']),
             (['u/p1/metadata.yaml', 'u/p1/p1_0.mcap', 'u/p1/p1_1.mcap'], ['u/p1']),
-            # The recorder was killed before it wrote metadata.yaml.
+            # Bags without metadata.yaml, as after a recorder was killed.
             (['u/p1/p1_0.mcap', 'u/p2/p2_0.db3'], ['u/p1', 'u/p2']),
             (['u/u_a.mcap'], ['u/u_a.mcap']),
             (['top.bag', 'u/x.db3'], ['top.bag', 'u/x.db3']),
@@ -140,7 +140,7 @@ class TestDiscovery:
             ('lot-B/u2', 'lot-B', 1),
             ('u3', '', 1),
         ]
-        # WHY: a unit of which only tables were recorded was left out without a message.
+        # WHY: a unit with tables and no bags was left out without a message.
         assert folders_of_tables(Storage(str(tmp_path))) == ('u4',)
 
     def test_bags_without_folders_are_sorted_by_serial(self, tmp_path):
@@ -152,7 +152,7 @@ class TestDiscovery:
         assert {unit.name: list(unit.bags) for unit in units} == {
             'mems-0001': ['a.mcap', 'd.mcap'],
             'mems-0002': ['b.mcap', 'c.mcap'],
-            # The folder names a unit whose bags have no serial; one bag cannot be opened at all.
+            # A bag without a serial belongs to a unit named like the folder; f.mcap is unreadable.
             tmp_path.name: ['e.mcap'],
             'f.mcap': ['f.mcap'],
         }
@@ -168,7 +168,7 @@ class TestDiscovery:
         for row in rows:
             assert all(cell.isprintable() for cell in row.values() if isinstance(cell, str))
 
-    def test_links_are_followed_but_not_in_circles(self, tmp_path):
+    def test_links_are_followed_except_in_circles(self, tmp_path):
         (tmp_path / 'store' / 'u1').mkdir(parents=True)
         (tmp_path / 'store' / 'u1' / '1.mcap').touch()
         fleet = tmp_path / 'fleet'
@@ -179,7 +179,7 @@ class TestDiscovery:
         units = find_units(Storage(str(fleet)))
         assert [name for unit in units for name in unit.bags] == ['unit/1.mcap']
 
-    def test_a_relative_path_is_the_same_for_every_process(self, tmp_path, monkeypatch):
+    def test_a_relative_path_of_a_fleet_becomes_absolute(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         assert Storage('bags').address == str(tmp_path / 'bags')
         assert Storage('memory://bags').address == 'memory://bags'
@@ -192,7 +192,7 @@ class TestDiscovery:
                 find_units(Storage(url))
 
 
-def test_a_damaged_bag_is_no_failure_of_the_file_system(tmp_path):
+def test_a_damaged_bag_is_not_reported_as_a_failure_of_the_file_system(tmp_path):
     (path,) = write_unit(tmp_path / 'u', 1, 1)
     damage(path)
     (units,) = find_units(Storage(str(tmp_path)))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The statistics of a fleet report real outliers and drifts, and none by chance."""
+"""Statistics of a fleet: simulated outliers and drifts are reported, noise is not."""
 
 import re
 from datetime import datetime, timedelta
@@ -20,7 +20,7 @@ MONDAY = datetime(2026, 1, 5)
 
 
 def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
-    """Draw a fleet: every quantity normal (sizes log-normal), or near the quantity in `like`."""
+    """Draw a fleet of n units: normal (sizes: log-normal) quantities, or near those in `like`."""
     rows = []
     for i in range(n):
         cells = {}
@@ -30,7 +30,7 @@ def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
                 before = float(like[i][quantity.name])
                 sd = float(like[i][quantity.sd]) if quantity.sd else 0.0
                 per_unit = abs(before) * 1e-6 if quantity.by == 'ppm' else 1.0
-                # Two tests of a unit differ by the noise of the second test alone.
+                # A second test of a unit has the value of the first test plus noise.
                 cells[quantity.name] = before + noise * sd * per_unit
             elif quantity.by == 'ppm':
                 cells[quantity.name] = 300.0 * (1.0 + 1e-3 * noise)
@@ -60,7 +60,7 @@ class TestOutliers:
         assert outliers.value == 600.0
         assert outliers.z == pytest.approx(12.0, rel=0.3)
 
-    def test_a_twelfth_of_bad_units_is_reported(self, rng):
+    def test_5_bad_units_of_60_are_reported(self, rng):
         rows = fleet_of(60, rng)
         for i in range(5):
             rows[i] = {**rows[i], 'dynamic_ug': 40.0}
@@ -68,12 +68,12 @@ class TestOutliers:
         assert serials == {f'S{i:03d}' for i in range(5)}
 
     @pytest.mark.parametrize('n', [10, pytest.param(40, marks=pytest.mark.slow)])
-    def test_fleets_without_outliers_have_a_false_alarm_in_one_of_twenty(self, n, rng):
+    def test_fleets_without_outliers_give_a_false_alarm_in_5_percent(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
-        # At an alarm rate of 0.05, 60 fleets give 3 alarms on average, 12 or more with p < 1e-4.
+        # With a rate of 5 %, 60 fleets give 3 false alarms on average; 12 have p < 1e-4.
         assert n_alarms < 12
 
-    def test_a_small_fleet_has_no_outliers(self, rng):
+    def test_no_outlier_is_reported_in_a_fleet_of_six(self, rng):
         rows = fleet_of(6, rng)
         rows[0] = {**rows[0], 'bias_y_ug': 1e6}
         assert summarise(rows).outliers == ()
@@ -84,7 +84,7 @@ class TestOutliers:
         assert (spread.sd, set(spread.z.tolist())) == (0.0, {0.0})
 
     def test_a_lag_of_the_board_is_compared(self, rng):
-        # WHY: a loose case thermometer reads the air, so that the board seemed to lead.
+        # A loose case thermometer does not follow the case, so the board seems to lead the case.
         rows = fleet_of(20, rng)
         rows[4] = {**rows[4], 'board_lag_s': -800.0}
         (outlier,) = summarise(rows).outliers
@@ -100,8 +100,8 @@ def spread_of(name, rows):
 
 class TestUndetermined:
     """
-    Values that a unit's data do not determine are those of the prior, with a large sd. WHY: M =
-    -3950 urad with an sd of 9100 urad was ranked as -32 sd.
+    A value that a unit's data do not determine is that of the prior, with a large sd. WHY: M of
+    -3950 urad, with an sd of 9100 urad, was listed as an outlier of -32 sd.
     """
 
     @staticmethod
@@ -124,17 +124,17 @@ class TestUndetermined:
             assert all_units.counted.tolist() == whole.values.tolist()
             n_comparisons = sum(len(spread.names) for spread in summary.spreads)
             assert all_units.limit == outlier_limit(12, n_comparisons)
-        # A bias slope without an sd is not determined, so it is not compared at all.
+        # Units whose bias slope has no sd are left out of the comparison.
         assert len(spread_of('bias_slope_z', rows).names) == 12
 
-    def test_a_distance_is_divided_by_both_sds(self, rng):
+    def test_the_distance_of_a_unit_is_divided_by_the_sd_of_fleet_and_unit(self, rng):
         rows = self.with_few_positions(1, rng)
         rows[0] = {**rows[0], 'm_10_urad': -3950.0}
         spread = spread_of('m_10', rows)
         expected = (-3950.0 - spread.middle) / np.sqrt(spread.sd**2 + 9100.0**2)
         assert spread.z[0] == pytest.approx(expected)
 
-    def test_a_unit_stands_out_beside_many_that_lack_data(self, rng):
+    def test_an_outlier_is_reported_among_many_units_that_lack_data(self, rng):
         rows = self.with_few_positions(16, rng)
         rows[-1] = {**rows[-1], 'm_10_urad': 2000.0}
         (outlier,) = summarise(rows).outliers
@@ -146,7 +146,7 @@ class TestUndetermined:
         assert 'm_10_urad' not in names
         assert 'm_20_urad' in names
 
-    def test_eight_units_must_determine_a_parameter(self, rng):
+    def test_a_parameter_is_compared_if_at_least_eight_units_determine_it(self, rng):
         rows = self.with_few_positions(30, rng)[:37]
         rows[-1] = {**rows[-1], 'bias_slope_z_ug_k': 1e6}
         assert spread_of('bias_slope_z', rows).limit == float('inf')
@@ -184,7 +184,7 @@ class TestDrift:
         drifts = summarise(later, before).drifts
         names = sorted(drift.earlier for drift in drifts)
         assert names == [f'earlier /u00{i}@0' for i in range(3)]
-        # The same calibrations in a second table are not a drift.
+        # A table of the same calibrations gives no drift.
         assert summarise(first, before).drifts == ()
 
 
@@ -215,7 +215,7 @@ class TestPage:
         assert "default-src 'none'" in page
         assert page.count('<figure') == 2
 
-    def test_the_page_of_a_fleet_without_a_calibration(self):
+    def test_the_page_of_a_fleet_without_a_calibration_has_no_figure(self):
         rows = [row_of(name='u', serial='u', verdict='failed', problem='x: damaged')]
         page = render_fleet(rows, summarise(rows), lambda _: '')
         assert '0 of 1 test gave a calibration.' in page
@@ -223,7 +223,7 @@ class TestPage:
 
 
 class TestTable:
-    def test_cells_of_the_table_are_no_formulas(self, tmp_path):
+    def test_cells_of_the_csv_table_are_not_read_as_formulas(self, tmp_path):
         row = row_of(name='=cmd()', serial='-1', n_bags=3, raw_ug=-1.5)
         _, path = write_tables([row], tmp_path)
         heading, line = path.read_text().splitlines()
@@ -232,7 +232,7 @@ class TestTable:
         assert (cells['name'], cells['serial']) == ("'=cmd()", "'-1")
         assert (cells['n_bags'], cells['raw_ug'], cells['board_lag_s']) == ('3', '-1.5', '')
 
-    def test_a_file_that_is_no_fleet_table_is_refused(self, tmp_path):
+    def test_a_file_that_is_not_a_fleet_table_is_refused(self, tmp_path):
         (tmp_path / 'x.parquet').write_bytes(b'PAR1 not')
         with pytest.raises(ThermoCompError, match=r'x\.parquet: not a fleet table'):
             read_parquet(tmp_path / 'x.parquet')
@@ -257,7 +257,7 @@ class TestTable:
 @pytest.mark.parametrize(
     'name', ['../../etc', '.', '..', 'a/../b', '/abs', 'a\0b', 'x' * 300, 'ü/ß', 'a b', '']
 )
-def test_no_name_leads_out_of_the_results(name, tmp_path):
+def test_the_result_folder_of_any_name_is_inside_the_results(name, tmp_path):
     results = Results(tmp_path / 'out')
     folder = results.folder_of(name)
     folder.mkdir(parents=True)

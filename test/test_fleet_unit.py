@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of a unit equals a fit in one process, and accounts for each bag of the unit."""
+"""The fleet command fits a unit as `thermo_comp fit` does, and reports every bag left out."""
 
 import json
 from dataclasses import replace
@@ -47,7 +47,7 @@ def test_the_fit_of_a_fleet_equals_that_of_thermo_comp_fit(fleet, brief):
     assert ours == replace(theirs, provenance=ours.provenance)
 
 
-def test_the_verdict_of_a_fleet_is_that_of_evaluate(fleet, brief, cli, tmp_path):
+def test_fleet_and_evaluate_give_the_same_verdict(fleet, brief, cli, tmp_path):
     row, bags = brief.row, sorted((fleet / 'lot-A' / 'unit1').iterdir())
     calibration = tmp_path / 'unit.yaml'
     calibration.write_text(brief.calibration)
@@ -65,7 +65,7 @@ def test_the_verdict_of_a_fleet_is_that_of_evaluate(fleet, brief, cli, tmp_path)
 
 class TestRow:
     @pytest.mark.usefixtures('no_figures')
-    def test_the_row_of_a_good_unit(self, fleet, brief):
+    def test_the_row_of_a_good_unit_contains_the_figures_of_its_fit(self, fleet, brief):
         outcome = processed(fleet, certificates=True)
         row = outcome.row
         assert (row['name'], row['serial'], row['lot']) == ('lot-A/unit1', 'mems-0001', 'lot-A')
@@ -81,7 +81,7 @@ class TestRow:
         assert row['scale_slope_x_ppm_k'] == pytest.approx(
             (slope.value(1e-3) - slope.value(-1e-3)) / 2e-3 * 1e6, rel=1e-6
         )
-        # The sd of a slope must equal the scatter of slopes drawn from the posterior.
+        # The sd of a slope must equal the sd of 4000 slopes drawn from the posterior.
         block = parameter_layout(calibration).scale[0]
         n_drawn, rows = 4000, slice(block.static + 1, block.static + 1 + slope.n_free)
         covariance = calibration.posterior.covariance()[rows, rows]
@@ -105,7 +105,7 @@ class TestRow:
         json.dumps(row, allow_nan=False)
 
     @pytest.mark.slow
-    def test_a_corrupt_bag_is_left_out_and_a_torn_bag_is_read_up_to_the_cut(self, tmp_path):
+    def test_a_damaged_bag_is_left_out_and_a_cut_off_bag_is_read_up_to_its_end(self, tmp_path):
         paths = write_unit(tmp_path / 'u', 2, 6)
         paths[2].write_bytes(paths[2].read_bytes()[:-300])
         damage(paths[3])
@@ -124,23 +124,23 @@ class TestRow:
         assert row['verdict'] == 'refused'
         assert row['problem'] == 'the bags are of different units: mems-0001, mems-0002'
 
-    def test_the_row_has_the_lot_of_the_metadata_and_the_chosen_topic(self, tmp_path):
+    def test_the_row_states_the_production_lot_and_the_chosen_topic(self, tmp_path):
         lot = {'lot': 'L7'}
         write_unit(tmp_path / 'shelf' / 'u', 1, 2, serial='', metadata=lot, counts='/imu/raw')
         row = processed(tmp_path).row
         assert (row['lot'], row['serial']) == ('L7', 'u')
         assert row['chosen'] == '/imu/raw, its only Vector3Stamped, is taken for counts'
 
-    def test_a_slope_that_the_positions_do_not_determine_has_no_sd(self, tmp_path):
-        # WHY: a fit of one position gave the slope of bias plus scale as that of the bias, with an
-        # sd of 0.06 ug/K.
+    def test_the_row_has_no_sd_of_a_slope_that_the_positions_do_not_determine(self, tmp_path):
+        # WHY: a fit of one position stated the sum of the slopes of bias and scale as the slope of
+        # the bias, with an sd of 0.06 ug/K.
         write_unit(tmp_path / 'u', 1, 1)
         row = processed(tmp_path).row
         assert [row[f'bias_slope_sd_{axis}_ug_k'] for axis in 'xyz'] == [None] * 3
         assert [row[f'scale_slope_sd_{axis}_ppm_k'] for axis in 'xyz'] == [None] * 3
 
-    def test_the_lag_of_a_board_that_leads_is_negative(self, tmp_path):
-        # WHY: a calibration without a measured board lag states 900 s, not the unit's lag.
+    def test_the_lag_of_a_board_that_changes_before_the_case_is_negative(self, tmp_path):
+        # WHY: a calibration without a measured board lag contains 900 s, which is not measured.
         write_unit(tmp_path / 'u', 1, 4, is_exchanged=True)
         allowed = replace(OPTIONS.fit, allow=('swapped',))
         outcome = processed(tmp_path, fit=allowed)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Temperature functions, predictions and residual statistics agree with hand numbers and scipy."""
+"""Temperature functions, predicted sd and residual statistics agree with hand numbers, scipy."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ temperatures = st.floats(-15.0, 15.0)
 
 
 @given(st.integers(0, 2**32), st.integers(1, 40), st.integers(1, 5), st.integers(1, 5))
-def test_sums_do_not_depend_on_the_size_of_the_other_axes(seed, size, before, after):
+def test_the_bits_of_a_sum_do_not_depend_on_the_other_axes(seed, size, before, after):
     values = np.random.default_rng(seed).standard_normal((before, size, after))
     for order in 'CF':
         total = in_order(np.array(values, order=order), 1)
@@ -45,23 +45,23 @@ def test_sums_do_not_depend_on_the_size_of_the_other_axes(seed, size, before, af
             assert total[i, k] == sum(values[i, :, k].tolist())
 
 
-def test_polynomial_by_hand():
-    # Equation 10 of Golovach's paper has a4 t as its fourth term, which should be a4 t^4.
+def test_a_polynomial_agrees_with_hand_numbers():
+    # Eq. (10): the fourth term is a4 t^4; Golovach's paper prints a4 t.
     assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 
-def test_exponential_by_hand():
+def test_an_exponential_agrees_with_hand_numbers():
     function = Exponential(-2.0, (2.0,), (10.0,))
     assert function.value(0.0) == 0.0
     assert function.value(10.0) == pytest.approx(2.0 * (np.e - 1.0), rel=1e-15)
 
 
-def test_spline_equals_scipy():
+def test_a_cubic_spline_equals_that_of_scipy():
     values = (1.5, 0.4, 0.0, -0.2, 0.9)
     ours = CubicSpline(KNOTS, values)
     reference = ReferenceSpline(KNOTS, values, bc_type='natural')
     t = np.linspace(-15.0, 15.0, 301)
-    # Both splines solve one linear system, and differ by rounding only.
+    # Both splines solve the same equations, so they differ by rounding.
     np.testing.assert_allclose(ours.value(t), reference(t), atol=1e-13)
     np.testing.assert_allclose(ours.slope(t), reference(t, 1), atol=1e-13)
 
@@ -87,7 +87,7 @@ def test_functions_of_arrays_have_the_bits_of_floats(function):
 def test_the_slope_of_a_function_is_its_derivative(function, t):
     step = 1e-4
     t = min(max(t, -15.0 + step), 15.0 - step)
-    # The error of a central difference, third derivative * step^2 / 6, is below 1e-8.
+    # A central difference has an error of (third derivative) * step^2 / 6, here below 1e-8.
     expected = (function.value(t + step) - function.value(t - step)) / (2.0 * step)
     assert function.slope(t) == pytest.approx(expected, abs=1e-8)
 
@@ -103,7 +103,7 @@ def test_the_value_of_a_function_is_linear_in_its_free_coefficients(function, t,
     expected = function.value(t) + sum(
         b * d for b, d in zip(function.basis(t), change, strict=True)
     )
-    # The tolerance is the rounding of powers up to 15^4 with coefficients of order 1.
+    # The tolerance is the rounding error of t^4 at 15 K with coefficients near 1.
     assert other.value(t) == pytest.approx(expected, rel=1e-12, abs=1e-9)
     assert other.value(0.0) == pytest.approx(function.value(0.0), abs=1e-15)
 
@@ -126,7 +126,7 @@ def test_impossible_functions_are_refused(build, message):
         build()
 
 
-def test_hold_clips_values_to_a_range():
+def test_hold_limits_values_to_a_range():
     assert [hold(x, -1.0, 2.0) for x in (-3.0, 0.5, 4.0)] == [-1.0, 0.5, 2.0]
     assert hold(np.array([-3.0, 0.5, 4.0]), -1.0, 2.0).tolist() == [-1.0, 0.5, 2.0]
 
@@ -139,7 +139,7 @@ def test_a_curve_that_is_not_finite_is_refused(bad):
 
 
 def slope_and_lag(variances):
-    """Make a unit with a bias slope and a lag of 600 s; `variances`: parameter -> variance."""
+    """Make a unit with a bias slope and a lag of 600 s; `variances`: variance by parameter."""
     unit = calibration(
         static=regime_set(*[axis_set((0.0, 0.3), residual_sd_m_s2=3e-5)] * 3),
         dynamic=regime_set(*[axis_set((0.0, 0.3))] * 3),
@@ -151,12 +151,13 @@ def slope_and_lag(variances):
     return replace(unit, posterior=posterior_of(np.diag(rest)))
 
 
-def test_the_predicted_sd_by_hand():
-    # Parameters of x: level and slope of the bias by set, weight of the lag, both scale levels.
+def test_the_predicted_sd_agrees_with_hand_numbers():
+    # Parameters of x: level and slope of the bias in each set (0-3), weight of the lag (4), scale
+    # level of each set (5, 6).
     unit = slope_and_lag({0: 4e-4, 1: 1e-6, 2: 9e-4, 3: 0.0, 4: 1e-6, 5: 1e-12, 6: 4e-12})
     states = ramp_states(unit, np.array([20.0, 30.0]), 0.0, np.inf)
     bias, scale = sd_of_states(unit, states)
-    # At 30 degC: variance 4e-4 + 100 * 1e-6 counts^2, at 300 counts per m/s^2, plus (30 um/s^2)^2.
+    # At 30 degC the variance is 4e-4 + 100 * 1e-6 counts^2, plus the residual's (30 um/s^2)^2.
     expected = np.sqrt([4e-4, 5e-4]) / 300.0
     assert bias[:, 0] == pytest.approx(np.hypot(expected, 3e-5), rel=1e-6)
     assert bias[:, 1] == pytest.approx([3e-5, 3e-5])
@@ -174,8 +175,8 @@ def test_parameters_without_variance_give_no_sd():
     assert not scale.any()
 
 
-def test_in_a_soak_the_gradient_is_that_of_the_unit_s_own_heat():
-    # WHY: the certificate omitted the gradient of a soak: with 3 K and 16 ug/K an error of 50 ug.
+def test_the_bias_in_a_soak_includes_the_gradient_by_self_heating():
+    # WHY: the certificate left out the gradient in a soak, here 3 K, an error of 50 ug at 16 ug/K.
     unit = calibration(
         response=(
             term('gradient', (30.0, 0.0, 0.0), scale=(0.0, 2e-5, 0.0)),
@@ -185,8 +186,8 @@ def test_in_a_soak_the_gradient_is_that_of_the_unit_s_own_heat():
         soak_gradient_k=(-3.0, 0.2),
     )
     bias, bias_sd, scale, scale_sd = in_a_soak(unit)
-    # In a soak the lag of the gradient equals the gradient. A part halfway between board and case
-    # lags the board by minus half the gradient.
+    # In a soak the lagged gradient is the gradient. A part midway between board and case is colder
+    # than the board by half of the gradient.
     by_kelvin = np.array([30.0, 60.0, -45.0]) / 300.0
     assert bias == pytest.approx(-3.0 * by_kelvin)
     assert bias_sd == pytest.approx(0.2 * np.abs(by_kelvin))
@@ -198,8 +199,8 @@ def test_in_a_soak_the_gradient_is_that_of_the_unit_s_own_heat():
 
 
 @pytest.mark.parametrize('rate', [0.01, -0.02])
-def test_ramp_states_equal_those_of_the_stepped_memory(rate):
-    # The expected state comes from the memory of the fit, stepped through a ramp after a soak.
+def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
+    # Expected: state of the memory of the fit after readings of a soak and a ramp.
     unit = replace(rich_calibration(), board_lag_s=100.0)
     spec = Correction(unit).memory
     first = Layout(spec).width - 2 * len(spec.lags) - len(spec.plays)
@@ -213,16 +214,16 @@ def test_ramp_states_equal_those_of_the_stepped_memory(rate):
         if isinstance(quantity, Gradient):
             assert state[place] == pytest.approx(100.0 * rate)
         elif isinstance(quantity, Lag):
-            # In the memory the gradient rises within the first second, in `ramp_states` at once.
+            # The gradient rises within 1 s in the memory, and in a step in `ramp_states`.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Plays on lags are left out: they would reach their half-width after half an hour.
+            # Plays on lags are left out: they need half an hour to reach their half-width.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 
 
-def test_statistics_of_scalars_by_hand():
-    # The values 3 and -4 have the mean -0.5 and the mean square 12.5.
+def test_statistics_of_numbers_agree_with_hand_numbers():
+    # For 3 and -4 the mean is -0.5, the mean square 12.5.
     statistics = residual_statistics(np.array([3.0, -4.0]))
     assert (statistics.n, statistics.mean, statistics.peak) == (2, -0.5, 4.0)
     assert statistics.rms == pytest.approx(12.5**0.5, rel=1e-15)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fuzz targets run, without a fuzzer, on their seeds: whole, cut off and changed."""
+"""The functions for fuzz tests accept their seeds, also cut off or changed, without a crash."""
 
 import pytest
 
@@ -35,7 +35,7 @@ def test_fuzz_run_lists_every_target():
     assert set(run.NAMES) == set(TARGETS)
 
 
-def test_seeds_of_the_fuzz_targets_pass_the_first_checks():
+def test_seeds_of_the_fuzz_targets_are_valid_inputs():
     assert parse_calibration(TARGETS['calibration'].seeds[0]).unit.serial == 'T'
     for seed in TARGETS['mcap'].seeds:
         targets.BAG.write_bytes(seed)

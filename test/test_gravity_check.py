@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The gravity check passes good calibrations, reports aged calibrations, ignores motion."""
+"""The gravity check accepts good calibrations, reports aged ones, and ignores motion."""
 
 import math
 
@@ -28,7 +28,7 @@ def watch(rng, *, bias=0.0, seconds=60, motion=0.0, rate_hz=100, monitor=None):
     return monitor.result
 
 
-def test_residual_of_a_good_calibration_is_within_its_sd(rng):
+def test_the_residual_of_a_good_calibration_is_within_its_sd(rng):
     result = watch(rng)
     # The mean of 99 samples has a noise of 0.2 mm/s^2, the mean of 30 such windows 0.04 mm/s^2.
     assert abs(result.residual) < 5 * NOISE_SD / math.sqrt(100 * 15)
@@ -47,7 +47,7 @@ def test_motion_gives_no_verdict(rng):
     assert watch(rng, motion=0.05) is None
 
 
-def test_a_jump_of_time_starts_a_new_window(rng):
+def test_a_jump_of_the_stamps_starts_a_new_window(rng):
     monitor = GravityCheck(GRAVITY)
     watch(rng, seconds=10, monitor=monitor)
     result = watch(rng, seconds=10, monitor=monitor)
@@ -55,7 +55,7 @@ def test_a_jump_of_time_starts_a_new_window(rng):
 
 
 def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
-    """Run a rest whose |f| changes at `at_s`; return the delay of a refusal [s] and its result."""
+    """Change |f| at `at_s`; return the time from then to the refusal [s], and the result."""
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     up = np.array([0.3, -0.5, math.sqrt(1 - 0.34)])
     for k in range(round((at_s + 10.0) * rate_hz)):
@@ -72,24 +72,24 @@ def steps(rng, *, offset, at_s=20.0, ramp_s=0.0, rate_hz=2.5, scatter=0.0):
 @pytest.mark.parametrize('rate_hz', [2.5, 5.0, 10.0])
 @pytest.mark.parametrize('offset', [0.3, -3.0, 15.0])
 def test_a_step_at_rest_refutes_the_calibration_within_a_second(rng, rate_hz, offset):
-    # WHY: the refusal took five seconds, and the printed mean included the time before the change.
+    # WHY: the refusal came after five seconds, and its printed mean included samples before the
+    # change.
     after_s, result = steps(rng, offset=offset, rate_hz=rate_hz)
     assert after_s < 1.0
-    # A refusal needs at least two samples.
     assert result.residual == pytest.approx(offset, abs=5 * NOISE_SD)
 
 
 def test_a_change_by_motion_does_not_refute_the_calibration_at_once(rng):
-    # A calibration is not refused at once in a lift that accelerates for 0.8 s, or a shaking car.
+    # Such changes occur in a lift that accelerates for 0.8 s, and in a shaking car.
     assert steps(rng, offset=1.0, ramp_s=0.8, rate_hz=5.0)[0] > 2.0
     assert steps(rng, offset=1.0, scatter=0.05, rate_hz=5.0)[0] > 2.0
 
 
-def test_the_message_states_the_present_deviation(rng):
+def test_the_message_states_the_deviation_of_the_latest_windows(rng):
     monitor = GravityCheck(GRAVITY, tolerance=0.1)
     watch(rng, seconds=40, bias=0.001, monitor=monitor)
     assert not monitor.is_refuted
-    # Stamps that start again at 0 are a restart, not a step of |f|.
+    # The stamps start again at 0, so the change of |f| is taken for a restart, not for a step.
     result = watch(rng, seconds=8, bias=0.5, monitor=monitor)
     assert monitor.is_refuted
     assert result.residual == pytest.approx(0.5, abs=1e-3)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration of a gyroscope agrees with simulated truth and closed forms."""
+"""The calibration of a gyroscope agrees with simulated truth and closed formulas."""
 
 from dataclasses import replace
 
@@ -61,16 +61,15 @@ def rms(values):
 
 @pytest.fixture(scope='module')
 def unit():
-    # A temperature reading every 4 s suffices for lags of minutes, and saves 3/4 of a fit's time.
+    # The lags are minutes, so a reading every 4 s is sufficient; this saves 3/4 of a fit's time.
     return unit_preset('mems', 2).with_thermometers(rate_hz=0.25)
 
 
 @pytest.fixture(scope='module')
 def fitted(unit):
-    """Fit a MEMS unit in nine positions; no single column equals the drift of its gyroscope."""
+    """Fit a MEMS unit in nine positions; several columns together make its gyroscope's drift."""
     records = arrays(unit, plan('chamber-9', 2), 2, rate_hz=RATE_HZ)
-    # The fitted groups have half of all columns, so the fit takes half the time of a fit of all
-    # groups.
+    # These groups have half of all columns, so the fit takes half the time.
     options = replace(OPTIONS, groups=('curve', 'gradient', 'board', 'gradient_lag', 'product'))
     return fit([source_of(record, unit.scale_factor) for record in records], options)
 
@@ -78,15 +77,14 @@ def fitted(unit):
 @pytest.fixture(scope='module')
 def held_out(unit):
     (station, *_) = plan('held-out', 2)
-    # The program has two ramps up and two down, with soaks, and ends at another temperature than
-    # at its start.
+    # The shortened program has two ramps up and two ramps down, each followed by a soak.
     whole = station.program
     program = replace(whole, time_s=whole.time_s[:10], temperature_c=whole.temperature_c[:10])
     return arrays(unit, [replace(station, program=program)], 99, rate_hz=RATE_HZ)[0]
 
 
 @pytest.mark.slow
-def test_the_residual_of_a_mems_gyroscope_is_its_noise(unit, fitted, held_out):
+def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise(unit, fitted, held_out):
     calibration = fitted.calibration
     gyroscope = calibration.gyroscope
     block = block_of(held_out, unit.scale_factor)
@@ -100,17 +98,17 @@ def test_the_residual_of_a_mems_gyroscope_is_its_noise(unit, fitted, held_out):
     assert rms(raw - raw.mean(axis=0)) > 100.0 * FLOOR
     assert rms(changes) < 1.15 * FLOOR
     assert (np.sqrt(np.mean(changes**2, axis=0)) < 1.3 * FLOOR).all()
-    # The mean rate is within 3 sd: claimed variance plus a third of the Earth's rate squared.
+    # The variance of a mean rate is the claimed variance plus 1/3 of the Earth's rate squared.
     message = gyroscope.noise_density_rad_s_sqrt_hz[0] ** 2 / calibration.unit.cycle_time_s
     claimed = np.sqrt(out.angular_rate_variance.mean(axis=0) - message + EARTH_RATE**2 / 3.0)
     assert (np.abs(means.mean(axis=0)) < 3.0 * claimed).all()
     np.testing.assert_allclose(gyroscope.noise_density_rad_s_sqrt_hz, 5.0 * MILLIDEGREE, rtol=0.05)
-    # The claimed sd is that of the turn-ons, 2 mdeg/s, estimated from 9 positions.
+    # The residual sd is the sd of turn-ons, 2 mdeg/s, estimated from nine positions.
     assert np.mean(gyroscope.residual_sd_rad_s) == pytest.approx(2.0 * MILLIDEGREE, rel=0.4)
 
 
 @pytest.mark.slow
-def test_left_out_residuals_of_the_fit_hold_for_new_positions(fitted):
+def test_left_out_residuals_of_a_gyroscope_are_near_the_fitted_ones(fitted):
     row = fitted.rates[-1]
     assert row.section == 'all'
     assert row.raw.rms > 100.0 * FLOOR
@@ -150,7 +148,7 @@ def test_a_gyroscope_does_not_change_the_accelerometer_s_fit(unit):
 
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
 @settings(max_examples=50, deadline=None)
-def test_residuals_within_positions_do_not_depend_on_levels(places, seed):
+def test_residuals_about_position_means_do_not_depend_on_the_means(places, seed):
     position = np.sort(np.array(places))
     rng = np.random.default_rng(seed)
     rate, level = rng.standard_normal((len(places), 3)), rng.standard_normal((5, 3))
@@ -162,7 +160,7 @@ def test_residuals_within_positions_do_not_depend_on_levels(places, seed):
         np.testing.assert_allclose(within[position == p].sum(axis=0), 0.0, atol=1e-12)
 
 
-def test_the_round_trip_of_a_gyroscope_is_exact():
+def test_a_gyroscope_is_read_back_from_a_file_bit_for_bit():
     whole = rich_calibration()
     assert parse_calibration(dump_calibration(whole).encode()) == whole
     triad = rate_triad(whole)
@@ -183,7 +181,7 @@ def test_the_round_trip_of_a_gyroscope_is_exact():
         rate_triad(calibration())
 
 
-def test_a_bad_gyroscope_in_a_file_is_refused_by_key():
+def test_the_message_on_a_wrong_gyroscope_names_the_key():
     text = dump_calibration(rich_calibration())
     for old, new, said in (
         ('bias_rad_s: [0.02', 'bias_rad_s: [.nan', r'gyroscope\.bias_rad_s\[0\]'),
@@ -207,7 +205,7 @@ def test_a_bad_gyroscope_in_a_file_is_refused_by_key():
         replace(rich_calibration(), gyroscope=foreign)
 
 
-def test_the_rate_is_corrected_by_hand_numbers():
+def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
     # At the reference temperature the rate gets its constant bias, the force no correction.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
@@ -224,7 +222,7 @@ def test_the_rate_is_corrected_by_hand_numbers():
     assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
     x, y, z, *variances = compensator.correct_rate(0, 1.0, 1.0, 1.0)
     assert (x, y, z) == pytest.approx((0.98 - 1e-5, 1.03, 0.99 - 1e-5), abs=1e-12)
-    # While the regime is unknown the variance is noise, slow error, and difference of the sets.
+    # In an unknown regime the variance is noise, residual, and the difference of the sets.
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)
@@ -250,7 +248,7 @@ def reduced(unit, records):
 @pytest.mark.slow
 def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted, held_out):
     calibration, bags = fitted.calibration, reduced(unit, [held_out])
-    # The first third of the bag has enough ramps and soaks to show a wrong calibration.
+    # The first third of the bag is sufficient to detect a wrong calibration, and saves time.
     thirds = [replace(interval, n_whole=interval.n_whole // 3) for interval in bags[0].intervals]
     short = [replace(bags[0], intervals=tuple(thirds))]
     judged = judge_bags(bags, calibration)
@@ -259,13 +257,13 @@ def test_the_changes_of_the_rate_are_compared_with_their_claimed_sd(unit, fitted
     assert judged.exit_code == 0
     for name in ('static', 'dynamic', 'all'):
         section = rate.sections[name]
-        # The claimed sd exceeds the noise, because the initial states of the lags are unknown.
+        # The claimed sd includes that of unknown initial lag states, so it exceeds the noise.
         assert 0.7 < section.ratio < 1.2
         assert section.rms < 1.3 * FLOOR
         assert section.raw_rms > 50.0 * FLOOR
     assert judged.facts()['angular_rate']['reason'] == rate.reason
     assert 'angular rate: valid: 0.' in str(rate)
-    # A gyroscope calibration of another unit is detected, also if it has no covariance.
+    # A wrong gyroscope calibration is detected, although it has no covariance.
     gyro = calibration.gyroscope
     other = replace(gyro, response=(), static=gyro.dynamic, dynamic=gyro.dynamic, posterior=None)
     wrong = judge_bags(short, replace(calibration, gyroscope=other))

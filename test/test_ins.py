@@ -11,8 +11,8 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize('axis', [0, 1])
-def test_a_bias_makes_schuler_s_oscillation(axis):
-    # A bias b after levelling gives the position error b R / g (1 - cos(w t)), w^2 = g / R.
+def test_a_bias_causes_a_schuler_oscillation(axis):
+    # A bias b from levelling on causes the position error b R / g (1 - cos(w t)), w^2 = g / R.
     bias, dt, minutes = 1e-4, 0.5, 84
     force = G * UP
     force[axis] += bias
@@ -23,7 +23,7 @@ def test_a_bias_makes_schuler_s_oscillation(axis):
         if k % 1200 == 0:
             angle = omega * k * dt
             expected = bias / omega**2 * (1.0 - np.cos(angle))
-            # Tolerance: the change of the position in an integration step; the amplitude is 130 m.
+            # Tolerance: the position, which reaches 130 m, changes by 0.04 m in a time step.
             assert navigator.position[axis] == pytest.approx(expected, abs=0.1)
             speed = bias / omega * np.sin(angle)
             assert navigator.velocity[axis] == pytest.approx(speed, abs=1e-4)
@@ -42,9 +42,9 @@ def test_levelling_makes_the_force_vertical(rng):
     np.testing.assert_allclose((attitude @ force[..., None])[..., 0], expected, atol=1e-12)
 
 
-def test_the_sigma_of_the_filter_is_the_position_sd_by_white_noise(rng):
-    # Expected variance of the position: Schuler oscillation of the levelling error, plus the white
-    # noise through the impulse response of the Schuler loop, sin(w t) / w.
+def test_the_sd_of_the_filter_equals_the_closed_form_for_white_noise(rng):
+    # The variance of the position is the sum of that by the levelling error and that by the noise
+    # in flight, whose impulse response is sin(w t) / w.
     density, dt = 1e-4, 0.5
     force = G * UP + rng.normal(0.0, density / np.sqrt(dt), (40_000, 3))
     free = fly(Model(force, density, 0.0), dt, UP, G, 0.0)
@@ -53,12 +53,12 @@ def test_the_sigma_of_the_filter_is_the_position_sd_by_white_noise(rng):
     by_noise = density**2 * (T / 2.0 - np.sin(2.0 * omega * T) / (4.0 * omega)) / omega**2
     expected = np.sqrt(2.0 * (by_levelling + by_noise))
     assert free.sigma[-1, 0] == pytest.approx(expected, rel=0.01)
-    # Of the 298 overlapping flights only about eight are independent.
+    # The RMS of the 298 flights is uncertain, as they overlap: about eight are independent.
     assert 0.5 < np.sqrt(np.mean(free.position[-1] ** 2)) / expected < 1.5
 
 
 def test_zupt_removes_a_bias_that_appears_after_levelling():
-    # A bias of 1e-3 m/s^2 appears after levelling; 25 minutes of ZUPT must remove most of it.
+    # 25 minutes of zero-velocity updates must remove 90 % of a bias of 1e-3 m/s^2.
     dt, n_align = 0.5, 600
     force = np.tile(G * UP, (n_align + 3600 + 1, 1))
     force[n_align:, 0] += 1e-3
@@ -66,5 +66,5 @@ def test_zupt_removes_a_bias_that_appears_after_levelling():
     free = fly(Model(force, 1e-4, 1e-3), dt, UP, G, 0.0)
     assert free.position[-1, 0] > 1000.0
     coasted = message.position[-1, 0] - message.position[2999, 0]
-    # Without ZUPT a bias of 1e-3 m/s^2 would give 45 m in five minutes.
+    # In five minutes without updates the whole bias would cause a position error of 45 m.
     assert abs(coasted) < 4.5

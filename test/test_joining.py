@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fit and the judge treat the parts of a split recording as the whole recording."""
+"""The parts of a split recording give the fit and the judgement of the whole recording."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -42,7 +42,7 @@ def recorded(rng, seconds):
 
 
 def cut(whole, edges_s, pause_s=0.0):
-    """Cut a block at times [s]; each part begins `pause_s` later than the previous part ended."""
+    """Cut a block at times [s], with a pause between the parts."""
     edges = [START_NS, *(START_NS + round(1e9 * edge) for edge in edges_s), 2 * START_NS]
     parts = []
     for number, (begin, end) in enumerate(pairwise(edges)):
@@ -73,7 +73,7 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     whole = recorded(rng, 600.0)
     (bag,) = reduced([whole])
     (rest,) = bag.intervals
-    # The order in which the parts of a recording are given does not matter.
+    # The parts are given in reverse order, which must not change the result.
     (again,) = joined(reduced(cut(whole, edges_s))[::-1])
     (continued,) = again.intervals
     assert (again.start_ns, again.end_ns) == (bag.start_ns, bag.end_ns)
@@ -84,18 +84,18 @@ def test_parts_of_a_rest_have_the_windows_of_the_whole_rest(rng, edges_s):
     for name in ('board', 'case'):
         np.testing.assert_array_equal(getattr(again, name).stamp_ns, getattr(bag, name).stamp_ns)
         np.testing.assert_array_equal(getattr(again, name).value, getattr(bag, name).value)
-    # Less than one window of 10 s is lost where a part of the recording ends and the next begins.
+    # At each cut less than one window of 10 s is lost.
     n_lost = rest.count.sum() - continued.count.sum()
     assert 0.0 <= n_lost <= 10.0 * RATE_HZ * len(edges_s)
     assert np.all(np.diff(continued.time) > 0.0)
-    # Each window's mean is on the line of the drift, within five sd of the mean's noise.
+    # Means of windows follow the drift within five sd of their noise.
     line = LEVEL + np.outer(continued.time, DRIFT)
     sd = NOISE / np.sqrt(continued.count)[:, None]
     assert np.abs((continued.mean - line) / sd).max() < 5.0
     np.testing.assert_allclose(continued.sample_sd, NOISE, rtol=0.05)
 
 
-def test_a_unit_that_was_moved_between_two_parts_has_two_rests(rng):
+def test_a_move_between_two_parts_of_a_recording_gives_two_rests(rng):
     whole = recorded(rng, 600.0)
     before, after = cut(whole, (300.0,))
     moved = replace(after, accel=after.accel + np.array([0.0, 1.0, 0.0]))
@@ -104,17 +104,17 @@ def test_a_unit_that_was_moved_between_two_parts_has_two_rests(rng):
     assert first.time[-1] < 300.0 < second.time[0]
 
 
-def test_other_recordings_are_not_joined(rng):
+def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     whole = recorded(rng, 400.0)
     assert len(joined(reduced(cut(whole, (200.0,), pause_s=1.0)))) == 1
-    # In a pause of 60 s between two parts the unit may have been switched off and on.
+    # After a pause of 60 s the unit may have been switched off and on, so parts are not joined.
     assert len(joined(reduced(cut(whole, (200.0,), pause_s=60.0)))) == 2
     known = KnownForce('part', parse_sections('0 400 2.0'))
     assert len(joined(reduced(cut(whole, (200.0,)), force=known))) == 2
-    # Two recordings of 2 s whose stamps begin at the same time are no parts of one recording.
+    # Recordings of 2 s that begin at equal times are not parts of one recording.
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
-    # Two recordings with the same stamps are each joined with their own second part.
+    # Of two recordings with equal stamps, each is joined with its second part.
     other = replace(whole, accel=-whole.accel)
     parts = [*cut(whole, (200.0,)), *cut(other, (200.0,))[::-1]]
     first, second = joined(reduced(parts))
@@ -140,9 +140,9 @@ def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
 
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
-    # WHY: each part of a split recording had its own turn-on, rests and initial lag states.
-    # Eighteen recordings of 9 h, split hourly, took 30 times as long to fit as the whole
-    # recordings, and the claimed sd was 6 times that of the whole recordings.
+    # WHY: each part of a split recording was fitted with a separate turn-on and separate initial
+    # lag states. For 18 recordings of 9 h, split every hour, the fit took 30 times as long and
+    # claimed 6 times the sd.
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):
@@ -158,7 +158,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         }
         part = replace(bag, time_s=bag.time_s[inside[0]], counts=bag.counts[inside[0]])
         parts.append(replace(part, temperatures=readings, name=f'{begin_s:g} s'))
-    # Two groups of columns: the choice among all groups takes five times as long.
+    # A fit of these two groups takes 1/5 of the time of a choice among all groups.
     whole, split = (
         thermo_comp.fit(bags, gravity=9.80665, groups=('curve', 'board')) for bags in (bag, parts)
     )
@@ -167,8 +167,8 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
         unit.correct(bag.time_s, bag.counts, **bag.temperatures).specific_force
         for unit in (whole, split)
     ))  # fmt: skip
-    # Half a minute of samples is lost at the end of each part: the drifts of the corrected forces
-    # differ by less than the noise of a mean over a minute, 1.2 ug.
+    # At the end of each part 30 s of samples are lost: corrected forces drift differently by less
+    # than 1.2 ug, the noise of a mean over 60 s.
     assert np.nanstd(difference, axis=0).max() < 1.2 * MICRO_G
 
 
@@ -186,14 +186,14 @@ def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng, cli):
     result = evaluate(paths, [('unit', calibration)])
     (bag,) = result.bags
     assert bag.source.name == 'part0.mcap .. part1.mcap'
-    # 900 s hold 15 windows of 60 s, of which two may be lost around the end of the first part.
+    # 900 s have 15 windows of 60 s, of which two may be lost at the cut.
     assert len(result.judgements['unit'].windows) >= 13
-    # The command line states which bags were joined.
+    # The command prints which bags it has joined.
     thermo_comp.save(calibration, tmp_path / 'unit.yaml')
     errors = cli('evaluate', *paths, '-c', tmp_path / 'unit.yaml').stderr
     assert 'part0.mcap .. part1.mcap: 2 bags of one recording, joined' in errors
     page = tmp_path / 'unit.html'
     cli('report', *paths, '-c', tmp_path / 'unit.yaml', '-o', page)
-    # The certificate has the name and the SHA-256 of each bag, not of the joined recording alone.
+    # The certificate has name and SHA-256 of each joined bag.
     text = page.read_text()
     assert all(path.name in text and digest(path) in text for path in paths)

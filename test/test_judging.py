@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A judgement has the residuals computed by hand, windows of the stated length, each verdict."""
+"""Windows, residuals and verdicts of a judgement agree with values computed by hand."""
 
 import csv
 import dataclasses
@@ -55,7 +55,7 @@ def resting(
     counts[:, 2] = K * GRAVITY + SLOPE * (celsius - 20.0) + error
     counts += noise * rng.standard_normal((n, 3))
     counts[:, ['xyz'.index(axis) for axis in dead]] = 0.0
-    # A working sensor never repeats a value for long, and repeated values are rejected.
+    # Samples with long repetitions of one value are rejected as those of a broken sensor.
     counts[::2, 0] += 1e-9
     if shaken_s:
         shaken = (seconds >= shaken_s[0]) & (seconds < shaken_s[1])
@@ -103,8 +103,8 @@ CLAIMING = corrected_by(SLOPE, 1e-5)
 
 class TestWindows:
     @pytest.mark.parametrize('reading_s', [30, 50])
-    def test_a_slow_thermometer_leaves_all_windows(self, tmp_path, reading_s):
-        # WHY: at 2 Hz, sums of samples over 20 s between readings were dropped as time jumps.
+    def test_readings_every_30_or_50_s_remove_no_window(self, tmp_path, reading_s):
+        # WHY: at 2 Hz windows were lost, because the time between readings was taken for a jump.
         bag = resting(tmp_path / 'bag', 30.0, minutes=30.0, rate_hz=2.0, reading_s=reading_s)
         windows = judged(bag, corrected_by(SLOPE)).windows
         assert len(windows) >= 28
@@ -116,15 +116,15 @@ class TestWindows:
         models = [('right', corrected_by(SLOPE)), ('half', corrected_by(SLOPE / 2))]
         judgements = evaluate([bag], models).judgements
         drift = SLOPE * 10.0 / K
-        # The estimate of a constant temperature is exact to 1e-7 K, an error of 1e-9 m/s^2.
+        # The temperature estimate has an error of 1e-7 K, which causes an error of 1e-9 m/s^2.
         for name, expected in (('right', 0.0), ('half', drift / 2)):
             windows = judgements[name].windows
             np.testing.assert_allclose(windows.raw_residual, drift, atol=1e-9)
             np.testing.assert_allclose(windows.residual, expected, atol=1e-9)
             np.testing.assert_allclose(windows.board, 30.0, rtol=0.0, atol=1e-6)
 
-    def test_a_window_is_the_mean_of_what_the_node_publishes(self, tmp_path):
-        # In a ramp of 1 K/min a wrong time or reading would change the correction.
+    def test_a_window_is_the_mean_of_the_samples_that_the_node_publishes(self, tmp_path):
+        # The temperature rises by 1 K/min, so that a wrong time or reading changes the correction.
         bag = resting(tmp_path / 'bag', (15.0, 33.0), minutes=18.0, noise=0.2)
         unit = corrected_by(SLOPE)
         windows = judged(bag, unit).windows
@@ -136,19 +136,19 @@ class TestWindows:
         for start_ns, mean in zip(windows.start_ns, windows.force, strict=True):
             inside = (stamps >= start_ns) & (stamps < start_ns + 60 * 10**9)
             assert inside.sum() == 600
-            # Corrections linear in time over 10 s are accurate to a thousandth of a micro-g.
+            # The judgement takes the correction as linear over 10 s: an error below 0.001 ug.
             np.testing.assert_allclose(mean, force[inside].mean(axis=0), atol=1e-8)
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
     @pytest.mark.parametrize('window_s', [60.0, 120.0])
     def test_windows_at_rest_have_the_stated_length(self, tmp_path, rate_hz, window_s):
-        # WHY: at 4 Hz cells of 32 samples last 8 s, so windows of ten seconds lasted 16 s.
+        # WHY: at 4 Hz a cell of 32 samples lasts 8 s, so windows of 10 s became 16 s long.
         bag = resting(tmp_path / 'bag', 20.0, minutes=20.5, rate_hz=rate_hz, noise=0.3)
         windows = judged(bag, calibration(), window_s=window_s).windows
         assert windows.window_s == window_s
         np.testing.assert_array_equal(windows.count, rate_hz * window_s)
         np.testing.assert_allclose(np.diff(windows.start_ns) * 1e-9, window_s, atol=1e-6)
-        # Windows cover the whole rest, except for the time before the first temperature.
+        # Windows cover the recording, except for the time before the first temperature reading.
         assert len(windows) >= int(20.5 * 60.0 / window_s) - 1
 
     def test_samples_too_slow_for_a_window_are_refused(self, tmp_path):
@@ -165,22 +165,22 @@ class TestWindows:
         assert not inside.any()
         assert len(windows) >= 55
         assert np.unique(windows.position).tolist() == [0, 1]
-        # A noise of 0.3 counts, averaged over 100 samples, is 0.1 mm/s^2 per window.
+        # A mean over 100 samples with a noise of 0.3 counts has a noise of 0.1 mm/s^2.
         assert np.sqrt(np.mean(windows.residual**2)) < 3.0 * 0.3 / K / 10.0
 
-    def test_the_claimed_sd_of_noise_is_its_sd(self, tmp_path):
-        # The calibration states the bag's white noise: an sd of 0.3 counts at 10 Hz.
+    def test_residuals_of_white_noise_agree_with_their_claimed_sd(self, tmp_path):
+        # The calibration has the density of the bag's white noise, 0.3 counts per sample at 10 Hz.
         density = 0.3 / K * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
         knows = calibration(unit=unit, noise_density_m_s2_sqrt_hz=(density,) * 3)
         bag = resting(tmp_path / 'bag', 20.0, minutes=40.0, noise=0.3)
         windows = judged(bag, knows, window_s=10.0).windows
         ratio = windows.residual / windows.claimed_sd
-        # 240 windows: the RMS of a standard normal is 1 within 3 / sqrt(2 * 240).
+        # The RMS of 240 standard normal numbers is 1 within 3 / sqrt(2 * 240) = 0.14.
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.14)
 
-    def test_a_noisy_unit_rests_as_its_calibration_says(self, tmp_path):
-        # WHY: the limit of 50 mg for noise at rest also applied to a unit with a noise of 100 mg.
+    def test_the_limit_of_noise_at_rest_follows_from_the_calibration(self, tmp_path):
+        # WHY: for a unit with a noise of 100 mg no window counted as rest: the limit was 50 mg.
         bag = resting(tmp_path / 'bag', 20.0, noise=0.1 * K * GRAVITY)
         density = 0.1 * GRAVITY * np.sqrt(0.1)
         unit = dataclasses.replace(calibration().unit, cycle_time_s=0.1)
@@ -189,19 +189,19 @@ class TestWindows:
         with pytest.raises(RecordingError, match='no window of 60 s at rest'):
             judged(bag, calibration())
 
-    def test_the_user_can_state_the_gravity_of_the_place(self, tmp_path):
+    def test_residuals_use_the_gravity_that_the_user_states(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0)
         judgement = judged(bag, calibration(), gravity=GRAVITY + 1e-3)
         np.testing.assert_allclose(judgement.windows.residual, -1e-3, atol=1e-9)
 
-    def test_several_recordings_are_judged_as_one(self, tmp_path):
+    def test_the_figures_of_several_recordings_are_those_of_all_their_windows(self, tmp_path):
         bags = [
             resting(tmp_path / name, at, error=error)
             for name, at, error in (('one', 19.0, 0.3), ('two', 30.0, -0.3))
         ]
         evaluation = evaluate(bags, [('it', CLAIMING)])
         whole = evaluation.judgements['it'].sections['all']
-        # Residuals of +102 ug in one regime and -102 ug in the other have the mean 0.
+        # Two bags with equal numbers of windows have residuals of +102 and -102 ug: the mean is 0.
         assert whole.n == sum(judged(bag, CLAIMING).sections['all'].n for bag in bags)
         assert whole.mean / MICRO_G == pytest.approx(0.0, abs=0.5)
         assert whole.rms == pytest.approx(0.3 / K, rel=1e-3)
@@ -213,7 +213,7 @@ class TestWindows:
         (note,) = evaluate([good, short], [('it', CLAIMING)]).notes
         assert note.startswith(f'{short}: no window of 60 s at rest')
 
-    def test_a_report_that_judges_nothing_does_not_count_as_valid(self, tmp_path, cli):
+    def test_a_report_on_a_recording_without_a_rest_has_exit_code_1(self, tmp_path, cli):
         short = resting(tmp_path / 'short', 25.0, minutes=0.5)
         save_calibration(CLAIMING, tmp_path / 'unit.yaml')
         options = '-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'report.html'
@@ -237,8 +237,7 @@ class TestVerdict:
             (121.0, 1000.0, 60.0, 'recalibrate'),
             (1100.0, 9000.0, 1500.0, 'valid, but it only claims 1.5 mg'),
             (50.0, 100.0, 60.0, 'valid, but it only claims 60 ug'),
-            # A calibration whose residual is not below the raw residual is not valid, whatever it
-            # claims.
+            # A residual not below the raw one is never valid, even with a large claimed sd.
             (1100.0, 1000.0, 1500.0, 'no better than raw'),
             (1000.0, 1000.0, 1500.0, 'no better than raw'),
         ],
@@ -255,8 +254,8 @@ class TestVerdict:
     @pytest.mark.parametrize(
         ('residual', 'raw', 'claimed', 'verdict'),
         [
-            (90.0, 1000.0, 10.0, 'valid'),  # error 9 times the claimed sd, within the tolerance
-            (110.0, 1000.0, 200.0, 'recalibrate'),  # error within the claimed sd only
+            (90.0, 1000.0, 10.0, 'valid'),  # above the claimed sd, below the tolerance of 100 ug
+            (110.0, 1000.0, 200.0, 'recalibrate'),  # below the claimed sd, above the tolerance
             (90.0, 1000.0, 200.0, 'valid, but it only claims 200 ug'),
             (90.0, 80.0, 60.0, 'no better than raw'),
         ],
@@ -266,8 +265,8 @@ class TestVerdict:
         assert judgement.verdict == verdict
         assert 'limit 100 ug' in judgement.reason
 
-    def test_the_headline_for_bags_of_the_fit_is_the_left_out_error(self):
-        # WHY: the error was 61 ug in the attitudes of the fit, 1091 ug in a new attitude.
+    def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
+        # WHY: the verdict stated 61 ug, the error in fitted attitudes; in others it was 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -278,14 +277,14 @@ class TestVerdict:
         assert seen.reason.startswith(
             '300 ug RMS of |f| - g on positions left out; in sample 50 ug RMS of |f| - g, 1 mg raw'
         )
-        # The claimed sd limits the error in sample, a tolerance the error of left-out positions.
+        # The in-sample error is judged by the claimed sd, the left-out error by a tolerance.
         assert seen.verdict == unseen.verdict == 'valid'
         limited = judge(windows, unit, 100.0 * MICRO_G, is_seen=True)
         assert limited.verdict == 'recalibrate'
         assert '300 ug RMS on positions left out, limit 100 ug' in limited.reason
         assert judge(windows, unit, 100.0 * MICRO_G).verdict == 'valid'
 
-    def test_a_bag_of_the_fit_is_known_by_its_hash(self, tmp_path):
+    def test_a_bag_of_the_fit_is_recognised_by_its_hash(self, tmp_path):
         bag = resting(tmp_path / 'bag', 25.0)
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=3e-4)
         for sha256, expected in ((digest(bag), 3e-4), ('0' * 64, np.nan)):
@@ -295,7 +294,7 @@ class TestVerdict:
             assert judgement.left_out_rms == pytest.approx(expected, nan_ok=True)
 
     def test_a_calibration_without_covariance_gets_the_verdict_no_claim(self):
-        # WHY: an imported calibration without covariance was judged by noise alone, as wrong.
+        # WHY: without a covariance only noise was claimed, so the verdict was 'recalibrate'.
         imported = corrected_by(SLOPE)
         windows = made(50.0, 1000.0, 2.0)
         judgement = judge(windows, imported)
@@ -312,7 +311,7 @@ class TestVerdict:
         worse = windows.force.copy()
         worse[:10, 2] = GRAVITY + 150.0 * MICRO_G
         windows = dataclasses.replace(windows, force=worse)
-        # RMS of the residual: 84 ug in all windows, 60 ug claimed, 150 ug in the dynamic regime.
+        # Residuals: 150 ug in the dynamic regime, 84 ug RMS in all windows. Claimed sd: 60 ug.
         judgement = judge(windows, CLAIMING)
         assert judgement.sections['all'].ratio < 2.0
         assert judgement.verdict == 'recalibrate'
@@ -327,7 +326,7 @@ class TestVerdict:
         assert found.sections['all'].n == 30
         assert found.sections['outside'].n == 10
         assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
-        # Residuals inside the ranges decide the verdict; windows outside alone give no verdict.
+        # Only windows inside the ranges decide the verdict; without them there is no verdict.
         bad = windows.force.copy()
         bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
         found = judge(dataclasses.replace(windows, force=bad), CLAIMING)
@@ -341,10 +340,10 @@ class TestVerdict:
         _, upper = CLAIMING.static.temperature_range_c
         judgement = judged(resting(tmp_path / 'out', upper + 2.0), CLAIMING)
         assert judgement.kind is Verdict.OUTSIDE
-        # WHY: the message named only temperatures for windows outside the calibrated rates.
+        # WHY: the message named temperatures only, also for windows outside the range of rates.
         assert '+0.00 K/min; calibrated at 5.0 to 35.0 degC and -1.00 to +1.00' in judgement.reason
         assert f'at {upper + 2.0:.1f} to {upper + 2.0:.1f} degC' in judgement.reason
-        # A soak 0.01 K beyond the range counts as inside: 0.01 K may be the thermometer's noise.
+        # A soak 0.01 K above the range counts as inside, because thermometer noise may be 0.01 K.
         edge = judged(resting(tmp_path / 'edge', upper + 0.01), CLAIMING)
         assert edge.sections['outside'].n == 0
 
@@ -365,7 +364,7 @@ class TestShifts:
     @pytest.mark.parametrize('n', [6, 18])
     def test_changed_parameters_are_named(self, n):
         moved = around(n, (20.0 * MICRO_G, 0.0, 0.0), (0.0, 30e-6, 0.0), noise=0.5 * MICRO_G)
-        # 12 windows per position with 0.5 ug of noise determine shifts far below 20 ug and 30 ppm.
+        # 12 windows per position with a noise of 0.5 ug determine bias to 1 ug, scale to 1.5 ppm.
         judgement = judge(moved, corrected_by(SLOPE, 1e-5), None)
         assert judgement.n_positions >= min(n, 12)
         assert judgement.shifts[0].bias / MICRO_G == pytest.approx(20.0, abs=1.0)
@@ -376,7 +375,7 @@ class TestShifts:
         assert '; shifted: x bias +' in judgement.reason
 
     def test_a_large_shift_is_written_without_an_exponent(self):
-        # WHY: the verdict had an sd with an exponent, `x bias +829 +- 1.3e+02 ug`.
+        # WHY: the message was `x bias +829 +- 1.3e+02 ug`.
         big = AxisShift(829.4 * MICRO_G, 129.2 * MICRO_G, 0.0, 1.0)
         small = AxisShift(-1.234 * MICRO_G, 0.0567 * MICRO_G, 0.0, 1.0)
         assert change_texts((big, small)) == ('x bias +829 +- 129 ug', 'y bias -1.234 +- 0.057 ug')
@@ -387,7 +386,7 @@ class TestShifts:
         judgement = judge(around(5, (0.0,) * 3, (0.0,) * 3), CLAIMING)
         assert (judgement.shifts, judgement.n_positions) == ((), 5)
 
-    def test_the_drift_of_an_axis_is_about_its_mean_in_a_position(self):
+    def test_the_drift_of_an_axis_is_the_deviation_from_its_mean_in_a_position(self):
         windows = made(0.0, 1000.0, 60.0, n=40, dynamic=20)
         force = windows.force.copy()
         force[:20, 0] += 3e-5 * np.where(np.arange(20) % 2, 1.0, -1.0)
@@ -396,7 +395,7 @@ class TestShifts:
 
 
 def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(root, tmp_path):
-    """Exchanged thermometers, or a temperature outside the calibrated range, give no verdict."""
+    """Exchanged thermometers make a verdict invalid; temperatures out of range give a note."""
     exchanged = Topics(board='temperature/case', case='temperature/board')
     for topics, text in ((Topics(), []), (exchanged, [SWAPPED])):
         bag = root / 'bags' / 'held_out.mcap'
@@ -412,16 +411,16 @@ def test_evaluate_reports_exchanged_thermometers_and_temperatures_out_of_range(r
     assert note == f'board temperature +2.00 K {CONTINUED}'
 
 
-def test_an_axis_that_is_dead_in_a_rest_is_named(tmp_path):
-    # WHY: the norm of a unit at rest hardly shows an axis across gravity, and a bag with an axis
-    # that repeated one number for an hour was judged as valid.
+def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
+    # WHY: a level axis hardly changes |f|, and a bag whose y axis repeated one number for an hour
+    # was judged as valid.
     bag = resting(tmp_path / 'dead.mcap', 20.0, noise=5.0, dead='y')
     density = (5.0 / K * np.sqrt(0.1),) * 3
     noisy = corrected_by(SLOPE, noise_density_m_s2_sqrt_hz=density)
     noisy = dataclasses.replace(noisy, unit=dataclasses.replace(noisy.unit, cycle_time_s=0.1))
     with pytest.raises(RecordingError, match=r'dead\.mcap: y reads exactly 0 for 0\.'):
         judged(bag, noisy)
-    # An axis whose noise is below the step of the converter may repeat one number.
+    # An axis whose noise is below the step of the converter may repeat values: it is not reported.
     assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))
 
 

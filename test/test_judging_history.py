@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The history of a unit agrees with covariances by hand; all commands give the same verdict."""
+"""Changes between calibrations of a unit are right; `evaluate` and `report` agree."""
 
 import dataclasses
 import json
@@ -36,9 +36,8 @@ def dated(created, bias_ug=0.0, ppm=0.0, sd_ug=3.0):
     return dataclasses.replace(unit, provenance=provenance)
 
 
-def test_changes_between_calibrations_and_their_sd_by_hand():
-    # The later calibration is given first, but the dates give the order. Sd of 3 and 4 ug combine
-    # to 5 ug.
+def test_changes_between_calibrations_and_their_sd_equal_those_found_by_hand():
+    # The later calibration is given first, but dates give the order; 3 and 4 ug combine to 5 ug.
     drifts = drifts_of(history_of([dated('2026-02-01', 20.0, 50.0, 4.0), dated('2026-01-01')]))
     assert [drift.constant for drift in drifts] == [
         *('bias x', 'bias y', 'bias z', 'scale x', 'scale y', 'scale z')
@@ -54,7 +53,7 @@ def test_changes_between_calibrations_and_their_sd_by_hand():
         assert not change.is_sure
 
 
-def test_calibrations_that_are_no_history_give_no_drift():
+def test_calibrations_that_do_not_form_a_history_give_no_drift():
     unit = dated('2026-01-01')
     # A single calibration, models of the same bags, or another unit do not form a history.
     other = dataclasses.replace(unit, unit=dataclasses.replace(unit.unit, serial='other'))
@@ -66,7 +65,7 @@ def test_calibrations_that_are_no_history_give_no_drift():
     assert not any(drift.is_sure for drift in silent)
 
 
-def test_commands_print_the_history(cli, tmp_path, monkeypatch):
+def test_evaluate_and_report_print_the_history(cli, tmp_path, monkeypatch):
     undrawn = 'thermo_comp.report.page.drawn_figures'
     monkeypatch.setattr(undrawn, lambda figures: [(figure, '') for figure in figures])
     now = fitted().calibration
@@ -118,7 +117,7 @@ def test_evaluate_and_report_give_equal_verdicts(cli, folder, options):
         assert ours[name] == theirs[name], name
     assert printed.returncode == other.returncode == (0 if ours['is_valid'] else 1)
     assert ours['window_s'] == float(options[3] if options else 60)
-    # The report's page shows the figures of `evaluate`, for windows of the same length.
+    # The page of the report shows the figures of `evaluate`, from windows of the same length.
     text = page.read_text(encoding='utf-8')
     assert f'means over {ours["window_s"]:g} s' in text
     assert ours['verdict'].replace(' ug', ' µg') in text

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Jumps at rest are found with time and size; turns, motions and knocks are not jumps."""
+"""Jumps of the bias at rest are found; turns, motions and shocks are not taken for jumps."""
 
 from dataclasses import replace
 
@@ -19,14 +19,14 @@ def look(rest, **keys):
     return find_jumps(bag)
 
 
-def test_a_quiet_rest_has_no_jump(rng):
+def test_no_jump_is_found_in_an_undisturbed_rest(rng):
     assert look(Rest(rng)) == ()
 
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('sd', [0.05, 0.1, 0.2, 0.5])
-def test_steps_of_a_coarse_converter_are_no_jumps(rng, sd):
-    # WHY: samples that are mostly equal at rest ended in a division by zero.
+def test_steps_of_a_coarse_converter_are_not_taken_for_jumps(rng, sd):
+    # WHY: a rest in which most samples were equal ended in a division by zero.
     rest = Rest(rng, sd=4.0 * sd * MG)
     drift = 20.0 * MG * np.linspace(0.0, 1.0, len(rest.accel))
     rest.accel = np.rint((rest.accel + drift[:, np.newaxis]) / (4.0 * MG)) * 4.0 * MG
@@ -34,25 +34,25 @@ def test_steps_of_a_coarse_converter_are_no_jumps(rng, sd):
 
 
 @pytest.mark.parametrize('with_gyro', [False, True])
-def test_jump_along_gravity(rng, with_gyro):
+def test_time_and_size_of_a_jump_along_gravity_are_found(rng, with_gyro):
     rest = Rest(rng)
     rest.add((2.0 * MG, 0.0, 20.0 * MG), from_s=301.0)
     (event,) = look(rest, with_gyro=with_gyro)
-    # The jump happens within one sample interval, which `find_jumps` locates.
+    # The jump is between two samples, and `find_jumps` returns the interval between these samples.
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
     assert event.duration_s == pytest.approx(1.0 / rest.rate_hz, rel=1e-6)
-    # 250 samples with 3 mg on each side: sd of the step 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
+    # Trends through 250 samples (noise 3 mg) per side: sd 2 * 3 mg * sqrt(2 / 250); limit 4 sd.
     np.testing.assert_allclose(np.array(event.step) / MG, (2.0, 0.0, 20.0), atol=2.2)
     assert event.along / MG == pytest.approx(20.0, abs=2.2)
-    # 20 readings (noise 20 mK) on each side: sd of the temperature jump 2 * 0.02 * sqrt(2 / 20).
+    # Trends through 20 readings (noise 20 mK) per side: sd 2 * 0.02 K * sqrt(2 / 20).
     assert event.temperature_change_sd == pytest.approx(0.0126, rel=0.4)
     assert abs(event.temperature_change) < 4.0 * event.temperature_change_sd
 
 
 @pytest.mark.parametrize('rate_hz', [0.5, 2.0, 5.0])
-def test_jump_in_a_slow_log(rng, rate_hz):
-    # WHY: the gap between the rests around a jump is 120 samples, 60 s at 2 Hz, above the limit of
-    # 30 s.
+def test_a_jump_is_found_at_low_sample_rates(rng, rate_hz):
+    # WHY: at 2 Hz the gap of 120 samples between the rests before and after a jump was 60 s, above
+    # the limit of 30 s, so the jump was not found.
     rest = Rest(rng, duration_s=8000.0 / rate_hz, rate_hz=rate_hz, pace_s=4000.0)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=4000.0 / rate_hz)
     source = rest.source()
@@ -71,14 +71,14 @@ def turned(rest, from_s, angle, with_rate):
 
 @pytest.mark.parametrize('seen', [True, False])
 def test_a_turn_is_recognised_by_the_gyroscope(rng, seen):
-    # A turn by 20 mrad in one sample does not change the norm, so only a gyroscope shows it.
+    # A turn by 20 mrad within one sample does not change |f|: only the gyroscope observes it.
     rest = Rest(rng)
     turned(rest, 250.0, 0.02, with_rate=seen)
     events = look(rest, with_gyro=True)
     assert [round(event.time) for event in events] == ([] if seen else [250])
 
 
-def test_without_a_gyroscope_a_turn_is_no_jump(rng):
+def test_without_a_gyroscope_a_turn_is_not_taken_for_a_jump(rng):
     rest = Rest(rng)
     turned(rest, 250.0, 0.02, with_rate=False)
     assert look(rest) == ()
@@ -87,7 +87,7 @@ def test_without_a_gyroscope_a_turn_is_no_jump(rng):
 @pytest.mark.parametrize(
     ('end', 'sd', 'step'), [(312.0, 200.0 * MG, (50.0, 0, 0)), (360.0, GRAVITY, (0, 0, 20.0))]
 )
-def test_a_change_during_a_motion_is_no_jump(rng, end, sd, step):
+def test_a_change_during_a_motion_is_not_taken_for_a_jump(rng, end, sd, step):
     rest = Rest(rng)
     rows = (rest.time > 300.0) & (rest.time < end)
     rest.accel[rows] += sd * rng.standard_normal((rows.sum(), 3))
@@ -95,13 +95,13 @@ def test_a_change_during_a_motion_is_no_jump(rng, end, sd, step):
     assert look(rest) == ()
 
 
-def test_a_bump_of_two_seconds_is_no_jump(rng):
+def test_a_disturbance_of_two_seconds_is_not_taken_for_a_jump(rng):
     rest = Rest(rng)
     rest.add((0.0, 0.0, 40.0 * MG), from_s=300.0, to_s=302.0)
     assert look(rest) == ()
 
 
-def test_jumps_do_not_depend_on_the_blocks(rng):
+def test_jumps_do_not_depend_on_the_lengths_of_blocks(rng):
     rest = Rest(rng)
     rest.add((0.0, 5.0 * MG, 20.0 * MG), from_s=300.0)
     whole = look(rest)
@@ -109,7 +109,7 @@ def test_jumps_do_not_depend_on_the_blocks(rng):
     assert len(whole) == 1
 
 
-def test_drift_with_temperature_is_no_step(rng):
+def test_drift_with_temperature_is_not_taken_for_a_jump(rng):
     # The bias changes by 2 mg/K, at up to 6 K/min.
     rest = Rest(rng)
     rest.accel[:, 2] += 2.0 * MG * (rest.temperature(rest.time) - 20.0)
@@ -124,20 +124,20 @@ def behind_a_low_pass(rng, rest, tau_s, sd):
 
 
 @pytest.mark.parametrize('tau_s', [0.1, 0.5, 1.0, 3.0])
-def test_noise_behind_a_low_pass_is_one_rest_without_a_jump(rng, tau_s):
-    # WHY: low-pass filtered samples counted as independent: one rest became 8 to 37 rests.
+def test_low_pass_filtered_noise_gives_one_rest_without_a_jump(rng, tau_s):
+    # WHY: low-pass filtered samples were taken for independent: one rest became 8 to 37 rests.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
     bag = reduce_source(rest.source(), full_scale=None)
     assert len(bag.intervals) == 1
     assert find_jumps(bag) == ()
-    # With the true scatter of the samples the whole interval is at rest, except for its ends.
+    # At most 2 % of the cells, those at the ends of the rest, may count as motion.
     assert bag.n_still_cells > 0.98 * bag.n_cells
 
 
 @pytest.mark.parametrize(('tau_s', 'sd'), [(0.1, 1.0), (0.5, 3.0), (1.0, 3.0), (3.0, 3.0)])
-def test_a_jump_in_noise_behind_a_low_pass_is_found(rng, tau_s, sd):
-    # WHY: means over 10 s keep coloured noise of 3 mg, so jumps of 20 mg were missed.
+def test_a_jump_in_low_pass_filtered_noise_is_found(rng, tau_s, sd):
+    # WHY: means over 10 s hardly reduce the correlated noise of 3 mg: jumps of 20 mg were missed.
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, sd * MG)
     rest.add((0.0, 0.0, 20.0 * MG), from_s=301.0)
@@ -145,13 +145,13 @@ def test_a_jump_in_noise_behind_a_low_pass_is_found(rng, tau_s, sd):
     assert len(bag.intervals) == 2
     (event,) = find_jumps(bag)
     assert event.time == pytest.approx(301.0, abs=1.5 / rest.rate_hz)
-    # The limit is 4 sd of the innovation of a sample, which does not depend on earlier samples.
+    # `new` is the sd of the part of a sample that does not depend on earlier samples.
     new = sd * np.sqrt(1.0 - np.exp(-2.0 / (rest.rate_hz * tau_s)))
     assert event.along / MG == pytest.approx(20.0, abs=4.0 * new)
 
 
 @pytest.mark.parametrize('tau_s', [0.5, 3.0])
-def test_a_shock_that_the_low_pass_lets_die_away_is_no_jump(rng, tau_s):
+def test_a_shock_that_decays_behind_a_low_pass_is_not_taken_for_a_jump(rng, tau_s):
     rest = Rest(rng)
     behind_a_low_pass(rng, rest, tau_s, 3.0 * MG)
     since = rest.time - 301.0
@@ -159,7 +159,7 @@ def test_a_shock_that_the_low_pass_lets_die_away_is_no_jump(rng, tau_s):
     assert find_jumps(reduce_source(rest.source(), full_scale=None)) == ()
 
 
-def test_bag_without_neighbours_is_not_read_again(rng):
+def test_a_bag_with_one_rest_is_not_read_a_second_time(rng):
     n_passes = 0
     source = Rest(rng).source()
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files name existing arguments, executables, parameters and topics."""
+"""Arguments, executables, parameters and topics in the launch files exist."""
 
 import configparser
 import re
@@ -16,7 +16,7 @@ FILES = sorted((ROOT / 'launch').glob('*.launch.xml'))
 OURS = ROOT / 'launch' / 'thermo_comp.launch.xml'
 BESIDE = ROOT / 'launch' / 'beside_ins.launch.xml'
 
-# Parameters of other packages' nodes, from the Jazzy sources: a node ignores a misspelt name.
+# Parameters of nodes of other packages in ROS Jazzy. A misspelt parameter would have no effect.
 OTHERS = {
     ('tf2_ros', 'static_transform_publisher'): set(),
     ('imu_filter_madgwick', 'imu_filter_madgwick_node'): {
@@ -61,7 +61,7 @@ class TestEveryFile:
 
 
 def parameters_set(arguments):
-    """Return the parameters that our launch file sets, with substitutions evaluated by launch."""
+    """Return the parameters that thermo_comp.launch.xml sets for these arguments."""
     given = {arg.get('name', ''): arg.get('default', '') for arg in parse(OURS).findall('arg')}
     given |= arguments
 
@@ -76,14 +76,14 @@ def parameters_set(arguments):
     return {value(tag.get('name', '')): value(tag.get('value', '')) for tag in elements}
 
 
-def test_a_driver_is_a_file_of_topics():
+def test_each_driver_of_the_launch_file_has_a_topics_file():
     parameters = parameters_set({'driver': 'xsens'})
     assert parameters['topics'] == str(ROOT / 'config/drivers/xsens.yaml')
     assert 'topics' not in parameters_set({})
 
 
 def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
-    # WHY: defaults of launch arguments replaced the values of the user's parameter file.
+    # WHY: defaults of launch arguments replaced values in the user's parameter file.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     import rclpy
     import yaml
@@ -105,7 +105,7 @@ def test_a_parameter_is_set_only_where_its_argument_was_given(tmp_path):
     some = [{}, {'frame_id': 'body'}, {'serial': '0042', **counts}]
     for arguments in some:
         files = []
-        # Launch passes the user's file first, then the values of the launch file.
+        # ros2 launch passes the user's file first, then the values of the launch file.
         for name, values in (('mine', mine), ('launch', parameters_set(arguments))):
             path = tmp_path / f'{name}.yaml'
             path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
@@ -143,26 +143,26 @@ def test_executable_parameters_and_topics_of_a_launch_file_exist():
     defaults = {arg.get('name'): arg.get('default') for arg in parse(OURS).findall('arg')}
     for remap in node.findall('remap'):
         topic = remap.get('from')
-        # Temperature topics are named after the sensors.
+        # The topic of a thermometer is temperature/ and its name.
         assert topic in topics or topic.startswith('temperature/'), topic
         argument = re.fullmatch(r'\$\(var (\w+)\)', remap.get('to', ''))
         assert defaults[argument[1]] == topic
 
 
-def test_beside_ins_gives_declared_arguments_to_the_included_file():
+def test_the_launch_file_beside_ins_passes_declared_arguments():
     (include,) = parse(BESIDE).findall('include')
     assert include.get('file', '').endswith(OURS.name)
     assert {element.get('name') for element in include.findall('arg')} <= declared(parse(OURS))
 
 
-def test_beside_ins_names_parameters_that_other_nodes_have():
+def test_the_launch_file_beside_ins_sets_existing_parameters_of_other_nodes():
     nodes = {(node.get('pkg'), node.get('exec')): node for node in parse(BESIDE).findall('node')}
     assert set(nodes) == set(OTHERS)
     for key, node in nodes.items():
         assert {element.get('name') for element in node.findall('param')} <= OTHERS[key]
 
 
-def test_beside_ins_subtracts_gravity_once_and_gives_each_frame_one_parent():
+def test_in_beside_ins_one_node_subtracts_gravity_and_each_frame_has_one_parent():
     nodes = {element.get('exec'): element for element in parse(BESIDE).findall('node')}
     given = {
         name: {arg.get('name'): arg.get('value') for arg in nodes[name].findall('param')}

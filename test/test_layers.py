@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Packages import from lower layers only; a heavy library is imported by certain packages only."""
+"""Packages import from lower layers only; certain libraries are imported by few packages only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from conftest import ran
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
-# Layer of each package (a folder, or a module in the root), which imports lower layers only.
+# Layer of each package (a folder or file in thermo_comp): a package imports lower layers only.
 LAYERS = {
     '__init__': 0,  # public names, imported for type checkers
     'errors': 0,
@@ -42,7 +42,7 @@ LAYERS = {
     '__main__': 6,
 }
 
-# Packages that may import a library; libraries not listed may be imported anywhere.
+# The packages that may import each library; any package may import a library not listed here.
 ROS = ['rclpy', 'rcl_interfaces', 'sensor_msgs', 'geometry_msgs', 'std_msgs', 'diagnostic_msgs']
 HOMES = {
     **{name: {'ros'} for name in ROS}, 'rosgraph_msgs': {'ros'}, 'builtin_interfaces': {'ros'},
@@ -122,7 +122,7 @@ def test_packages_import_from_lower_layers_only(path):
 
 @cache
 def own_file(name):
-    """Return the file of this package that an absolute name is imported from, as a dotted name."""
+    """Return the file of thermo_comp that contains an imported absolute name, as a dotted name."""
     parts = name.split('.')[1:]
     while parts:
         path = PACKAGE.joinpath(*parts)
@@ -144,8 +144,8 @@ def circle(uses):
 
 
 @pytest.mark.parametrize('by', ['package', 'file'])
-def test_no_packages_or_files_import_each_other(by):
-    # Neither two packages nor two files may import each other, except for type annotations.
+def test_imports_between_packages_and_between_files_form_no_circle(by):
+    # Imports for type annotations only may form circles, as they are not executed.
     uses = {}
     for path in SOURCES:
         text = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)
@@ -164,23 +164,23 @@ def loaded_after(statement, *watched):
     return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
 
-def test_the_node_loads_none_of_the_offline_libraries():
-    # Libraries for fits or plots would cost the node memory and start-up time.
+def test_the_node_imports_none_of_the_offline_libraries():
+    # Libraries for fits or plots would increase the memory and the start-up time of the node.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     offline = ('rosbags', 'mcap', 'matplotlib', 'scipy', 'scipy.optimize', 'typer', 'rich')
     assert loaded_after('import thermo_comp.ros.node', *offline) == []
 
 
-def test_help_loads_none_of_the_heavy_libraries():
+def test_help_imports_none_of_the_heavy_libraries():
     heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
 
 
-def test_inspecting_a_bag_loads_no_fit():
+def test_the_command_info_does_not_import_the_fit():
     heavy = ('scipy', 'matplotlib', 'pydantic', 'rosbags', 'rclpy', 'thermo_comp.fitting')
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
 
 
-def test_the_compensator_imports_no_ros_and_no_bag_libraries():
+def test_the_compensator_imports_neither_ros_nor_libraries_for_bags():
     statement = 'import thermo_comp.online.compensator'
     assert loaded_after(statement, 'rclpy', 'rosbags', 'mcap', 'matplotlib', 'scipy') == []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every path in the layouts of the viewers leads to a number in a replayed bag."""
+"""Every curve in the layouts for Foxglove and PlotJuggler names a number in a replayed bag."""
 
 import json
 import re
@@ -22,7 +22,7 @@ from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 FOXGLOVE = ROOT / 'config' / 'thermo_comp.foxglove.json'
 PLOTJUGGLER = ROOT / 'config' / 'plotjuggler_layout.xml'
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-# Only the live node publishes diagnostics; the panels for them are empty for a replayed bag.
+# A replayed bag has no diagnostics, which only the node publishes.
 LIVE_ONLY = {'/diagnostics'}
 
 
@@ -53,7 +53,7 @@ def topics(tmp_path_factory):
 
 
 def field_kind(message, fields):
-    """Follow field names through message definitions; return the type of the last one."""
+    """Look up nested fields in the message definitions; return the type of the last field."""
     name = message
     for part in fields:
         field, _, index = part.partition('[')
@@ -81,7 +81,7 @@ def script():
     return only['sourceCode']
 
 
-def test_foxglove_paths_lead_to_numbers(topics):
+def test_foxglove_paths_name_numbers_in_the_messages(topics):
     used = set()
     (output,) = re.findall(r'export const output = "(.*)"', script())
     fields_of_script = re.findall(r'(\w+): number', re.search(r'type Output = .*', script())[0])
@@ -93,11 +93,11 @@ def test_foxglove_paths_lead_to_numbers(topics):
         else:
             assert field_kind(topics[topic], fields) in ('float64', 'bool')
         used.add(topic)
-    # `regime/stamped` has the same flags as `regime/dynamic`, and viewers show both at one time.
+    # The layout shows `regime/dynamic`, so it need not show the same flags of `regime/stamped`.
     assert used == {output, *topics} - {'/regime/stamped'}
 
 
-def test_foxglove_script_and_diagnostics_name_topics_that_exist(topics):
+def test_topics_in_the_foxglove_script_and_diagnostics_panels_exist(topics):
     (inputs,) = re.findall(r'export const inputs = (\[.*\])', script())
     assert set(json.loads(inputs)) <= set(topics)
     rendered = {p['topicToRender'] for p in panels().values() if 'topicToRender' in p}
@@ -120,14 +120,14 @@ def plotjuggler():
 def source_kind(topics, series):
     topic = max((t for t in topics if series.startswith(f'{t}/')), key=len)
     fields = series[len(topic) + 1 :].split('/')
-    # PlotJuggler writes an element of a covariance as a field [row;column].
+    # PlotJuggler names an entry of a covariance [row;column]; messages number entries from 0 to 8.
     if match := re.fullmatch(r'\[([012]);([012])\]', fields[-1]):
         place = 3 * int(match[1]) + int(match[2])
         fields = [*fields[:-2], f'{fields[-2]}[{place}]']
     return field_kind(topics[topic], fields)
 
 
-def test_plotjuggler_curves_lead_to_numbers(topics):
+def test_plotjuggler_curves_name_numbers_in_the_messages(topics):
     root = plotjuggler()
     snippets = {snippet.get('name'): snippet for snippet in root.iter('snippet')}
     curves = {curve.get('name') for curve in root.iter('curve')}
@@ -147,9 +147,8 @@ def test_plotjuggler_splitters_have_the_right_number_of_panels():
 @pytest.mark.parametrize(
     ('name', 'expected'),
     [
-        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes: the rate is 1.7 K/min at 60 min, and
-        # 1.68 K/min behind two lags of 30 s (sampled at 1 Hz); the second derivative is
-        # 0.02 K/min^2.
+        # T = 20 + 0.5 m + 0.01 m^2 with m in minutes has a rate of 1.7 K/min at 60 min, or 1.68
+        # K/min after two low-passes of 30 s, and a second derivative of 0.02 K/min^2.
         ('/thermo_comp/board_k_min', 1.68),
         ('/thermo_comp/case_k_min', 1.68),
         ('/thermo_comp/case_k_min2', 0.02),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal memory agrees with closed forms: lags of ramps and steps, plays, unknown starts."""
+"""Lags, play operators and priors of initial lag states agree with closed formulas."""
 
 import math
 
@@ -16,8 +16,8 @@ TAUS = (60.0, 900.0, 7680.0)
 
 
 @pytest.mark.parametrize('step_s', [0.5, 5.0, 77.0])
-def test_a_lag_of_a_ramp(step_s):
-    # A ramp u = r t from rest gives u - L = r tau (1 - exp(-t / tau)) for any interval.
+def test_the_lag_of_a_ramp_agrees_with_the_closed_formula(step_s):
+    # For a ramp u = r t from rest, u - lagged u = r tau (1 - exp(-t / tau)), at any interval.
     rate, n = 0.01, 200
     bank = LagBank(TAUS)
     for k in range(n + 1):
@@ -29,8 +29,9 @@ def test_a_lag_of_a_ramp(step_s):
     assert (max(extra) > 0.0) == (step_s > 6.0)
 
 
-def test_a_lag_of_a_step():
-    # The input rises from 0 to 5 K in 1 ms, and is then constant: u - L = 5 exp(-t / tau).
+def test_the_lag_of_a_step_agrees_with_the_closed_formula():
+    # The input u rises from 0 to 5 K in 1 ms and is then constant: u - lagged u is
+    # 5 exp(-t / tau).
     bank = LagBank(TAUS)
     bank.step(0, 0.0)
     bank.step(1_000_000, 5.0)
@@ -41,17 +42,17 @@ def test_a_lag_of_a_step():
     assert extra == [0.0] * len(TAUS)
 
 
-def test_a_value_at_the_same_stamp_replaces_the_last_one():
+def test_a_value_with_the_last_stamp_replaces_the_last_value():
     bank = LagBank((100.0,))
     bank.step(0, 1.0)
     bank.step(0, 3.0)
     assert bank.at(0, 3.0)[0] == [2.0]
 
 
-def test_the_variance_of_a_lag_by_hand():
+def test_the_variance_of_a_lag_after_a_gap_agrees_with_the_formula():
     bank = LagBank((100.0, 1000.0))
     bank.step(0, 0.0)
-    # A gap of 50 s is more than a tenth of the time constant 100 s, but not of 1000 s.
+    # A gap of 50 s adds variance to the lag of 100 s, as it exceeds 1/10 of the time constant.
     bank.step(50 * SECOND_NS, 2.0)
     lost = 2.0 * (1.0 - math.exp(-0.5))
     assert bank.extra == pytest.approx([lost**2, 0.0])
@@ -61,7 +62,7 @@ def test_the_variance_of_a_lag_by_hand():
     assert bank.extra == pytest.approx([lost**2 + 9.0, 9.0])
 
 
-def test_a_constant_error_of_readings_becomes_the_error_of_a_lag():
+def test_a_constant_error_of_readings_gives_an_equal_error_of_the_lag():
     bank = LagBank((100.0,))
     for second in range(2000):
         bank.step(second * SECOND_NS, 0.0, 0.5 if second else 0.0)
@@ -72,7 +73,7 @@ TWO_STAGES = Lag('board', 900.0, 150.0)
 
 
 def after_two_stages(times, board):
-    """Integrate a part that lags another part, which lags the board, at rest at the start."""
+    """Integrate two lags in series after the board, from rest; return the second temperature."""
 
     def slope(t, parts):
         u = np.interp(t, times, board)
@@ -84,7 +85,7 @@ def after_two_stages(times, board):
     return solved.y[1]
 
 
-def test_a_lag_of_two_stages_is_that_of_two_parts_in_series(rng):
+def test_a_lag_of_two_stages_equals_two_parts_in_series(rng):
     times = np.arange(0.0, 7200.0, 30.0)
     board = 20.0 + np.cumsum(0.2 * rng.standard_normal(len(times)))
     spec = MemorySpec(lags=(TWO_STAGES, ('case', 900.0, 150.0)), plays=((900.0, 0.4, 150.0),))
@@ -97,7 +98,7 @@ def test_a_lag_of_two_stages_is_that_of_two_parts_in_series(rng):
         streamed.append(memory.at(stamp, celsius, [celsius]))
     streamed = np.array(streamed)
     part = after_two_stages(times, board)
-    # The solver steps over the corners of the input, with an error of some microkelvin.
+    # The solver has an error of some uK, because it steps over the corners of the input.
     np.testing.assert_allclose(streamed[:, 0], board - part, atol=1e-5)
     np.testing.assert_allclose(streamed[:, 2], part, atol=1e-5)
     assert np.abs(streamed[:, 4]).max() <= 0.4 + 1e-12
@@ -109,7 +110,7 @@ def test_a_lag_of_two_stages_is_that_of_two_parts_in_series(rng):
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
 
 
-def test_the_lag_of_a_part_between_board_and_sensor(rng):
+def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
     times = np.arange(0.0, 7200.0, 30.0)
     board, case = 20.0 + np.cumsum(0.2 * rng.standard_normal((2, len(times))), axis=1)
     lag = Lag('board', 900.0, 150.0, 'case', 0.4)
@@ -126,10 +127,10 @@ def test_the_lag_of_a_part_between_board_and_sensor(rng):
     np.testing.assert_allclose(board - streamed[:, 0], part, atol=1e-5)
     on_grid = memory_on_grid(spec, 30.0, board, [case - board])
     np.testing.assert_allclose(on_grid[:, [0, 2, 4]], streamed[:, [0, 2, 4]], atol=1e-9)
-    # The lag of the case has a negative share in the lag of the part.
+    # The case's lag contributes to the part's lag with a negative sign.
     P = start_covariance(spec.lags)
     assert P[0, 1] < 0.0 < P[0, 0] + 2.0 * P[0, 1] + P[1, 1]
-    # A lag of two inputs starts when both inputs have had a first value.
+    # A lag with two inputs begins with the first value of the second input.
     late = ThermalMemory(spec)
     late.board_step(0, 20.0)
     late.banks['case'].step(600 * SECOND_NS, 1.0)
@@ -137,7 +138,7 @@ def test_the_lag_of_a_part_between_board_and_sensor(rng):
 
 
 @pytest.mark.parametrize('second_s', [0.0, 150.0])
-def test_the_lag_of_a_part_behind_a_thermometer_that_lags_the_board(rng, second_s):
+def test_the_lag_of_a_part_agrees_with_a_solver_if_the_thermometer_lags(rng, second_s):
     times = np.arange(0.0, 3600.0, 30.0)
     board = 20.0 + np.cumsum(0.2 * rng.standard_normal(len(times)))
     own = 60.0
@@ -167,7 +168,7 @@ def test_the_lag_of_a_part_behind_a_thermometer_that_lags_the_board(rng, second_
     assert sum(lag.shares) == pytest.approx(lag.by_board)
 
 
-def test_the_unknown_start_of_a_lag_of_two_stages(rng):
+def test_the_prior_of_the_initial_state_of_two_stages_is_that_of_a_random_walk(rng):
     # The board temperature walks at random for 90 min, then is constant.
     D, step, n = 0.005, 6.0, 4000
     tau = np.array([900.0, 150.0])
@@ -178,8 +179,7 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
         parts[:, 0] *= math.exp(-step / tau[0])
         parts[:, 1] += (parts[:, 0] - parts[:, 1]) * -math.expm1(-step / tau[1])
     P = start_covariance([TWO_STAGES])
-    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; a step of 6 s is 4 % of the stage of
-    # 150 s.
+    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; steps are 4 % of 150 s.
     assert np.mean(parts[:, 1] ** 2) == pytest.approx(P[0, 0], rel=0.11)
     for age in (150.0, 900.0, 2700.0):
         first = parts[:, 0] * math.exp(-age / tau[0])
@@ -190,12 +190,12 @@ def test_the_unknown_start_of_a_lag_of_two_stages(rng):
         assert b < 0.0 < share < 1.0
 
 
-def test_the_error_of_a_second_stage_adds_the_errors_of_two_stages():
+def test_a_jump_gives_a_lag_of_two_stages_the_errors_of_both_stages():
     memory = ThermalMemory(MemorySpec(lags=(TWO_STAGES,)))
     memory.board_step(0, 0.0)
     memory.note_jump(2.0)
-    # Factor 1.4 = (900 s + 150 s) / (900 s - 150 s): the errors of the two stages of 900 s and
-    # 150 s may have opposite signs.
+    # The lag is a difference of two first-order lags: (900 * lag_900 - 150 * lag_150) / 750. Their
+    # errors may have opposite signs: 1.4 = (900 + 150) / (900 - 150).
     assert memory.at(0, 0.0, [0.0])[1] == pytest.approx((2.0 * 1.4) ** 2)
 
 
@@ -203,9 +203,9 @@ def plays(*widths):
     return ThermalMemory(MemorySpec(plays=tuple((0.0, width) for width in widths)))
 
 
-def test_the_hysteresis_loop_of_a_play():
-    # The output of a play of half-width 1 K is v - 1 if its input v rises, v + 1 if v falls, and
-    # constant while v turns back by less than 2 K.
+def test_the_hysteresis_loop_of_a_play_agrees_with_the_formula():
+    # The output of a play with half-width 1 K is v - 1 while its input v rises, v + 1 while v
+    # falls, and constant after a reversal until v has changed by 2 K.
     memory = plays(1.0)
     way = np.concatenate((np.linspace(0, 5, 51), np.linspace(5, 0, 51), np.linspace(0, 5, 51)))
     P = []
@@ -220,7 +220,7 @@ def test_the_hysteresis_loop_of_a_play():
     assert memory.at(200, -9.0, [0.0]) == [1.0]
 
 
-def test_a_play_on_a_lag_follows_the_lag():
+def test_a_play_on_a_lag_has_the_lagged_temperature_as_input():
     spec = MemorySpec(lags=(('board', 900.0),), plays=((900.0, 0.4),))
     memory = ThermalMemory(spec)
     for second in range(1801):
@@ -228,12 +228,12 @@ def test_a_play_on_a_lag_follows_the_lag():
     lagged = 23.6 - 0.002 * 900.0 * -math.expm1(-2.0)
     state = memory.at(1800 * SECOND_NS, 23.6, [0.0])
     assert 23.6 - state[0] == pytest.approx(lagged)
-    # The lagged temperature rises from 20 degC, so the play follows 0.4 K below it.
+    # The lagged temperature rises, so the output of the play is 0.4 K below it.
     assert lagged - 20.0 > 0.4
     assert state[2] == pytest.approx(-0.4)
 
 
-def test_the_prior_of_initial_lag_states_by_hand():
+def test_the_prior_covariance_of_initial_lag_states_agrees_with_the_formula():
     lags = (('board', 60.0), ('board', 3600.0), ('case', 3600.0), ('tip', 3600.0))
     P = start_covariance(lags)
     assert math.sqrt(P[1, 1]) == pytest.approx(3.0, rel=START_JITTER)
@@ -246,8 +246,8 @@ def test_the_prior_of_initial_lag_states_by_hand():
     assert start_covariance(()).shape == (0, 0)
 
 
-def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
-    # After a long random walk of the board the lags have the covariance `start_covariance`.
+def test_the_prior_of_initial_lag_states_is_their_covariance_after_a_random_walk(rng):
+    # After a long random walk of the board temperature the lags have this covariance.
     D = 0.005
     tau = np.array([60.0, 240.0, 960.0])
     n, step = 4000, 6.0
@@ -257,8 +257,7 @@ def test_start_prior_is_the_scatter_of_lags_whose_past_was_a_random_walk(rng):
         e = np.exp(-step / tau)
         m = m * e + walk * (tau / step) * (1.0 - e)
     P = start_covariance([('board', t) for t in tau])
-    # Variances from n draws scatter by sqrt(2 / n) = 2.2 %; a step of 6 s is 10 % of the lag of
-    # 60 s.
+    # The variance of n draws is uncertain by sqrt(2 / n) = 2.2 %; steps are 10 % of 60 s.
     np.testing.assert_allclose(m.T @ m / n, P, rtol=0.11)
 
 
@@ -271,7 +270,7 @@ def test_initial_lag_states_decay_with_their_time_constants():
     assert shares == pytest.approx([math.exp(-10.0), math.exp(-1.0), math.exp(-0.5)])
 
 
-def test_readings_of_the_board_that_stand_still_are_errors_of_both_lags():
+def test_a_stuck_board_thermometer_adds_errors_to_the_lags_of_board_and_case():
     memory = ThermalMemory(MemorySpec(lags=(('board', 900.0), ('case', 600.0))))
     memory.board_step(0, 20.0)
     memory.banks['case'].step(0, 1.0)

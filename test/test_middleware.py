@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node's Fast DDS profile avoids wake-ups; a profile of the user replaces this profile."""
+"""The node's Fast DDS profile saves wake-ups of a thread; a profile of the user replaces it."""
 
 import json
 import os
@@ -27,7 +27,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 
 CYCLE_NS = 10_000_000
 N_SAMPLES = 300
-#: Number of samples sent until the discovery of a peer counts as failed.
+#: Number of samples to send before the test fails because the node has not found its peers.
 N_TRIED = 5000
 OTHER = """\
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
@@ -35,7 +35,7 @@ OTHER = """\
 </profiles></dds>
 """
 
-#: A receiver with two subscriptions: prints when both receive, and at the end the stamps of each.
+#: A program with a reliable and a best-effort subscription, which prints the stamps of each.
 RECEIVER = """
 import json, select, sys, time
 import rclpy
@@ -73,7 +73,7 @@ print(json.dumps(list(heard.values())), flush=True)
 
 
 def event_wakes(pid):
-    """Count how often the thread of the middleware's timed events has been woken so far."""
+    """Return how often the middleware's thread for timed events has been woken so far."""
     tasks = Path(f'/proc/{pid}/task').iterdir()
     (thread,) = (task for task in tasks if (task / 'comm').read_text().startswith('dds.ev'))
     lines = (thread / 'status').read_text().splitlines()
@@ -97,7 +97,7 @@ def node_arguments(tmp_path):
 
 
 def wakes_per_sample(peer, drivers, node_arguments):
-    """Run the node with a reliable subscriber; count the wake-ups of its event thread."""
+    """Run the node with a reliable subscriber; return wake-ups of its event thread per sample."""
     with NodeProcess(*node_arguments) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         # All nodes get the same driver, because a node ignores a topic with two publishers.
@@ -115,19 +115,19 @@ def wakes_per_sample(peer, drivers, node_arguments):
 
 
 def test_samples_do_not_wake_the_event_thread(peer, node_arguments, tmp_path, monkeypatch):
-    # With the user's profile each sample or group of samples causes a timed event.
+    # With a profile without the node's settings, each sample or group of samples wakes the thread.
     other = tmp_path / 'other.xml'
     other.write_text(OTHER)
     monkeypatch.setenv(VARIABLE, str(other))
     drivers = []
     by_default = wakes_per_sample(peer, drivers, node_arguments)
-    # With the node's profile there are 50 timed events per second, at 700 samples per second.
+    # With the node's profile the thread is woken 50 times per second at 700 samples per second.
     monkeypatch.delenv(VARIABLE)
     assert wakes_per_sample(peer, drivers, node_arguments) < 0.5 * by_default
 
 
 def test_samples_lost_by_dds_are_repeated(peer, node_arguments, monkeypatch):
-    # The receiver is stopped during twice as many samples as its shared memory holds (512).
+    # The receiver stops while twice as many samples are sent as its shared memory holds (512).
     monkeypatch.delenv(VARIABLE, raising=False)
     command = [sys.executable, '-c', RECEIVER]
     with (
@@ -149,14 +149,13 @@ def test_samples_lost_by_dds_are_repeated(peer, node_arguments, monkeypatch):
         print((last - 1) * CYCLE_NS, file=receiver.stdin, flush=True)
         assert receiver.stdout.readline() == 'ready\n'
         reliable, best_effort = json.loads(receiver.stdout.readline())
-    # All samples arrived in order, although some were lost at first.
+    # The reliable subscription received all samples in order; the other subscription lost some.
     assert reliable[-1000:] == [k * CYCLE_NS for k in range(first, last)]
     assert len(set(best_effort) & set(reliable[-1000:])) < 1000
 
 
-def test_the_users_profile_replaces_that_of_the_node(tmp_path, monkeypatch):
+def test_a_dds_profile_set_by_the_user_replaces_that_of_the_node(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    # The node keeps a DDS profile that the user has set.
     monkeypatch.setenv(VARIABLE, 'mine.xml')
     use_profile()
     assert os.environ[VARIABLE] == 'mine.xml'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node has the right input, output and diagnostics on DDS."""
+"""The node's input, output and diagnostics over DDS."""
 
 import math
 import time
@@ -54,7 +54,7 @@ def saved(tmp_path):
 
 
 def diagnosis(peer):
-    """Wait for diagnostics that fulfil a condition; return the status and its values."""
+    """Return a function that waits for diagnostics with a condition on status and values."""
     heard = peer.listen(DiagnosticArray, '/diagnostics')
 
     def wait(condition):
@@ -107,7 +107,7 @@ def test_the_node_takes_imu_input_and_can_switch_to_counts(peer, saved):
         assert heard[1].linear_acceleration.x == pytest.approx(0.5, rel=1e-12)
 
 
-def test_the_regime_flag_is_latched_and_absent_while_unknown(peer, saved):
+def test_the_regime_flag_is_latched_and_not_published_while_unknown(peer, saved):
     with node_in_thread(*saved(calibration()), *lossless()) as node:
         heard = peer.listen(Imu, 'imu/data_raw')
         flags = peer.listen(Bool, 'regime/dynamic')
@@ -121,7 +121,7 @@ def test_the_regime_flag_is_latched_and_absent_while_unknown(peer, saved):
         assert not flags
         n = 0
         while not flags and n < 4000:
-            # Two minutes of data at a time are sent, until the detector has recognised the soak.
+            # Send two minutes of data at a time until the detector has recognised the soak.
             for _ in range(120):
                 n += 1
                 driver.temperatures(START_NS + n * SECOND_NS, 20.0, 20.0)
@@ -134,7 +134,7 @@ def test_the_regime_flag_is_latched_and_absent_while_unknown(peer, saved):
         assert not late[0].data
         # `regime/stamped`, the flag with the stamp of the deciding reading, is latched, too.
         latched = peer.listen(DiagnosticArray, 'regime/stamped', LATCHED)
-        # A late subscriber gets the latched messages, the newest last.
+        # A subscriber that joins later gets the latched messages, the newest last.
         peer.wait_for(
             lambda: (
                 len(stamped_flags) == len(flags)
@@ -178,18 +178,18 @@ def test_diagnostics_name_faults_of_samples(peer, saved):
         assert (values['samples in'], values['samples out']) == ('4', '1')
         assert values['sample stamp [ns]'] == str(stamp_ns)
         assert [m.linear_acceleration.x for m in heard] == [1.0 / 300.0]
-        # After the end of a saturation the report does not mention the saturation.
+        # A report without new saturated samples does not mention saturation.
         wait(lambda s, _: 'no samples are coming in' in s.message and 'sat' not in s.message)
         driver.temperatures(stamp_ns, 40.0, 40.0)
         driver.counts(stamp_ns + CYCLE_NS, 1.0, 2.0, 3.0)
-        # A stamp that goes back by over 1 s is a jump of time; by less, it is out of order.
+        # A stamp that falls by over 1 s is a jump of time; one that falls by less is out of order.
         driver.counts(stamp_ns - 5, 1.0, 2.0, 3.0)
         _, status, _ = wait(lambda s, _: 'out of order' in s.message)
         driver.counts(START_NS - 10 * SECOND_NS, 1.0, 2.0, 3.0)
         wait(lambda s, _: 'jumps of time backwards, estimators reset: 1' in s.message)
 
 
-def test_diagnostics_have_noise_density_and_bias_sd(peer, saved):
+def test_diagnostics_contain_noise_density_and_bias_sd(peer, saved):
     wait, unit = diagnosis(peer), rich_calibration()
     with node_in_thread(*saved(unit)) as node:
         driver = drive(peer, node)
@@ -197,7 +197,7 @@ def test_diagnostics_have_noise_density_and_bias_sd(peer, saved):
         driver.counts(START_NS + 1, *standing(0))
         _, _, values = wait(lambda _, values: values['samples out'] == '1')
         for axis in 'xyz':
-            # An INS needs noise density and bias sd in addition to the covariance.
+            # An INS needs noise density and bias sd as well as the covariance of each sample.
             density, whole, bias = (
                 float(values[f'{name} {axis} {of}'])
                 for name, of in (
@@ -217,12 +217,12 @@ def test_diagnostics_have_noise_density_and_bias_sd(peer, saved):
             assert sd >= 0.99 * math.sqrt(covariance[level, level])
             of_rate = float(values[f'noise density of rate {axis} [rad/s/sqrt(Hz)]'])
             assert of_rate == unit.gyroscope.noise_density_rad_s_sqrt_hz['xyz'.index(axis)]
-            # In an unknown regime the bias sd contains the difference of the sets, some 30 urad/s.
+            # In an unknown regime the bias sd contains the difference of both sets, 30 urad/s.
             assert 1e-5 < float(values[f'bias sd of rate {axis} [rad/s]']) < 1e-3
 
 
 @pytest.mark.parametrize('was_fitted_with_case', [False, True])
-def test_a_missing_case_is_reported_only_if_it_was_calibrated(peer, saved, was_fitted_with_case):
+def test_a_missing_case_is_reported_only_if_the_fit_had_a_case(peer, saved, was_fitted_with_case):
     seen = DetectorSettings(case=ThermometerSettings(noise_sd_c=0.05))
     unit = thermal_calibration()
     unit = replace(unit, detector=seen) if was_fitted_with_case else unit
@@ -273,9 +273,9 @@ def test_a_node_with_constants_needs_no_thermometer(peer, saved):
         for k in range(20):
             driver.counts(START_NS + k * CYCLE_NS, *standing(k))
         _, status, values = wait(lambda _, values: values['samples out'] == '20')
-        # The report may arrive before the last samples, which come on another topic.
+        # The report may arrive before the last samples, which are on a different topic.
         peer.wait_for(lambda: len(heard) == 20)
-    # Samples are sent at once, so the rate in the report depends on DDS and may cause a warning.
+    # The samples are sent without pauses, so the report may contain a warning of their rate.
     assert 'not corrected for temperature' in status.message or 'samples/s' in status.message
     assert status.level != DiagnosticStatus.ERROR
     assert (values['board age [s]'], values['board temperature sd [K]']) == ('inf', '10.0000')
@@ -297,7 +297,7 @@ def test_the_sample_rate_is_compared_with_the_calibrated_rate(peer, saved):
 
 
 @pytest.mark.parametrize('qos', [DEEP, BEST_EFFORT], ids=['reliable', 'best effort'])
-def test_subscribers_and_drivers_of_any_reliability_match(peer, saved, qos):
+def test_the_node_connects_to_peers_of_any_reliability(peer, saved, qos):
     with node_in_thread(*saved(calibration())) as node:
         heard = peer.listen(Imu, 'imu/data_raw', qos)
         driver = drive(peer, node, qos=qos)
@@ -306,7 +306,7 @@ def test_subscribers_and_drivers_of_any_reliability_match(peer, saved, qos):
         peer.wait_for(lambda: heard, 'the sample')
 
 
-def test_the_node_follows_namespace_and_remapping(peer, saved):
+def test_the_node_uses_the_namespace_and_remapped_topics(peer, saved):
     args = ['-r', '__ns:=/imu0', '-r', 'accel/counts:=/adc/raw', '-r', 'imu/data_raw:=imu/clean']
     with node_in_thread(*saved(calibration()), *args) as node:
         topics = dict(node.node.get_topic_names_and_types())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests and messages of unknown peers on the network: the node answers, and samples go on."""
+"""Requests and messages of unknown peers: the node answers and publishes all samples."""
 
 import os
 import re
@@ -84,7 +84,7 @@ def test_any_request_is_answered_and_samples_go_on(peer, unit, together):
             assert result.reason == one_line(result.reason)
             assert len(result.reason) < 10_000, message.name[:60]
         samples.go_on()
-        # If one value of a request is bad, all other values are set, or none of them.
+        # With a wrong value in a request, the right values are set (or none, if set atomically).
         good = Parameter('frame_id', value='body').to_parameter_msg()
         answer = peer.call(kind, name, kind.Request(parameters=[STRANGE[1], good]))
         config = node._config
@@ -127,7 +127,7 @@ def test_parameter_requests_of_any_length_are_answered(peer, unit, kind, field):
 
 
 def test_a_callback_that_fails_is_logged_counted_and_survived(peer, unit):
-    # WHY: an unexpected exception in a service, a timer or the relay must not end the node.
+    # An unexpected exception in a service, a timer or the relay must not end the node.
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
 
@@ -175,7 +175,7 @@ def test_no_content_of_a_file_that_is_no_calibration_is_quoted(peer, unit, tmp_p
                 assert word not in result.reason.removeprefix(str(other))
 
 
-def test_calibrations_are_taken_from_one_folder_only(peer, unit, tmp_path):
+def test_a_calibration_outside_the_calibration_directory_is_refused(peer, unit, tmp_path):
     folder, outside = tmp_path / 'units', tmp_path / 'outside.yaml'
     folder.mkdir()
     save_calibration(calibration(), outside)
@@ -199,7 +199,7 @@ def test_calibrations_are_taken_from_one_folder_only(peer, unit, tmp_path):
 
 
 def test_a_calibration_reader_that_ends_is_restarted(unit):
-    # WHY: a file may crash or hang the process that reads it, but not the node.
+    # A separate process reads the file, so a file that crashes the reader does not end the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process = reader._process
@@ -214,7 +214,7 @@ def test_a_calibration_reader_that_ends_is_restarted(unit):
 
 
 def test_a_calibration_reader_that_hangs_is_ended(unit):
-    # WHY: a lost network drive blocked every request, and also the end of the node.
+    # WHY: a file on a lost network drive blocked all parameter requests and the end of the node.
     reader = Reader()
     assert reader.read(str(unit), '').calibration == calibration()
     process, reader._limit_s = reader._process, 0.3
@@ -296,7 +296,7 @@ raise SystemExit(node.main(['node', '--ros-args', '-p', 'calibration_file:=gone.
 
 
 def test_a_node_that_hangs_at_the_start_ends_with_one_signal():
-    # WHY: SIGTERM was stored but not handled; a second SIGTERM was needed.
+    # WHY: the first SIGTERM had no effect; a second SIGTERM was necessary.
     with subprocess.Popen(
         [sys.executable, '-c', HANGING], stdout=subprocess.PIPE, text=True
     ) as process:
@@ -307,7 +307,7 @@ def test_a_node_that_hangs_at_the_start_ends_with_one_signal():
         assert time.monotonic() - began < 2.0
 
 
-def test_what_param_dump_writes_param_load_sets(peer, unit):
+def test_parameters_written_by_param_dump_are_set_by_param_load(peer, unit):
     with node_in_thread(*node_arguments(unit)) as node:
         names = [parameter for parameter in node.node._parameters]  # noqa: C416
         request = GetParameters.Request(names=names)

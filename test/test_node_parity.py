@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag played over DDS into the node and its offline replay give the same bits."""
+"""The node, with a bag played over DDS, and the offline replay of the bag give the same bits."""
 
 import csv
 import gc
@@ -33,13 +33,13 @@ UNIT = Unit('T-1', 'counts', 32767.0, 1.0 / RATE_HZ)
 
 @pytest.fixture(autouse=True)
 def _collected():
-    """Free rclpy's circular references, which would remain in the ROS graph of the next test."""
+    """Free objects in circular references: their ROS nodes would be visible to the next test."""
     yield
     gc.collect()
 
 
 def thermal_test(path, imu=False, has_case=True):
-    """Write a bag of soak, ramp, soak, some readings late; return the number of samples."""
+    """Write a bag of soak, ramp and soak, with some late readings; return the sample count."""
     rng = np.random.default_rng(11)
     n = MINUTES * 60 * RATE_HZ
     stamps = START_NS + np.arange(1, n + 1) * (1_000_000_000 // RATE_HZ)
@@ -95,7 +95,7 @@ def assert_same(live, offline):
     assert expected.imu is not None
     for name in ImuColumns._fields:
         assert getattr(out.imu, name).tobytes() == getattr(expected.imu, name).tobytes(), name
-    # Each case reading gives a regime flag: equal lists of flags mean equal times of switches.
+    # There is one regime flag for each case reading, so equal flags mean equal times of switches.
     assert (len(flags), flags) == (len(expected_flags), expected_flags)
     assert False in flags
     assert True in flags
@@ -115,7 +115,7 @@ def run(calibration, bag, folder, *node_args, **keys):
     return result.counters.n_out
 
 
-def test_the_node_equals_the_replay_for_counts(tmp_path):
+def test_node_and_replay_give_equal_output_for_counts(tmp_path):
     n = thermal_test(tmp_path / 'bag')
     unit = replace(rich_calibration(), unit=UNIT)
     # The first board temperature arrives in time, so every sample is corrected.
@@ -123,9 +123,9 @@ def test_the_node_equals_the_replay_for_counts(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_board_decides_the_regime_of_a_unit_without_a_case_sensor(tmp_path):
-    # WHY: `regime/dynamic` was not published, and the regime in the table of a replay was always
-    # `unknown`.
+def test_without_a_case_sensor_the_board_rate_selects_the_regime(tmp_path):
+    # WHY: without a case sensor `regime/dynamic` was never published, and the table of a replay
+    # stated the regime `unknown`.
     n = thermal_test(tmp_path / 'bag', has_case=False)
     unit = replace(rich_calibration(), unit=UNIT)
     assert run(unit, tmp_path / 'bag', tmp_path) == n
@@ -135,7 +135,7 @@ def test_the_board_decides_the_regime_of_a_unit_without_a_case_sensor(tmp_path):
     assert regimes == {'unknown', 'static', 'dynamic'}
 
 
-def test_the_node_equals_the_replay_for_imu_messages(tmp_path):
+def test_node_and_replay_give_equal_output_for_imu_messages(tmp_path):
     thermal_test(tmp_path / 'bag.mcap', imu=True)
     unit = replace(rich_calibration(), unit=replace(UNIT, input='m/s^2', full_scale=160.0))
     axes = {axis: replace(getattr(unit.axes, axis), scale_factor=1.0, bias=0.0) for axis in 'xyz'}
@@ -146,7 +146,7 @@ def test_the_node_equals_the_replay_for_imu_messages(tmp_path):
     published, _, _ = output_of(tmp_path / 'live.mcap')
     given = given.imu.take(np.flatnonzero(np.isin(given.accel_stamp_ns, published.accel_stamp_ns)))
     is_rate = given.angular_velocity_covariance[:, 0] != -1.0
-    # The node corrects an existing angular rate and passes a missing rate unchanged.
+    # The node corrects a measured angular rate, and publishes one marked as missing unchanged.
     moved = np.abs(published.imu.angular_velocity - given.angular_velocity)
     assert moved[~is_rate].max() == 0.0
     # The biases of `rich_gyroscope` at the reference temperature are 10 mrad/s and more.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration of a node process changes through ROS services while samples flow."""
+"""Calibration and parameters of a node process are changed through ROS services while it runs."""
 
 import sys
 import threading
@@ -33,7 +33,7 @@ K = 300.0
 
 
 def of_bias(counts, **keys):
-    """Make a calibration that a test recognises by its bias of x."""
+    """Make a calibration with a bias of x [counts], by which a test recognises it."""
     axes = Axes(AxisReference(K, counts), AxisReference(K, 0.0), AxisReference(K, 0.0))
     return calibration(axes=axes, **keys)
 
@@ -85,11 +85,11 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         before = flow.more()
         assert flow.bias(before - 1) == 1.0
 
-        # When the answer comes, the new calibration is in use; it was exchanged between samples.
+        # When the service answers, the node already uses the new calibration.
         assert [r.successful for r in peer.set_parameters(calibration_file=str(second))] == [True]
         flow.more()
 
-        # A broken file is refused with path, key and reason; the calibration in use stays.
+        # A broken file is refused with path, key and reason; the node keeps its calibration.
         (result,) = peer.set_parameters(calibration_file=str(broken))
         assert not result.successful
         assert str(broken) in result.reason
@@ -100,7 +100,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         (value,) = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert value.string_value == str(second)
 
-        # An atomic request with a file and other parameters applies all values, or none.
+        # An atomic request with a wrong value changes no parameter.
         result = peer.set_atomically(transition_time=5, calibration_file=str(broken))
         assert not result.successful
         result = peer.set_atomically(transition_time=5, calibration_file=str(tmp_path / 'none'))
@@ -118,7 +118,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 5.0
 
-        # A file of another serial is refused, as is a serial that differs from the file in use.
+        # Parameter `serial` and the serial in the calibration file must agree.
         save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
         (result,) = peer.set_parameters(serial='T-9')
         assert "unit.serial: must be 'T-9'" in result.reason
@@ -140,21 +140,21 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         assert node.stop() == 0
         assert 'Traceback' not in node.said
 
-    # From the first output on no sample is lost, repeated or out of order.
+    # No sample after the first output is lost, repeated or out of order.
     stamps = [stamp_of(message) for message in flow.heard]
     assert stamps == list(range(stamps[0], stamps[-1] + 1, CYCLE_NS))
-    # The calibrations apply one after the other; exactly one corrects each sample.
+    # Each sample is corrected with one of the calibrations, in the order in which they were set.
     biases = [flow.bias(index) for index in range(len(stamps))]
     changes = [b for a, b in pairwise(biases) if a != b]
     assert (biases[0], changes) == (1.0, [2.0, 3.0])
 
 
 class _Stop(BaseException):
-    """The exception that `raising_at` raises."""
+    """The exception of `raising_at`."""
 
 
 def raising_at(number, call):
-    """Call a function and raise at its n-th executed line; return whether the line was reached."""
+    """Call a function and raise at the n-th executed line; return whether this line exists."""
     n_lines = 0
 
     def trace(frame, event, _):
@@ -177,10 +177,10 @@ def raising_at(number, call):
 
 
 def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
-    # WHY: a calibration was refused, and its bias was applied all the same.
+    # WHY: a calibration was refused, but samples were corrected with its bias.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # For other detector settings the node must rebuild all parts of the correction.
+    # If detector settings differ, the node must build all parts of the correction again.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)
@@ -214,7 +214,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
                 sample = START_NS + k * CYCLE_NS, *standing(k)
                 assert running.compensator.process(*sample) == undisturbed.process(*sample)
                 k += 1
-        # The loop must have raised the failure at each executed line (over 150) of the change.
+        # A change executes over 150 lines; the loop has raised an exception at each of them.
         assert number > 150
         assert {name: node.node.get_parameter(name).value for name in values} == {
             change.name: change.value for change in changes
@@ -230,7 +230,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
 
 
 def test_a_calibration_that_cannot_be_applied_changes_nothing(peer, tmp_path):
-    # WHY: a file with a lag of 1e-300 s was refused only after its new bias was in use.
+    # WHY: a file with a lag of 1e-300 s was refused after its bias was already in use.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
     text = dump_calibration(of_bias(77.0))
@@ -250,8 +250,7 @@ def test_a_calibration_that_cannot_be_applied_changes_nothing(peer, tmp_path):
 
 
 def test_a_calibration_of_another_unit_is_named(peer, tmp_path, capfd):
-    # WHY: a file of another unit was used without a warning, with errors of 890 times the claimed
-    # sd.
+    # WHY: a calibration of another unit was used without a warning; errors were 890 claimed sd.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
     unit = of_bias(1.0).unit

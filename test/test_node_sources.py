@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node never mixes samples of two publishers, and soon accepts a restarted driver."""
+"""The node does not use samples of two publishers at a time, and accepts a restarted driver."""
 
 import contextlib
 import os
@@ -38,7 +38,7 @@ from thermo_comp.unit.calibration_file import save_calibration
 
 
 def contested(peer, heard, topic, send):
-    """Let both publishers send until the node reports two publishers; return its status."""
+    """Send by two publishers until the node reports two publishers; return the node's status."""
     text = f'2 publishers on {topic}, the topic is not used until only one of them sends'
     status = status_with(peer, heard, text, send)
     assert status.level == DiagnosticStatus.ERROR
@@ -46,7 +46,7 @@ def contested(peer, heard, topic, send):
 
 
 def test_samples_of_a_second_publisher_are_never_published(peer, unit):
-    # WHY: samples of a second driver in another attitude were published as the unit's samples.
+    # WHY: the node corrected and published samples of a second driver, in a different attitude.
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         other = peer.node.create_publisher(Vector3Stamped, 'accel/counts', DEEP)
@@ -63,7 +63,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         assert values['sample publishers'] == '2'
         peer.node.destroy_publisher(other)
         peer.poll(lambda: node._relay.samples.count_publishers() == 1, 'one left')
-        # Right after one of two drivers has ended, samples of this driver may still arrive.
+        # After one of two drivers has ended, samples that it sent before may still arrive.
         samples.send(20)
         before = len(samples.heard)
         peer.poll(lambda: (samples.send(1), len(samples.heard) > before)[1], 'samples again')
@@ -71,7 +71,7 @@ def test_samples_of_a_second_publisher_are_never_published(peer, unit):
         assert all(stamp_of(imu) % CYCLE_NS == 0 for imu in samples.heard)
 
 
-#: A driver process: 100 Hz from its first subscriber on, with its name in each sample.
+#: A driver process: it sends at 100 Hz as soon as it has a subscriber; frame_id is its name.
 DRIVER = """
 import sys, time, rclpy
 from geometry_msgs.msg import Vector3Stamped
@@ -104,7 +104,7 @@ rclpy.spin(node)
 
 @contextlib.contextmanager
 def driver_process(name):
-    """Run a driver; return the time of its first sample [ns]. The driver is killed at the end."""
+    """Run a driver until the context ends; yield the process and its first stamp [ns]."""
     command, environment = [sys.executable, '-c', DRIVER, name], {**os.environ, **OVER_UDP}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     try:
@@ -116,7 +116,7 @@ def driver_process(name):
 
 
 def test_after_a_driver_was_killed_output_continues_within_two_seconds(peer, unit):
-    # WHY: after a driver was killed the node was silent for 20 s, until the DDS lease ended.
+    # WHY: after a driver was killed, the node published nothing for 20 s, until DDS removed it.
     with node_in_thread(*node_arguments(unit)) as node:
         diagnostics = peer.listen(DiagnosticArray, '/diagnostics')
         heard = peer.listen(Imu, 'imu/data_raw')
@@ -127,7 +127,7 @@ def test_after_a_driver_was_killed_output_continues_within_two_seconds(peer, uni
         with driver_process('first'):
             peer.wait_for(lambda: len(of('first')) > 100, 'samples of the first driver')
         killed = time.monotonic()
-        # Restart the driver a second after it was killed, as a supervisor would.
+        # Start the driver again 1 s after it was killed, as a supervisor does.
         peer.poll(lambda: time.monotonic() - killed > 1.0, 'a second')
         with driver_process('second') as (_, began_ns):
             peer.wait_for(lambda: of('second'), 'samples of the second driver')
@@ -162,12 +162,12 @@ def test_two_publishers_that_send_are_never_mixed(offset, period_s):
         if not sources.first_of_single_source(n_known, [number], [round(at_s * 1e9)]):
             used.append((at_s, name))
     assert {name for _, name in used} == {'own'}
-    # A second after one of two drivers fell silent, samples of the first driver are used again.
+    # Driver 2 ends at 8 s; from 10 s on all samples of driver 1 are used.
     assert sum(at_s < 2.0 for at_s, _ in used) >= 199
     assert sum(at_s > 10.0 for at_s, _ in used) >= 199
 
 
-def test_without_sequence_numbers_no_publisher_is_taken_as_ended():
+def test_without_sequence_numbers_samples_of_two_publishers_are_never_used():
     sources = Sources()
     assert sources.first_of_single_source(1, [None] * 3, [0, 1, 2]) == 0
     for k in range(5):
@@ -208,11 +208,11 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
 
 
 def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path):
-    # WHY: with diagnostics_period below the sample interval each empty report was an ERROR.
+    # WHY: with a diagnostics_period below the sample interval, reports without samples were ERROR.
     from thermo_comp.unit.calibration import Unit
 
     slow = tmp_path / 'slow.yaml'
-    # Silence is reported after 5 cycles = 1.5 s; a busy machine delays the driver by less.
+    # Missing samples are an error after 5 cycles, 1.5 s: no busy machine delays a sample as long.
     save_calibration(calibration(unit=Unit('T-1', 'counts', 32767.0, 0.3)), slow)
     with node_in_thread(*node_arguments(slow, 'diagnostics_period:=0.01')) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
@@ -233,7 +233,7 @@ def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path
 
 
 def test_a_reading_far_ahead_is_forgotten(peer, unit):
-    # WHY: a temperature stamped a day ahead kept the status WARN until a sample of that day came.
+    # WHY: after a temperature with a stamp one day ahead, the status stayed WARN for a day.
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)
         samples.driver.temperatures(START_NS + 86_400 * SECOND_NS, 25.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A node process with a bad start ends at once with a clear line, another ends cleanly."""
+"""A node that cannot start ends with one line; a node that has started ends cleanly."""
 
 import signal
 import subprocess
@@ -52,7 +52,7 @@ def arguments(*overrides):
         (['calibration_file:={unit}', 'use_sim_time:=7'], "set parameter 'use_sim_time' to '7'"),
     ],
 )  # fmt: skip
-def test_a_bad_start_ends_with_one_line(overrides, text, unit, tmp_path, capfd):
+def test_a_node_that_cannot_start_prints_one_line(overrides, text, unit, tmp_path, capfd):
     (tmp_path / 'text.yaml').write_text('just words')
     nan = dump_calibration(calibration()).replace('bias: 0.0', 'bias: .nan', 1)
     (tmp_path / 'nan.yaml').write_text(nan)
@@ -66,7 +66,7 @@ def test_a_bad_start_ends_with_one_line(overrides, text, unit, tmp_path, capfd):
     assert text in line
 
 
-def test_one_topic_for_two_thermometers_ends_the_start(unit, capfd):
+def test_a_node_with_one_topic_for_two_thermometers_does_not_start(unit, capfd):
     remaps = [f'temperature/{name}:=/imu/temperature' for name in ('board', 'case')]
     words = [word for remap in remaps for word in ('-r', remap)]
     assert main([*arguments(f'calibration_file:={unit}'), *words]) == 1
@@ -92,7 +92,7 @@ def test_an_unusable_ros_environment_is_one_line(name, value, text, unit, monkey
 
 
 def test_a_node_with_closed_streams_runs(unit):
-    # WHY: with stderr closed, the signal pipe got descriptor 2, and log text was read as a signal.
+    # WHY: with stderr closed, the pipe for signals had descriptor 2, so log text became a signal.
     peer = Peer()
     shell = ['sh', '-c', 'exec "$0" "$@" <&- >&- 2>&-', sys.executable]
     words = [*shell, '-m', 'thermo_comp.ros.node', *arguments(f'calibration_file:={unit}')[1:]]
@@ -116,7 +116,7 @@ ABSENT = ('pydantic', 'typer', 'rich', 'rosbags', 'mcap', 'zstandard', 'scipy', 
 
 
 def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
-    # Python imports sitecustomize first, in the node and in its child processes.
+    # Python imports sitecustomize at its start, in the node and in its child processes.
     (tmp_path / 'sitecustomize.py').write_text(
         'import sys\n'
         'class Absent:\n'
@@ -143,7 +143,7 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
             return bool(heard)
 
         peer.poll(is_heard, 'a sample')
-        # A child process of the node reads the calibration.
+        # The node reads a calibration in a child process.
         (result,) = peer.set_parameters(calibration_file=str(unit))
         assert result.successful, result.reason
         del heard[:]
@@ -157,21 +157,21 @@ def test_the_node_needs_only_ros_numpy_and_yaml(unit, tmp_path, monkeypatch):
     assert (finished.stdout, finished.stderr) == ('', text)
 
 
-def test_help_and_unknown_arguments_of_the_node(capfd):
+def test_the_node_prints_its_help_and_names_unknown_arguments(capfd):
     assert main(['thermo_comp_node', '--help']) == 0
     assert 'example: thermo_comp_node --ros-args -p calibration_file' in capfd.readouterr().out
     assert main(['thermo_comp_node', 'unit.yaml']) == 2
     assert "unknown argument 'unit.yaml'" in capfd.readouterr().err
 
 
-def test_unreadable_ros_arguments_are_one_line(capfd):
+def test_wrong_ros_arguments_of_the_node_give_one_line(capfd):
     assert main(['thermo_comp_node', '--ros-args', '--params-file', '/none.yaml']) == 2
     printed = capfd.readouterr().err
     assert 'thermo_comp_node: ' in printed
     assert 'Traceback' not in printed
 
 
-def test_misspelt_parameters_are_named(unit, capfd):
+def test_misspelt_parameters_of_the_node_are_named(unit, capfd):
     overrides = ['-p', f'calibration_file:={unit}', '-p', 'transition_tme:=3.0']
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):
@@ -181,8 +181,8 @@ def test_misspelt_parameters_are_named(unit, capfd):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_during_start_up_ends_it_cleanly(unit, number):
-    # Send the signal while the node starts: once the middleware has started a thread.
+def test_a_signal_during_the_start_ends_the_node_cleanly(unit, number):
+    # Send the signal as soon as the middleware has started its first thread.
     with NodeProcess('-p', f'calibration_file:={unit}') as node:
         tasks = Path(f'/proc/{node.process.pid}/task')
         deadline = time.monotonic() + TIMEOUT

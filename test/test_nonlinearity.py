@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction of nonlinear axes agrees with closed forms, in stream and batch."""
+"""The correction of nonlinear axes agrees with closed formulas, in blocks and one by one."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def with_covariance(unit, rng, size=1e-5):
     return replace(unit, posterior=posterior_of(root @ root.T + size**2 * np.eye(n)))
 
 
-# Error of Halley's step at 10 g: 1e-14 g for 100 ug/g^2, 1e-9 g for a MEMS with 1 mg/g^2.
+# The error of one Halley step at 10 g is 1e-14 g for 100 ug/g^2, 1e-9 g for 1 mg/g^2.
 @pytest.mark.parametrize(('k2', 'tolerance'), [(1e-5, 1e-12), (-1e-4, 1e-12), (1e-3, 3e-9)])
 def test_the_inverse_of_a_square_is_the_root_of_a_quadratic(k2, tolerance):
     x = np.linspace(-10.0, 10.0, 41)
@@ -77,10 +77,10 @@ def test_a_correction_inverts_the_terms_at_their_temperature():
     assert np.array(corrected[:3]) / G == pytest.approx(f, abs=1e-11)
 
 
-def test_nonlinear_corrections_of_stream_and_batch_have_the_same_bits(rng):
+def test_nonlinear_corrections_of_single_samples_and_blocks_have_equal_bits(rng):
     bent = replace(rich_calibration(), posterior=None, nonlinearity=BENT)
     unit = with_covariance(bent, rng)
-    # The forces are up to 10 g on an axis, beyond the 6 g of the fit.
+    # Forces reach 10 g on an axis; the largest force of the fit is 6 g.
     events = [
         (kind, stamp, tuple(9.0 * count for count in value) if kind == 'accel' else value)
         for kind, stamp, value in run_of(rng, seconds=60)
@@ -93,7 +93,7 @@ def test_nonlinear_corrections_of_stream_and_batch_have_the_same_bits(rng):
     assert_same([process_block(cut, columns_from_events(piece)) for piece in pieces], rows)
 
 
-def test_without_terms_every_bit_is_that_of_a_file_without_a_nonlinearity(rng):
+def test_a_nonlinearity_without_terms_does_not_change_a_bit(rng):
     plain, events = rich_calibration(), run_of(rng, seconds=30)
     empty = replace(plain, nonlinearity=Nonlinearity((9.0, 100.0), 1e-4))
     before, _ = stream(Compensator(plain, UNCHECKED), events)
@@ -102,7 +102,7 @@ def test_without_terms_every_bit_is_that_of_a_file_without_a_nonlinearity(rng):
 
 
 def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
-    # The term |f| f is absent, as the correction overstates its variance.
+    # The term |f| f is left out: its claimed variance is too large, so it is not the exact one.
     unit = calibration(nonlinearity=replace(BENT, terms=(SQUARE, CUBE)))
     unit = with_covariance(unit, rng)
     layout, correction = parameter_layout(unit), Correction(unit)
@@ -166,5 +166,5 @@ def test_rests_in_the_field_depend_on_every_nonlinear_coefficient():
             unit, scale, values + step * (np.arange(len(values)) == k), covariance
         )
         slope = (series.residual - series_of(logged, moved).residual) / step
-        # The analytic derivatives neglect the slope of the nonlinear terms, 2 K2 times 1 g.
+        # The derivatives neglect the slope of the nonlinear terms, relative 2 * K2 * 1 g.
         assert np.allclose(slope, series.by_parameter[:, k], atol=1e-3 * abs(slope).max() + 1e-7)

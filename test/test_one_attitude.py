@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to units of benchmarks/strangers_units.py, heated in one or two attitudes, are right."""
+"""Fits to simulated units that were heated in only one or two attitudes are right."""
 
 from types import SimpleNamespace
 
@@ -24,22 +24,23 @@ from thermo_comp.fitting.rests import poses_of
 
 @pytest.mark.parametrize('poses', [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_rests_in_a_pose_at_four_temperatures_show_the_drift_of_the_level_axes(unit, poses):
-    # WHY: with free attitudes in all rests, the bias curve came from warm-ups of the board, which
-    # the sensor follows with a lag: errors of 1 to 4 mg between the rests.
+def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axes(unit, poses):
+    # WHY: if the attitude of each rest is free, only the warm-up of the board determines the bias
+    # curve. The sensor lags the board, which caused errors of 1 to 4 mg between the rests.
     study = list(returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
     (held,) = map(slow, study.tests[''])
     force = strangers.corrected(calibration, held).force
     drift = force - strangers.minutes(held).force
     drift -= np.nanmean(drift, axis=0)
-    # The rests are turned by 0.2 mrad RMS, 0.2 mg along each level axis; a bias curve through
-    # the rests is off by about 0.2 mg. Tolerance: 0.4 mg, two sd of the curve's error.
+    # Attitude errors of 0.2 mrad RMS in the rests cause errors of about 0.2 mg in the bias curve
+    # of a level axis. Tolerance: 0.4 mg, two sd.
     assert np.sqrt(np.nanmean(drift**2)) < 2.0 * 2e-4 * GRAVITY
 
 
-def test_a_pose_is_an_attitude_to_which_the_unit_was_returned():
-    # WHY: blocks of one long rest counted as returns to a pose; a bias walk was fitted as a curve.
+def test_only_an_attitude_to_which_the_unit_was_returned_is_a_pose():
+    # WHY: parts of one long rest counted as returns to a pose, so that a random walk of the bias
+    # was fitted as a curve over temperature.
     x, y = np.eye(3)[:2]
 
     def poses(*up, start_ns=range(4)):
@@ -54,8 +55,8 @@ def test_a_pose_is_an_attitude_to_which_the_unit_was_returned():
     assert poses(x, x, x, x) == [0, 0, 0, 0]
 
 
-def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
-    # WHY: the fit of rests in one pose began with a smaller mounting sd than stated, and kept it.
+def test_rests_in_one_pose_use_the_mounting_sd_that_the_user_stated():
+    # WHY: a fit of rests in one pose used a smaller sd of mountings than the user had stated.
     study = next(returned(1))
     calibration = strangers.fitted(study, mounting_sd=0.01)
     for axis in calibration.static.axes():
@@ -72,12 +73,11 @@ def test_a_stated_repeatability_of_mountings_holds_in_one_pose():
         (navigation, 2, False),
     ],
 )
-def test_rests_on_the_bench_do_not_separate_the_slopes_of_bias_and_scale(draw, unit, is_cold):
-    # WHY: the thermometer's noise in rests at constant temperature looked like temperature changes
-    # without an effect, and the drift of the one ramp went to the scale factors: 470 ppm/K instead
-    # of -36. For warm-ups of a cold unit the fit put a lag of an axis into its scale factor alone.
-    # Lags whose initial states fitted noise in rests of a warm unit separated bias and scale by
-    # chance.
+def test_the_claimed_sd_is_right_if_one_ramp_cannot_separate_bias_and_scale(draw, unit, is_cold):
+    # WHY: noise of the thermometer in rests at constant temperature was taken for temperature
+    # changes that do not change the bias, so the drift in the only ramp was attributed to scale
+    # factors: 470 ppm/K instead of -36. In warm-ups of a cold unit the effect of a lag was
+    # attributed to the scale factor alone.
     rng = rng_of('bench beside a ramp', unit)
     imu = draw(rng)
     bench = program(22.0, 5.0)
@@ -95,6 +95,6 @@ def test_rests_on_the_bench_do_not_separate_the_slopes_of_bias_and_scale(draw, u
     study = Study('', tuple(bags[:15]), one_test(held), options)
     tests = {'': [strangers.minutes(bag) for bag in held]}
     score = strangers.scored(study, strangers.fitted(study), tests)['']
-    # One attitude leaves the slopes of the scale factors at their prior, so the error is that of
-    # three unknown slopes: its RMS / claimed sd exceeds 1.9 in 1 % of all units.
+    # A ramp in one attitude does not determine the slopes of the three scale factors. If their
+    # claimed sd is right, the RMS of error / claimed sd exceeds 1.9 for 1 % of all units.
     assert score.ratio < 1.9

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Version, licence, commands and keys of the package agree wherever they are stated."""
+"""The package states the same version, licence, commands and dependencies in all its files."""
 
 import ast
 import os
@@ -18,7 +18,7 @@ import thermo_comp
 ROOT = Path(__file__).resolve().parent.parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314 - our own file
 
-# Keys that rosdep/python.yaml of rosdistro resolves on Ubuntu 24.04, and ROS 2 Jazzy packages.
+# Dependency names that rosdep can install on Ubuntu 24.04: Python packages and ROS 2 Jazzy.
 KNOWN_KEYS = {
     *('rclpy', 'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces'),
     *('rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'launch_xml', 'launch_ros', 'ament_flake8'),
@@ -45,7 +45,7 @@ def test_the_version_is_equal_wherever_it_is_stated():
     assert finished.stdout.split()[-1] == thermo_comp.__version__
 
 
-def test_manifest_is_format_3_with_keys_that_exist():
+def test_the_manifest_has_format_3_and_names_keys_that_exist():
     assert MANIFEST.get('format') == '3'
     assert MANIFEST.findtext('name') == 'thermo_comp'
     assert MANIFEST.findtext('export/build_type') == 'ament_python'
@@ -54,7 +54,7 @@ def test_manifest_is_format_3_with_keys_that_exist():
     assert keys == KNOWN_KEYS
 
 
-def test_licence_is_the_whole_apache_text():
+def test_the_licence_file_contains_the_whole_apache_licence():
     licence = (ROOT / 'LICENSE').read_text()
     assert 'Version 2.0, January 2004' in licence
     assert 'END OF TERMS AND CONDITIONS' in licence
@@ -70,7 +70,7 @@ def tracked(*patterns):
     return [ROOT / name for name in names if (ROOT / name).exists()]
 
 
-def test_every_source_carries_its_licence():
+def test_every_source_file_states_its_licence():
     first = 'SPDX-FileCopyrightText: 2026 thermo_comp contributors'
     second = 'SPDX-License-Identifier: Apache-2.0'
     for path in tracked('*.py', 'Makefile', '.ci/run'):
@@ -79,13 +79,13 @@ def test_every_source_carries_its_licence():
         assert lines[:2] == [f'# {first}', f'# {second}'], path
 
 
-def test_no_source_file_is_too_long():
+def test_no_source_file_exceeds_the_limit_of_lines():
     lengths = {path: len(path.read_text().splitlines()) for path in tracked('*.py')}
     assert {path.name: n for path, n in lengths.items() if n > 500} == {}
 
 
-def test_the_manifest_lists_dependencies_of_the_node_alone():
-    # Only the commands have further dependencies, which come from PyPI.
+def test_the_manifest_lists_only_dependencies_of_the_node():
+    # The further dependencies of the commands come from PyPI.
     keys = {node.text for node in MANIFEST.iter('exec_depend')}
     assert {key for key in keys if key and key.startswith('python3-')} == {
         'python3-numpy',
@@ -107,8 +107,8 @@ def test_hosted_ci_installs_as_the_readme_describes():
     assert jobs['ros']['container'] == 'ros:jazzy'
 
 
-def test_the_installed_share_folder_holds_the_files_of_ros(tmp_path):
-    # Run setup.py's install command into a prefix, as colcon does; only data files are tested.
+def test_the_installed_share_folder_contains_the_files_that_ros_needs(tmp_path):
+    # Install the data files into a folder with setup.py, as colcon does.
     words = (*('build', '--build-base', tmp_path / 'build'), 'install_data', '--install-dir')
     environment = {**os.environ, 'PYTHONWARNINGS': 'ignore'}
     command = (sys.executable, 'setup.py', '-q', *words, tmp_path / 'prefix')

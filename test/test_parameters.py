@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""One table gives the parameters their types, ranges, checks and documentation."""
+"""Types, ranges, checks and documentation of the node's parameters come from one table."""
 
 from dataclasses import fields
 
@@ -18,7 +18,7 @@ from thermo_comp.ros import parameters
 from thermo_comp.ros.parameters import NodeConfig, ParameterError
 
 
-def test_defaults_of_parameters_are_those_of_the_compensator():
+def test_parameters_and_compensator_have_the_same_defaults():
     with bare_node() as node:
         config = parameters.declare(node)
     assert config == NodeConfig()
@@ -61,7 +61,7 @@ def test_overrides_are_applied_and_integers_are_accepted_for_floats():
         ('transition_time:=.nan', 'parameter `transition_time` must be between 0 and 3600'),
         ('temperature_timeout:=0', 'parameter `temperature_timeout` must be between 0.1'),
         ('input:=both', "parameter `input` must be one of counts, imu, got 'both'"),
-        # A serial that looks like a number would lose its zeros; the message says to quote it.
+        # ROS takes 0042 for a number, without its zeros; the message asks for quotation marks.
         ('serial:=0042', 'parameter `serial` must be a string, got .*quote it'),
     ],
 )
@@ -80,7 +80,7 @@ def test_a_bad_override_is_refused_with_its_name_rule_and_value(override, text):
         ('serial', 'a\nb', "must be one printable line of at most 64 characters, got 3: 'a"),
     ],
 )
-def test_an_update_of_parameters_is_refused_as_a_whole(name, value, text):
+def test_an_update_with_one_wrong_parameter_changes_no_parameter(name, value, text):
     changes = [Parameter('serial', value='other'), Parameter(name, value=value)]
     with pytest.raises(ParameterError, match=text):
         parameters.updated(NodeConfig(), changes)
@@ -113,7 +113,7 @@ def test_table_and_help_name_every_parameter():
     assert table.count('\n') == 2 + len(fields(NodeConfig))
 
 
-def test_pages_hold_the_generated_table(root):
+def test_pages_contain_the_generated_table_of_parameters(root):
     table = parameters_table()
     header = table.splitlines()[0]
     pages = [root / 'README.md', *(root / 'docs').rglob('*.md')]
@@ -125,7 +125,7 @@ def test_pages_hold_the_generated_table(root):
 
 def test_the_parameter_file_states_the_defaults(root):
     text = (root / 'config' / 'thermo_comp.params.yaml').read_text(encoding='utf-8')
-    # The QoS section is commented out, as overrides of topics that are remapped have no effect.
+    # The file has the QoS settings as a comment only: they do not apply to remapped topics.
     before, overrides_text = text.split('    # The defaults of the overrides:\n    #\n')
     stated = yaml.safe_load(before)['/**']['ros__parameters']
     expected = {entry.name: entry.default for entry in fields(NodeConfig)}

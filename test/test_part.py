@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A part of a bag gives the same results as a bag of that part, in every test."""
+"""A command for a part of a bag gives the same results as for a bag of that part alone."""
 
 import re
 from dataclasses import replace
@@ -54,7 +54,7 @@ def test_a_part_contains_exactly_the_messages_inside(bag, begin, end, n_messages
     got = np.concatenate([b.temperatures['board'].celsius for b in blocks])
     np.testing.assert_array_equal(got, board.celsius[own])
     assert since == (begin or 0.0)
-    # In a part of a bag each reading applies from the same sample on as in the whole bag.
+    # Each reading in the part applies from the same sample on as in the whole bag.
     after = [np.sum(inside[:n]) for n in board.after[own]]
     begins = np.cumsum([0, *map(len, blocks)])
     places = [b.temperatures['board'].after + n for b, n in zip(blocks, begins, strict=False)]
@@ -91,7 +91,7 @@ def test_a_part_without_samples_is_refused(bag):
         (5.0, 1.7e9, 'or both as stamps'),
     ],
 )
-def test_bounds_that_are_no_part_are_refused(begin, end, reason):
+def test_impossible_bounds_of_a_part_are_refused(begin, end, reason):
     with pytest.raises(ValueError, match=reason):
         Part(begin, end)
 

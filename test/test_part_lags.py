@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lags, kinks and bumps of the parts of simulated units are fitted right."""
+"""Fits to simulated units whose bias depends on parts that lag: lags and errors are right."""
 
 import json
 from dataclasses import replace
@@ -45,17 +45,17 @@ HEADER = 'time_s,accel_x,accel_y,accel_z,temperature_board,temperature_case'
 PARTS_S = np.array([520.0, 910.0, 1400.0])
 MEMS_SCALE = {'full_scale': 32767.0}
 FACES = np.vstack((np.eye(3), -np.eye(3)))
-#: Held-out ramps of strangers_cases.py, with soaks of 15 and 30 min instead of 40 to 50 min.
+#: Programs of held-out bags: HELD of strangers_cases.py with shorter soaks, which saves time.
 HELD = program(12, 20, (31, 0.7, 30), (17, 1.5, 15)), program(30, 20, (8, 1.2, 30), (24, 0.6, 15))
 SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
-    """Record a unit in `up` (a number or directions) to fit, and in two held-out positions."""
+    """Record a unit for a fit in `up` (number of positions or directions), and in two held-out."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not navigation
-    # At 10 Hz the noise of a MEMS is as large as a count, so that rounding leaves no bias.
+    # At 10 Hz the noise of a MEMS sample is about a count, so rounding averages out.
     keys, options = ({'rate_hz': 10.0}, MEMS_SCALE) if is_mems else ({}, FULL_SCALE)
     up = spread(up, rng) if isinstance(up, int) else up
     bags = positions(unit, corners, up, rng, **keys)
@@ -65,7 +65,7 @@ def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
 
 @pytest.fixture(scope='module')
 def parts(tmp_path_factory, cli, equal_fits_once):
-    """Fit, by the command, tables of a unit whose axes follow parts with different lags."""
+    """Run the command `fit` on tables of a unit with a different part lag for each axis."""
     unit, study = study_of('parts', part_s=PARTS_S)
     folder, tables = tmp_path_factory.mktemp('parts'), []
     for bag in study.bags:
@@ -82,7 +82,7 @@ def parts(tmp_path_factory, cli, equal_fits_once):
 
 @cache
 def soaked(grade):
-    """Fit a unit to soaks in 18 positions; also score the fit in ramps."""
+    """Fit a unit to soaks in 18 positions; return its errors in held-out ramps, too."""
     unit, study = study_of('rests', 0, up=18, corners=SOAKS, grade=grade)
     return unit, study, judged(strangers.fitted(study), study)
 
@@ -103,23 +103,23 @@ def judged(calibration, study):
     return strangers.score(outs, [minutes(bag) for bag in bags], is_drift=False)
 
 
-def test_the_lags_are_those_of_the_parts_each_for_its_axis(parts):
+def test_the_fitted_lag_of_each_axis_is_that_of_its_part(parts):
     unit, study, calibration, _ = parts
-    # An error of 1 % of a time constant is 1 ug (10 ug/K, lag of 10 K).
+    # A part with 10 ug/K lags by 10 K in a ramp: 1 % of its time constant is an error of 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
 
 
 @pytest.mark.slow
-def test_a_part_between_board_and_case():
+def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
     case_share = np.array([0.6, 0.3, 0.0])
     unit, study = study_of('between', part_s=PARTS_S, case_share=case_share)
     calibration = strangers.fitted(study)
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
     taus, _, shares, leads = np.array(sorted(parts)).T
-    # Ramps determine a time constant to 1 %, and so the case's share in a part's input to 0.01.
+    # Ramps determine time constants to 1 %, and the case's share in a part's input to 0.01.
     assert taus == pytest.approx(unit.part_s, rel=0.02)
     assert shares == pytest.approx(case_share, abs=0.02)
     assert not leads.any()
@@ -128,9 +128,9 @@ def test_a_part_between_board_and_case():
 
 @pytest.mark.slow
 @pytest.mark.parametrize('sensors', [('board',), ('board', 'case')])
-def test_thermometers_that_lag_board_and_case(sensors):
-    # WHY: a model without the thermometers' lag left 1.2 times the noise, so the fit chose a bank
-    # of time constants: in another program the error was 57 ug, the claimed sd 2 ug.
+def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
+    # WHY: without the thermometer lag in the model the fit chose a bank of time constants instead
+    # of one per part; in a held-out program the error was 57 ug, the claimed sd 2 ug.
     given = {'part_s': PARTS_S, 'thermometer_s': 60.0, 'sensors': sensors}
     unit, study = study_of('slow thermometer', **given)
     calibration = strangers.fitted(study)
@@ -139,43 +139,43 @@ def test_thermometers_that_lag_board_and_case(sensors):
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # Each part lags board + share * (case - board); the share is equal for all axes.
+        # A lag of both thermometers acts like one share of (case - board) in all part inputs.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
-        # Thermometer lag / part lag (60 s / tau) is fitted with an error below 0.01 per axis.
+        # `leads / taus` is the lag of the thermometer (60 s) / lag of the part.
         assert leads / taus == pytest.approx(60.0 / unit.part_s, abs=0.01)
 
 
 @pytest.mark.slow
-def test_slow_tilts_of_a_support_are_no_second_stage_of_a_lag():
-    # WHY: second stages, shares of the gradient and mounting offsets of 5 mg explained tilts of 60
-    # urad within 4 h: the error in another program was 5.8 mg, for a cubic by hand 0.27 mg.
+def test_slow_tilts_of_a_support_are_not_fitted_by_a_second_stage_of_a_lag():
+    # WHY: tilts of 60 urad within 4 h were fitted by second stages of lags and offsets of 5 mg: in
+    # a held-out program the error was 5.8 mg, that of a cubic 0.27 mg.
     _, study, _ = slow_drift(2)
     calibration = strangers.fitted(study)
     parts = {part.part for part in calibration.response if part.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
-    # Twelve positions average drifts of 40 ug RMS, the tilts of one position.
+    # The tilts of one position are a drift of 40 ug RMS; twelve positions average it.
     tests = {'': [minutes(bag) for bag in study.tests['']]}
     assert strangers.scored(study, calibration, tests)[''].vector < 40.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [0, 1, 3])
-def test_a_coarse_or_noisy_thermometer_leaves_less_than_a_cubic_by_hand(number):
+def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_scipy(number):
     study = list(coarse_thermometer(1))[number]
     ours = judged(strangers.fitted(study), study)
     bags = [minutes(bag) for bag in study.tests['']]
     correct = strangers.scipy_baselines(study)['cubic']
     by_hand = strangers.error_of([correct(bag) for bag in bags], bags, is_drift=False)
-    # The errors of one unit scatter by some 20 %.
+    # For a single unit the ratio of the two errors scatters by some 20 %.
     assert ours.vector < 1.2 * by_hand.vector
     assert ours.ratio < 1.5
 
 
 @pytest.mark.slow
 def test_bags_that_only_warm_up_predict_a_cool_down():
-    # WHY: lags were valid only for the ramp direction of the bags; a cool-down was off by 180 ug.
+    # WHY: the lags fitted to warm-ups did not hold in a cool-down, which had an error of 180 ug.
     warm, cool = program(5, 20, (35, 0.8, 40)), program(33, 20, (10, 0.8, 40))
     given = {'corners': warm, 'held': cool, 'part_s': PARTS_S / 2.0}
     _, study = study_of('only warm', up=10, **given)
@@ -183,8 +183,9 @@ def test_bags_that_only_warm_up_predict_a_cool_down():
 
 
 @pytest.mark.slow
-def test_a_noisy_sensor_in_one_warm_up_shows_its_lags():
-    # WHY: with a spline of 60 nodes a fitted lag was twice the true lag, and the error 80 ug.
+def test_lags_of_a_noisy_sensor_are_fitted_to_bags_of_one_warm_up():
+    # WHY: the fit chose a spline of 60 nodes, a lag of twice the true lag, and had errors of 80
+    # ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)
     unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
@@ -196,8 +197,8 @@ def test_a_noisy_sensor_in_one_warm_up_shows_its_lags():
 
 
 @pytest.mark.slow
-def test_bags_of_one_warm_up_predict_another():
-    # All bags have the same warm-up, so each lag is a function of the board temperature.
+def test_a_fit_to_equal_warm_ups_predicts_a_slower_warm_up():
+    # The bags have equal warm-ups, in which a lag is a function of board temperature.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
     given = {'held': program(-15.0, 10.0, (20.0, 20.0, 90.0)), 'part_s': PARTS_S / 4.0}
     _, study = study_of('thaw', up=10, corners=thaw, **given)
@@ -207,7 +208,7 @@ def test_bags_of_one_warm_up_predict_another():
     assert judged(calibration, study).norm < 2.0
 
 
-def test_a_curve_over_a_part_is_a_sum_of_columns():
+def test_powers_of_a_part_temperature_are_sums_of_columns():
     t, m = np.linspace(-15.0, 15.0, 7), np.linspace(4.0, -3.0, 7)
     part = Part(900.0)
     line = Polynomial((0.0, 1.0, 1.0, 1.0))
@@ -227,7 +228,7 @@ def test_a_curve_over_a_part_is_a_sum_of_columns():
 
 
 @pytest.mark.slow
-def test_one_thermometer_is_sufficient():
+def test_lags_are_fitted_without_a_case_thermometer():
     unit, study = study_of('parts', up=12, part_s=PARTS_S, sensors=('board',))
     calibration = strangers.fitted(study)
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
@@ -235,7 +236,7 @@ def test_one_thermometer_is_sufficient():
 
 
 @pytest.mark.slow
-def test_a_unit_without_lags_gets_none():
+def test_no_lag_is_fitted_to_a_unit_without_lags():
     _, study = study_of('no lag', part_s=np.zeros(3))
     calibration = strangers.fitted(study)
     assert not any(term.tau_s for term in calibration.response)
@@ -244,8 +245,8 @@ def test_a_unit_without_lags_gets_none():
 
 @pytest.mark.slow
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
-    # WHY: the fit explained an effect of the gradient by a time constant of 223 s instead of
-    # 163 s: the error in a soak was 167 ug, the claimed sd 15 ug.
+    # WHY: an effect of the gradient was fitted by a lag of 223 s instead of 163 s; in a soak the
+    # error was 167 ug, the claimed sd 15 ug.
     (study,) = gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
@@ -253,22 +254,22 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 
 
 @pytest.mark.slow
-def test_a_bump_is_no_disturbance_and_no_motion():
-    # At 0.5 Hz a cell of 30 samples takes 60 s; the unit passes the bias bump within two cells.
+def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
+    # In two means over 60 s the unit passes the bump, which must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
-    # A fit of all groups chooses curve, part and bend, too, but takes three times as long.
+    # A fit of all groups chooses these three groups, too, but takes three times as long.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
     judgement = judged(calibration, study)
-    # The bias bump, a bell with an sd of 0.85 K, is fitted by lines between knees every 0.5 K.
+    # The bump is a bell with an sd of 0.85 K; the fit has straight lines between knees of 0.5 K.
     assert judgement.norm < 60.0
     assert judgement.norm_ratio < 1.5
 
 
 @pytest.mark.slow
-def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
-    # Heads lag the board, pendulums the heads; stress by T_board - T_pendulum changes the bias.
+def test_two_lags_in_series_are_fitted_as_two_stages():
+    # Heads lag the board and pendulums lag the heads; T_board - T_pendulum changes the bias.
     unit = second_simulator.unit_of('products', 2)
-    # Two equal stages of the x axis are fitted as two time constants with a ratio of 0.89.
+    # Two equal time constants are fitted as two time constants with a ratio of 0.89.
     unit.pendulum_s[0] = unit.head_s[0]
     _, program, *_, held = second_simulator.PLANS['mild']
     up = second_simulator.directions(9, 5)
@@ -278,7 +279,7 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
     for record in (*records, *tests):
         for name in ('board', 'case', 'board_stamp_ns', 'case_stamp_ns'):
             setattr(record, name, getattr(record, name)[::10])
-    # A fit of the groups of the unit's physics takes half the time of a fit of all groups.
+    # A fit with only the groups of the simulated unit takes half the time.
     groups = ('curve', 'board', 'part', 'product', 'square')
     result = fit_and_correct(records, tests, full_scale=FULL_SCALE['full_scale'], groups=groups)
     least, _ = second_simulator.floor_of(tests)
@@ -296,33 +297,33 @@ def test_a_part_that_hangs_on_another_part_lags_in_two_stages():
 
 @pytest.mark.slow
 @pytest.mark.parametrize('grade', [consumer_grade, navigation])
-def test_soaks_determine_the_curve_by_their_norms(grade):
-    # The board drifts by 0.01 K within a soak; 26 K between soaks change |f| by some mg.
+def test_norms_of_soaks_determine_the_curve_over_temperature(grade):
+    # Within a soak the board drifts by 0.01 K; from soak to soak, over 26 K, |f| changes by mg.
     _, study, score = soaked(grade)
     means = [minutes(bag) for bag in study.tests['']]
     forces = [strangers.scipy_baselines(study)['constants'](mean) for mean in means]
-    # Soaks do not determine the lags, so their effect remains as an error in held-out ramps.
+    # Soaks do not determine lags, so in held-out ramps errors by the lags remain.
     assert score.norm < 0.5 * strangers.error_of(forces, means, is_drift=False).norm
     assert score.ratio < 1.5
 
 
 @pytest.mark.slow
-def test_six_faces_in_three_soaks():
-    # WHY: to second order, misalignments of 0.3 rad explain the norms of six faces: the fit of a
-    # unit with drifts of 10 mg left 40 mg, and divided by zero if `mounting_sd` was stated.
+def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
+    # WHY: misalignments of 0.3 rad fitted the norms of six faces. A fit had errors of 40 mg for
+    # drifts of 10 mg, and divided by zero if `mounting_sd` was stated.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
     )  # fmt: skip
     for stated in ({}, {'mounting_sd': 3e-4}):
-        # Means of 25 min have a noise of 4 ug; quanta of 0.5 mg add errors of some 40 ug.
+        # Means over 25 min have a noise of 4 ug; rounding to 0.5 mg adds errors of some 40 ug.
         calibration = strangers.fitted(study, **stated)
         assert judged(calibration, study).vector < 100.0
 
 
 @pytest.mark.slow
-def test_a_curve_between_two_soaks_is_claimed():
-    # WHY: two soaks do not determine the powers of t; without these powers in the covariance the
+def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
+    # WHY: two soaks do not determine powers of t. The covariance lacked these powers, and the
     # claimed sd was 1/8 of the error.
     given = {'held': program(19.0, 90.0), 'grade': consumer_grade}
     _, study = study_of('two soaks', up=18, corners=SOAKS[::2], **given)
@@ -330,15 +331,15 @@ def test_a_curve_between_two_soaks_is_claimed():
 
 
 @pytest.mark.slow
-def test_a_curve_that_the_soaks_do_not_show_is_claimed():
-    # WHY: if each axis was vertical at another temperature, the error was 15 times the claimed sd.
+def test_the_claimed_sd_includes_a_curve_that_soaks_do_not_determine():
+    # WHY: each axis is vertical at one temperature only; the error was 15 times the claimed sd.
     _, study = study_of('confounded soaks', up=np.vstack((FACES, np.eye(3))), corners=SOAKS)
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
 
 @pytest.mark.slow
 def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
-    # WHY: the score of left-out soaks, which show no lag, rejected the columns of lags.
+    # WHY: lags do not change the errors of left-out soaks, so the columns of lags were rejected.
     unit, alone, score = soaked(navigation)
     rng = rng_of('soaks and a ramp')
     (ramps,) = positions(unit, HALF, spread(1, rng), rng)
@@ -349,9 +350,9 @@ def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
 
 
 @pytest.mark.slow
-def test_a_decay_after_power_on_is_no_lag():
-    # WHY: all bags start at 22 degC, and lags of the temperature imitated a decay of the bias that
-    # no thermometer shows: bags that start at other temperatures were 1.7 mg wrong.
+def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
+    # WHY: all bags of the fit start at 22 degC, and lags were fitted to a decay of the bias after
+    # power-on: bags that start at other temperatures had errors of 1.7 mg.
     rng = rng_of('power-on', 4)
     unit = consumer_grade(rng)
 
@@ -364,8 +365,7 @@ def test_a_decay_after_power_on_is_no_lag():
         for way, n in ((WARM, 12), (WARM_HELD, 4))
     )
     study = Study('', fit, one_test(held), {'full_scale': 32767.0})
-    # A decay that the fit leaves has an RMS of 0.32 mg over the 95 min of the bags. Its mean moves
-    # the constants, and is smaller.
+    # The decay has an RMS of 0.32 mg over a bag. Its mean, an error of the constants, is smaller.
     assert judged(strangers.fitted(study), study).vector < np.sqrt(2.0) * 320.0
 
 
@@ -374,19 +374,19 @@ def lags_of(calibration):
 
 
 @pytest.mark.slow
-def test_a_hidden_node_gives_the_fit_a_bank_of_lags():
-    # A hidden part without a thermometer: no axis' bias is a curve of one part's temperature.
+def test_lags_of_a_unit_with_a_hidden_node_are_those_of_the_bank():
+    # The bias of each axis depends on its part and on a hidden node without a thermometer.
     study = next(third_node(0))
-    # A fit of all groups chooses the six groups in `groups`, but takes 1.5 times as long.
+    # A fit of all groups chooses these six groups, too, but takes 1.5 times as long.
     groups = ('curve', 'part', 'board', 'gradient_lag', 'product', 'square')
     calibration = strangers.fitted(replace(study, bags=study.bags[:8]), groups=groups)
     assert lags_of(calibration) <= {*FINE_TAUS}
 
 
 @pytest.mark.slow
-def test_soaks_alone_show_neither_lags_nor_a_loose_thermometer():
-    # Soaks determine no time constant. Soaks do not show the lag of the board either, so the
-    # gradient of a ramp does not indicate a fault.
+def test_a_fit_to_soaks_has_no_fitted_lag_and_no_range_of_the_gradient():
+    # Soaks do not show case less board temperature in ramps, so a later ramp with a large
+    # difference must not be reported as a loose thermometer.
     study = next(soaks(1))
     calibration = strangers.fitted(replace(study, bags=study.bags[:9]))
     assert lags_of(calibration) <= {*FINE_TAUS}
@@ -394,9 +394,9 @@ def test_soaks_alone_show_neither_lags_nor_a_loose_thermometer():
 
 
 @pytest.mark.slow
-def test_six_faces_in_three_soaks_show_the_curve_of_a_mems():
-    # WHY: two of 78 such units got constants instead of a curve, because few left-out norms were
-    # determined: errors of the bias of 6 mg.
+def test_the_bias_of_a_mems_follows_its_curve_in_three_soaks_of_six_faces():
+    # WHY: for two of 78 such units the fit chose constants and no curve, because few left-out
+    # norms were determined; the errors of the bias were 6 mg.
     rng = rng_of('faces', 66)
     unit = replace(consumer_grade(rng), misalignment=1e-3 * rng.standard_normal(3))
     bags = []
@@ -412,7 +412,7 @@ def test_six_faces_in_three_soaks_show_the_curve_of_a_mems():
     for celsius in (5.0, 20.0, 35.0):
         bias, *_ = in_a_soak(calibration, celsius)
         true_bias = unit.bias_at(np.full((1, 3), celsius), np.zeros((1, 1)))[0]
-        # Misalignments of 1 mrad, which faces hardly show, give errors of up to 1 mg.
+        # Faces hardly determine misalignments of 1 mrad, which cause errors of up to 1 mg.
         assert np.abs(bias / UG - true_bias).max() < 1000.0
 
 
@@ -429,11 +429,11 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
     assert {term.tau_s for term in mean.response if term.tau_s} <= {*FINE_TAUS}
     bag = slow(study.tests[''][0])
     off = strangers.corrected(mean, bag).force - strangers.corrected(calibration, bag).force
-    # The effect of a lag, 10 K at 20 ug/K = 200 ug, differs by up to 7 % between the units.
+    # The effect of a lag is 200 ug (10 K, 20 ug/K), and differs by up to 7 % between the units.
     assert np.sqrt(np.mean(off**2)) < 5.0 * UG
 
 
-def test_fit_says_how_far_the_parts_lag(parts):
+def test_fit_prints_the_fitted_lags_of_the_parts(parts):
     unit, *_, (text, content) = parts
     (line,) = (line for line in text.splitlines() if 'its part' in line)
     printed = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]

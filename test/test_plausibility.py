@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Impossible readings of a thermometer are rejected, possible readings are not."""
+"""Faults of a thermometer are detected, and readings of a working thermometer are accepted."""
 
 import math
 from functools import cache
@@ -35,7 +35,7 @@ def tracker_of(sensor='continuous', memory=None, board_lag_s=900.0, **config):
 
 
 def soak(tracker, celsius=20.0, seconds=60, start_s=0):
-    """Feed both sensors once a second with the flicker of working sensors; return the end time."""
+    """Push readings of both sensors each second, alternating by some mK; return the end time."""
     for second in range(start_s, start_s + seconds):
         flicker = 0.004 * (-1) ** second
         tracker.read('board', second * SECOND_NS, celsius + flicker)
@@ -44,7 +44,7 @@ def soak(tracker, celsius=20.0, seconds=60, start_s=0):
 
 
 def test_the_first_reading_of_a_sensor_may_be_wrong():
-    """After the 85 degC of a DS18B20 without a conversion correct readings are accepted."""
+    """A DS18B20 reads 85 degC before its first conversion; later readings are accepted."""
     tracker = tracker_of()
     tracker.read('board', 0, 85.0)
     tracker.read('board', SECOND_NS, 85.0)
@@ -55,8 +55,8 @@ def test_the_first_reading_of_a_sensor_may_be_wrong():
 
 @pytest.mark.parametrize('wrong', [85.0, 24.2, -40.0])
 @pytest.mark.parametrize('sensor', ['board', 'case'])
-def test_a_wrong_first_reading_leaves_no_trace(sensor, wrong):
-    # WHY: one reading of 85 degC after power-up caused errors of 1 mg for 20 min.
+def test_a_wrong_first_reading_does_not_change_later_thermal_states(sensor, wrong):
+    # WHY: one reading of 85 degC after power-on caused errors of 1 mg for 20 min.
     memory = MemorySpec(lags=(('board', 900.0), ('case', 600.0)))
     tracker, without = tracker_of(memory=memory), tracker_of(memory=memory)
     for second in range(0, 900, 5):
@@ -74,10 +74,10 @@ def test_a_wrong_first_reading_leaves_no_trace(sensor, wrong):
 
 
 @pytest.mark.parametrize('lag_s', [0.0, 300.0])
-def test_a_ramp_or_a_step_of_the_air_at_the_start_is_no_wrong_reading(lag_s):
+def test_a_fast_change_at_the_start_is_not_taken_for_a_wrong_reading(lag_s):
     tracker = tracker_of(memory=LAG)
     for second in range(0, 60, 5):
-        # A ramp of 12 K/min, or the response to a step of 40 K behind a lag of 300 s.
+        # A ramp of 12 K/min, or a step of the air by 40 K after a lag of 300 s.
         changed = 40.0 * (1.0 - math.exp(-second / lag_s)) if lag_s else 0.2 * second
         tracker.read('board', second * SECOND_NS, 20.0 + changed)
     assert tracker.memory.board.start_ns == 0
@@ -85,7 +85,7 @@ def test_a_ramp_or_a_step_of_the_air_at_the_start_is_no_wrong_reading(lag_s):
 
 @pytest.mark.parametrize('sensor', SENSORS)
 @pytest.mark.parametrize('frozen', ['board', 'case'])
-def test_a_frozen_sensor_is_found_by_changes_of_the_second_sensor(sensor, frozen):
+def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, frozen):
     tracker = tracker_of(sensor, board_lag_s=300.0)
     quantum = SENSORS[sensor].quantum_c
     rng = np.random.default_rng(5)
@@ -111,7 +111,8 @@ def test_a_frozen_sensor_is_found_by_changes_of_the_second_sensor(sensor, frozen
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # A frozen board is wrong by up to 4 quanta and 2 K, a frozen case by 10 K more.
+    # Before its detection a frozen board has an error of up to 4 quanta + 2 K, a frozen case of
+    # 10 K more.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
@@ -122,7 +123,7 @@ def test_a_frozen_sensor_is_found_by_changes_of_the_second_sensor(sensor, frozen
     assert guard.fault == Fault.NONE
 
 
-def test_a_ramp_does_not_end_because_a_sensor_stands_still():
+def test_the_dynamic_regime_does_not_end_because_both_sensors_freeze():
     tracker = tracker_of()
     soak(tracker, seconds=1500)
     for second in range(1500, 2500):
@@ -134,7 +135,7 @@ def test_a_ramp_does_not_end_because_a_sensor_stands_still():
     assert tracker.detector.regime == Regime.DYNAMIC
 
 
-def test_a_standstill_within_the_quantum_is_no_fault():
+def test_constant_readings_of_a_coarse_sensor_are_no_fault():
     tracker = tracker_of('sixteenths')
     for second in range(3600):
         tracker.read('board', second * SECOND_NS, 20.0)
@@ -143,7 +144,7 @@ def test_a_standstill_within_the_quantum_is_no_fault():
 
 
 def test_readings_that_may_repeat_by_chance_are_no_fault():
-    # With noise of half a quantum a reading repeats with p = 0.68, 54 times with p = 1e-9.
+    # With a noise of 0.5 quanta a reading repeats with p = 0.68, and 54 times with p = 1e-9.
     assert still_readings(ThermometerSettings(0.005, 0.01)) == 54
     assert still_readings(ThermometerSettings(0.005, 0.0)) == STILL_READINGS
 
@@ -168,7 +169,7 @@ def in_its_chamber(preset, sensor):
         *((preset, 'sixteenths') for preset in ('bare-quartz', 'mems')),
     ],
 )
-def test_a_working_unit_in_its_chamber_is_never_reported(preset, sensor):
+def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
     tracker = tracker_of(sensor)
     for stamp_ns, is_case, celsius in in_its_chamber(preset, sensor):
         tracker.read('case' if is_case else 'board', stamp_ns, celsius)
@@ -177,7 +178,7 @@ def test_a_working_unit_in_its_chamber_is_never_reported(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# With swapped topics a board that follows the case within seconds leads by less than 1 K.
+# The other preset is left out: its board follows the case in seconds and would lead by below 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [
@@ -196,10 +197,10 @@ def test_swapped_topics_are_reported(preset, sensor):
     pytest.fail('the board has never led the case')
 
 
-def test_a_unit_that_was_switched_on_heats_itself_and_is_not_swapped():
-    # WHY: the warm-up after a start, in which the board leads, was taken for exchanged topics; the
-    # claimed sd of the run was 20 times too large. WHAT: the board warms up by 4 K, the case by a
-    # third of this; then a ramp follows, in which the case leads.
+def test_the_warm_up_after_power_on_is_not_taken_for_swapped_topics():
+    # WHY: in the warm-up after power-on the board leads the case, which was taken for exchanged
+    # topics; the claimed sd was 20 times too large. WHAT: the board warms up by 4 K, the case by
+    # 1.3 K; in the ramp after it the case leads.
     tracker = tracker_of(memory=LAG)
     for second in range(3 * 3600):
         warm = 4.0 * (1.0 - math.exp(-second / 500.0))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Player and recorder pass every message over DDS byte for byte, in the order of the bag."""
+"""The player sends every message of a bag over DDS byte for byte, in the order of the bag."""
 
 import hashlib
 import subprocess
@@ -74,12 +74,12 @@ def by_topic(path):
 
 
 @pytest.mark.parametrize('rate', [0.0, 20.0], ids=['as fast as taken', 'paced'])
-def test_every_message_arrives_byte_for_byte(peer, tmp_path, rng, rate):
+def test_every_message_played_over_dds_arrives_byte_for_byte(peer, tmp_path, rng, rate):
     bag = bag_of(tmp_path / 'bag', 4000, rng)
     listener = Listener(peer)
     progress = []
     report = play(bag, rate=rate, progress=progress.append)
-    # The player has ended, so every reliable subscriber has received every message.
+    # The player ends after all reliable subscribers have received all messages.
     listener.wait_for(4800)
     assert listener.topics == by_topic(bag)
     temperatures = {'/temperature/board': 400, '/temperature/case': 400}
@@ -111,8 +111,8 @@ print(digest.hexdigest())
 """
 
 
-def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng):
-    # The bag has more messages than the middleware holds (5000), sent too fast for a callback.
+def test_the_player_waits_for_a_slow_subscriber_which_loses_no_message(tmp_path, rng):
+    # More messages than the middleware stores (5000) are sent faster than the subscriber reads.
     with BagWriter(tmp_path / 'bag.mcap') as writer:
         stamps = START_NS + np.arange(7000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (7000, 3)), 'imu_link')
@@ -120,11 +120,11 @@ def test_a_slow_subscriber_slows_the_player_down_and_loses_nothing(tmp_path, rng
         [sys.executable, '-c', SLOW_LISTENER], stdout=subprocess.PIPE, text=True
     ) as listener:
         try:
-            # The listener is a new process, which may start slowly on a busy machine.
+            # On a busy machine the process of the listener may need a long time to start.
             report = play(tmp_path / 'bag.mcap', rate=0.0, wait_s=TIMEOUT)
             printed, _ = listener.communicate(timeout=2 * TIMEOUT)
         finally:
-            # A listener that still waits for messages would block the end of the test.
+            # After a failure the listener waits for further messages; end it.
             listener.kill()
     assert report.n_messages == {'/accel/counts': 7000}
     expected = hashlib.sha256(b''.join(messages_of(tmp_path / 'bag.mcap'))).hexdigest()
@@ -155,7 +155,7 @@ def test_imu_messages_are_played_under_the_names_of_the_bag(peer, tmp_path, rng)
     assert list(report.n_messages) == ['/imu/uncompensated']
 
 
-def test_ros1_bags_are_played_in_cdr(peer, tmp_path):
+def test_ros_1_bags_are_played_in_cdr(peer, tmp_path):
     path, messages = tmp_path / 'old.bag', []
     for k in range(20):
         for topic, numbers in ((BOARD, (20.0 + k, 0.0)), (ACCEL, (float(k), 2.0, 3.0))):
@@ -180,8 +180,8 @@ def test_play_refuses_a_negative_rate_and_an_absent_bag(tmp_path, rng):
         play(tmp_path / 'none')
 
 
-def test_the_wait_for_a_subscriber_that_takes_nothing_ends(peer, tmp_path, rng, monkeypatch):
-    # The middleware accepts 5000 messages and then refuses further messages.
+def test_the_player_ends_if_a_subscriber_takes_no_message(peer, tmp_path, rng, monkeypatch):
+    # The middleware stores 5000 messages and refuses further messages.
     with BagWriter(tmp_path / 'bag') as writer:
         stamps = START_NS + np.arange(8000) * CYCLE_NS
         writer.write_counts(TOPICS.counts, stamps, rng.integers(-9, 9, (8000, 3)))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The posterior in a file: its factor gives the covariance; its parameters have a fixed order."""
+"""The factor of the posterior in a calibration file gives the covariance of its parameters."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def random_covariance(seed, n, spread=1.0):
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.sampled_from([0.0, 1e-5, 1e-3, 0.1]))
 @settings(max_examples=60, deadline=None)
-def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, tolerance):
+def test_variances_are_kept_and_correlation_errors_are_within_the_tolerance(seed, n, tolerance):
     covariance = random_covariance(seed, n)
     posterior = posterior_of(covariance, tolerance)
     sd = np.sqrt(np.diag(covariance))
@@ -44,14 +44,14 @@ def test_variances_stay_and_correlations_miss_by_the_tolerance(seed, n, toleranc
     assert posterior.matrix.shape == (n, posterior.rank)
 
 
-def test_a_tolerance_makes_the_factor_smaller():
+def test_a_larger_tolerance_gives_a_smaller_factor():
     covariance = random_covariance(1, 30)
     ranks = [posterior_of(covariance, share).rank for share in (0.1, 1e-3, 1e-5)]
     assert ranks == sorted(ranks)
     assert ranks[0] < ranks[-1] <= 30
 
 
-def test_exactly_known_parameters_have_no_variance():
+def test_exactly_known_parameters_have_zero_variance():
     covariance = np.zeros((4, 4))
     assert posterior_of(covariance) == Posterior.of(np.empty((4, 0)), np.zeros(4))
     covariance[2, 2] = 9.0
@@ -71,12 +71,12 @@ def test_exactly_known_parameters_have_no_variance():
         ([[0.0, 1.0], [1.0, 1.0]], 'must be positive semidefinite'),
     ],
 )
-def test_matrix_that_is_no_covariance_is_refused(matrix, message):
+def test_a_matrix_that_is_not_a_covariance_is_refused(matrix, message):
     with pytest.raises(ValueError, match=f'`covariance` {message}'):
         posterior_of(np.array(matrix))
 
 
-def test_numbers_beyond_single_precision_are_refused():
+def test_numbers_too_large_for_single_precision_are_refused():
     with pytest.raises(ValueError, match='`factor` must hold finite numbers'):
         posterior_of(np.array([[1e80]]))
 
@@ -92,7 +92,7 @@ def test_arrays_of_a_posterior_are_read_only():
         posterior.matrix[0, 0] = 1.0
 
 
-def test_the_order_of_parameters_by_hand():
+def test_the_order_of_parameters_equals_one_found_by_hand():
     spline = CubicSpline((-5.0, 0.0, 5.0, 9.0), (0.1, 0.0, 0.2, 0.3))
     value = calibration(
         static=regime_set(axis_set((0.0, 1.0, 2.0)), axis_set(), axis_set(scale=(1.0, 1e-4))),
@@ -123,7 +123,7 @@ def whole_bank(sensors):
     return replace(value, posterior=Posterior.of(factor, np.full(n, 1 / 3)))
 
 
-def test_the_whole_bank_of_two_thermometers_fits_into_a_file():
+def test_a_model_of_all_columns_of_two_thermometers_can_be_saved():
     value = whole_bank(('case', 'frame'))
     content = dump_calibration(value).encode()
     assert len(content) < SIZE_LIMIT
@@ -135,7 +135,7 @@ def test_a_file_above_the_size_limit_is_not_written():
         dump_calibration(whole_bank(('case', 'frame', 'window')))
 
 
-#: The sd of mountings is given, because six faces do not determine it.
+#: The sd of bias changes from mounting to mounting is stated, as six faces do not determine it.
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2', groups=('curve',), mounting_sd=1e-6)
 FACES = np.vstack((np.eye(3), -np.eye(3)))
 
@@ -149,19 +149,19 @@ def said(result):
     return next((finding.message for finding in result.findings if finding.name == 'unseen'), '')
 
 
-def test_faces_leave_the_corners_to_the_prior_of_the_misalignment(rng):
+def test_six_faces_determine_attitudes_at_the_corners_of_a_cube_least(rng):
     result = fitted(rng, FACES)
     least = result.least_known
     assert least_known(replace(result.calibration, posterior=None), FACES) is None
-    # The variance is flat near a corner, so the attitude may be the grid point beside the corner.
+    # Near a corner of the cube the variance changes little: the grid point found may be beside it.
     np.testing.assert_allclose(np.abs(least.up), 3.0**-0.5, atol=0.05)
     assert least.away_deg == pytest.approx(np.degrees(np.arccos(3.0**-0.5)), abs=4.0)
-    # Three angles of 1 % (prior of a MEMS) change |f| by g times xy, xz and yz of the direction
-    # (x, y, z) of gravity; noise adds a little.
+    # Each of three misalignment angles (prior sd of a MEMS: 0.01 rad) changes |f| by g times the
+    # product of two components of the direction of gravity, each of them 1 / sqrt(3) at a corner.
     assert least.sd_m_s2 == pytest.approx(GRAVITY * 1e-2 / 3.0**0.5, rel=0.2)
 
 
-def test_the_attitude_of_a_side_that_was_never_up_is_named(rng):
+def test_the_least_determined_attitude_is_that_of_a_side_that_was_never_up(rng):
     ups = positions(30, 4)
     result = fitted(rng, ups[ups[:, 2] > 0.2])
     np.testing.assert_allclose(result.least_known.up, (0.0, 0.0, -1.0), atol=0.06)
@@ -169,7 +169,7 @@ def test_the_attitude_of_a_side_that_was_never_up_is_named(rng):
     assert said(result) in ' '.join(result.calibration.provenance.notes)
 
 
-def test_no_undetermined_attitude_is_named_for_spread_positions(rng):
+def test_no_least_determined_attitude_is_printed_for_well_spread_positions(rng):
     result = fitted(rng, positions(18, 4))
     assert result.least_known.sd_m_s2 < 2.0 * result.least_known.seen_sd_m_s2
     assert not said(result)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An earlier calibration, or siblings of a unit, improve a fit with little data."""
+"""Fits to little data with an earlier calibration, or with units of the type, as a prior."""
 
 from dataclasses import replace
 from functools import cache
@@ -27,12 +27,12 @@ from thermo_comp.unit.prediction import in_a_soak
 
 PROGRAM = parse_cyclogram('20 5min, 33@1 15min, 8@1 15min')
 KIND = triad('products', 1)
-#: The groups of the unit's physics: a third of all columns, fitted in half the time of all groups.
+#: The groups of the simulated unit are a third of all columns, and take half the time to fit.
 OPTIONS = FitOptions(STANDARD_GRAVITY, groups=('curve', 'board', 'product'))
 
 
 def source(record):
-    # A reading every eight seconds suffices for ramps of 1 K/min, and saves most of a fit's time.
+    # A reading every 8 s is sufficient in ramps of 1 K/min, and saves most of the time of a fit.
     arrays = arrays_of(record, 8)
     later = [array + 10**18 if array.dtype == np.int64 else array for array in arrays]
     return source_of(*later)
@@ -52,8 +52,8 @@ test_of.__test__ = False
 @cache
 def fitted(number):
     """
-    Fit a sibling on nine of its twelve positions, which determine all parameters but the sd
-    of mountings; the sd of mountings is stated.
+    Fit a sibling to nine of its twelve positions. Nine positions do not determine the sd of
+    mountings, so it is stated.
     """
     options = replace(OPTIONS, serial=f'unit-{number}', mounting_sd=1e-6 * STANDARD_GRAVITY)
     return fit([source(record) for record in test_of(number, 0, 9)], options)
@@ -71,7 +71,7 @@ def sd_of_levels(calibration):
 
 
 @pytest.mark.slow
-def test_population_is_the_mean_unit_and_its_scatter():
+def test_a_population_has_the_mean_of_its_units_and_their_scatter():
     prior = population(siblings())
     K = np.array([[unit.axes.x.scale_factor, unit.axes.z.scale_factor] for unit in siblings()])
     assert prior.axes.x.scale_factor == pytest.approx(np.exp(np.log(K[:, 0]).mean()))
@@ -87,9 +87,9 @@ def test_population_is_the_mean_unit_and_its_scatter():
     variance = np.diag(prior.posterior.covariance())
     at = parameter_layout(prior).bias[0].static + 1
     sd = np.sqrt(variance[at]) / prior.axes.x.scale_factor
-    # The variance of the next unit is 4/3 of the scatter of three units, in the mean of the axes,
-    # times 6 / (6 - 2) for Student's distribution with 6 degrees of freedom, plus the variance of
-    # the units' own slopes.
+    # Predicted variance of a fourth unit: 4/3 of the scatter of three units, mean over the axes,
+    # times 6 / (6 - 2) for Student's distribution with 6 degrees of freedom, plus the variance
+    # claimed by the calibrations of the three units.
     own = []
     for unit in siblings():
         variance = np.diag(unit.posterior.covariance())
@@ -99,9 +99,9 @@ def test_population_is_the_mean_unit_and_its_scatter():
     assert sd == pytest.approx(np.sqrt(expected), rel=1e-3)
 
 
-def test_three_units_that_are_alike_by_chance_do_not_determine_an_axis(rng):
-    # WHY: three siblings had nearly equal biases on one axis; with the prior of these
-    # siblings a fit of nine positions had an error of 363 ug, without this prior 77 ug.
+def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
+    # WHY: on one axis three siblings had nearly equal biases by chance; with their prior a fit of
+    # nine positions had an error of 363 ug, without a prior 77 ug.
     layout = parameter_layout(rich_calibration())
     deviations = rng.standard_normal((3, layout.n_parameters))
     level = layout.bias[1].static
@@ -111,8 +111,9 @@ def test_three_units_that_are_alike_by_chance_do_not_determine_an_axis(rng):
     np.testing.assert_allclose(sd[places] / sd[level], [2.0, 1.0, 1.0])
 
 
-def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(rng):
-    # WHY: a fit of one position with a prior of twelve units was off by 4.7 mg, claimed sd 0.9 mg.
+def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng):
+    # WHY: a fit of one position with a prior from twelve units had an error of 4.7 mg; the claimed
+    # sd was 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 
@@ -125,20 +126,20 @@ def test_correlations_by_chance_do_not_determine_the_parameters_of_another_unit(
     independent = rng.standard_normal((12, n))
     bias, M = layout.bias[1].response - 1, layout.misalignment
     assert share_left(independent, M) == pytest.approx(1.0)
-    # In the prior the dynamic level of a bias is correlated with its static level alone.
+    # In the prior the dynamic level of a bias is correlated only with the static level.
     level = layout.bias[0].dynamic
     pair = np.corrcoef(independent[:, [layout.bias[0].static, level]].T)[0, 1]
     assert share_left(independent, level) == pytest.approx(1.0 - pair**2)
     assert share_left(independent, bias) > 0.5
-    # Bias curves of both sets that have one cause determine each other.
+    # A correlation that all twelve units show is kept.
     common = rng.standard_normal((12, 1)) + 0.01 * independent
     assert share_left(common, bias) < 0.1
 
 
 @pytest.mark.slow
-def test_units_with_one_curve_for_both_sets_have_it_in_their_population():
-    # WHY: a prior with too small correlations made the equal curves of both sets independent: a
-    # fit of nine positions had an error of 3.1 ug with this prior, and 0.7 ug without it.
+def test_equal_curves_of_both_sets_stay_equal_in_a_population():
+    # WHY: in the prior the correlations between equal curves of both sets were reduced: a fit of
+    # nine positions had an error of 3.1 ug with this prior, and 0.7 ug without a prior.
     prior = population(siblings())
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     for block in (*layout.bias, *layout.scale):
@@ -146,14 +147,14 @@ def test_units_with_one_curve_for_both_sets_have_it_in_their_population():
         for static, dynamic in zip(*curves, strict=True):
             contrast = np.zeros(layout.n_parameters)
             contrast[[static, dynamic]] = 1.0, -1.0
-            # The posterior has single precision; unused coefficients have a rounding variance.
+            # The posterior has single precision, so unused coefficients have a variance of 1e-24.
             limit = 1e-5 * covariance[static, static] + 1e-24
             assert float(contrast @ covariance @ contrast) <= limit
 
 
 @cache
 def helped():
-    """Fit one position with the prior of the siblings; return also all priors that were tried."""
+    """Fit one position with the siblings' prior; return the calibration and all priors tried."""
     seen = []
 
     def fitted_with(*given):
@@ -170,10 +171,10 @@ def helped():
 
 
 @pytest.mark.slow
-def test_a_fit_starts_with_the_widest_prior():
-    # WHY: begun with the narrow prior of three units, a fit explained 190 ug by mounting offsets
-    # and stayed in this minimum: the held-out error was 271 ug instead of 0.9 ug. WHAT: a fit
-    # starts with the prior that is the widest in all directions.
+def test_a_fit_begins_with_the_widest_of_its_priors():
+    # WHY: a fit that began with the narrow prior of three units found mounting offsets of 190 ug,
+    # a local minimum: the held-out error was 271 ug instead of 0.9 ug. WHAT: a fit begins with the
+    # prior that has the largest variance in all directions.
     *tried, widest = (prior.root.T @ prior.root for prior in helped()[1])
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))
@@ -183,8 +184,8 @@ def test_a_fit_starts_with_the_widest_prior():
 
 
 @pytest.mark.slow
-def test_siblings_improve_the_fit_of_one_position():
-    # One position does not determine the scale over temperature, but the siblings' prior does.
+def test_the_prior_of_siblings_reduces_the_scale_error_of_one_position():
+    # One position does not determine the scale over temperature; the prior of siblings does.
     few = [source(record) for record in test_of(9, 0, 1)]
     alone = fit(few, replace(OPTIONS, serial='unit-9')).calibration
     truth = sibling(KIND, 9, 0.15)
@@ -197,13 +198,13 @@ def test_siblings_improve_the_fit_of_one_position():
     assert errors[1] < errors[0]
 
 
-def test_new_rests_improve_an_old_calibration():
+def test_three_positions_reduce_the_sd_of_an_aged_calibration():
     old = fitted(9).calibration
     later = [source(record) for record in test_of(9, 9, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=old, ageing_bias=1e-4, ageing_scale=2e-5)
     new = fit(later, options).calibration
-    # Three positions measure three of the six readings of faces, bias +- scale * g of each axis,
-    # so that half of the ageing variance is removed.
+    # Three positions determine three of the six sums bias +- scale * g of the axes, which removes
+    # half of the variance of ageing.
     grown = np.mean(sd_of_levels(old) ** 2 + options.ageing_bias**2)
     assert np.mean(sd_of_levels(new) ** 2) < 0.75 * grown
     bias = [(a.bias - b.bias) / a.scale_factor for a, b in zip(new.axes, old.axes, strict=True)]
@@ -211,8 +212,8 @@ def test_new_rests_improve_an_old_calibration():
 
 
 @pytest.mark.slow
-def test_rests_at_one_temperature_correct_ageing_and_keep_the_response():
-    # An hour at one temperature determines a bias change of 200 ug without --ageing-bias.
+def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
+    # Six rests of 10 min determine a bias change of 200 ug, also without --ageing-bias.
     moved, day = 200e-6 * STANDARD_GRAVITY, parse_cyclogram('20 10min')
     old = fitted(9).calibration
 
@@ -234,8 +235,8 @@ def test_rests_at_one_temperature_correct_ageing_and_keep_the_response():
         for calibration, changed in ((old, lambda record: record), (old, aged), (new, aged))
     ]
     assert left[1] > 10.0 * left[0]
-    # In rests of 10 min a lag of 1 h with an unknown start resembles a bias: an sd of 10 ug if the
-    # six norms determine three biases, twice as much if they determine three scale factors, too.
+    # In a rest of 10 min a lag of 1 h with an unknown initial state acts like a bias: sd 10 ug if
+    # six norms determine three biases, 20 ug if they also determine three scale factors.
     sd = float(sd_of_levels(new).max())
     assert sd < 20e-6 * STANDARD_GRAVITY
     assert left[2] < np.hypot(left[0], sd)
@@ -320,7 +321,7 @@ def test_population_refuses_too_few_equal_or_different_units():
 
 
 @pytest.mark.slow
-def test_the_command_names_the_nonlinear_terms_that_a_prior_leaves_out(cli, tmp_path):
+def test_the_command_prior_names_the_nonlinear_terms_that_it_leaves_out(cli, tmp_path):
     cube = NonlinearTerm('cube', (1e-6,) * 3, (0.0,) * 3, 1e-5)
     first, *others = siblings()
     assert first.posterior is not None
@@ -346,8 +347,8 @@ def test_a_prior_without_covariance_is_refused():
 
 
 @pytest.mark.slow
-def test_the_calibration_of_another_unit_is_no_prior():
-    # WHY: the constants of a sibling have small sd, and were taken for those of the new unit.
+def test_the_calibration_of_another_unit_is_refused_as_a_prior():
+    # WHY: the constants of a sibling, with their small sd, were used for the new unit.
     all_twelve = [source(record) for record in test_of(9, 0, 12)]
     options = replace(OPTIONS, serial='unit-9', prior=fitted(1).calibration)
     with pytest.raises(FitError, match='calibration of unit unit-1, the bags are of unit unit-9'):
@@ -356,18 +357,18 @@ def test_the_calibration_of_another_unit_is_no_prior():
     messages = [finding.message for finding in allowed.findings if finding.name == 'prior']
     assert any('allowed: ' in text for text in messages)
     assert any('bags contradict the prior' in text for text in messages)
-    # A prior has a set of curves per regime, so the fit has no residual of a single set.
+    # A prior has curves for each regime, so the fit has no residual of a single curve.
     assert not allowed.residuals[-1].one_set.n
 
 
-def test_prior_of_the_other_input_is_refused():
-    # WHY: scale factors of a prior in counts were once taken for those in m/s^2.
+def test_a_prior_in_counts_is_refused_for_samples_in_m_s2():
+    # WHY: scale factors of a prior in counts were used for samples in m/s^2.
     with pytest.raises(ValueError, match=r'`prior` is in counts, the samples are in m/s\^2'):
         replace(OPTIONS, prior=fitted(1).calibration, input='m/s^2')
 
 
 @pytest.mark.slow
-def test_commands_make_a_prior_and_name_what_is_missing(tmp_path, capsys):
+def test_the_command_prior_writes_a_prior_or_names_what_is_missing(tmp_path, capsys):
     files = []
     for unit in siblings():
         files.append(tmp_path / f'{unit.unit.serial}.yaml')

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-For any input the output of the correction is finite, in order of time, and physical.
+For any calibration file and any messages the output is finite, bounded and in order of time.
 
-Each test tries 10 000 inputs in `make nightly`.
+In `make nightly` each test has 10 000 examples.
 """
 
 import base64
@@ -50,7 +50,7 @@ anything = st.recursive(
 
 @settings(deadline=None)
 @given(st.sampled_from(PLACES), anything)
-def test_any_value_at_any_key_is_good_or_its_key_is_named(place, value):
+def test_a_wrong_value_at_any_key_is_refused_with_the_key(place, value):
     tree = json.loads(json.dumps(TREE))
     *way, last = place
     branch = tree
@@ -68,7 +68,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place, value):
     if refusal is not None:
         text = str(refusal)
         assert '\n' not in text
-        # The error of a file that is valid YAML names a key.
+        # If the file is valid YAML, the message names a key.
         assert refusal.key or 'not valid YAML' in text or 'nested deeper' in text, text
         if refusal.key:
             assert refusal.key.split('.')[0].split('[')[0] in TREE, text
@@ -76,7 +76,7 @@ def test_any_value_at_any_key_is_good_or_its_key_is_named(place, value):
 
 EXAMPLE = Path(__file__).parents[1] / 'config' / 'calibration.example.yaml'
 TREES = (TREE, yaml.safe_load(dump_calibration(unit())), yaml.safe_load(EXAMPLE.read_text()))
-#: Every number, text and list of numbers of the calibrations in TREES.
+#: Index in TREES and path of every value of these calibrations.
 EDITS = [(k, place) for k, tree in enumerate(TREES) for place in leaves(tree)]
 magnitudes = st.builds(
     lambda sign, digits, power: sign * digits * 10.0**power,
@@ -84,7 +84,7 @@ magnitudes = st.builds(
     st.floats(1.0, 9.99),
     st.integers(-308, 307),
 )
-#: The bounds of all quantities, and values just inside and outside of them.
+#: Limits of all quantities of a calibration file, and values just below and above each limit.
 edges = st.sampled_from(
     [
         near
@@ -98,7 +98,7 @@ factors = st.integers(-60, 60).map(lambda power: 2.0**power)
 
 
 class Edited(dict[str, Any]):
-    """A calibration file with some changed values; a failing example shows only these values."""
+    """A calibration file with changed values; hypothesis prints only the changed values."""
 
     edits: tuple[Any, ...] = ()
 
@@ -108,7 +108,7 @@ class Edited(dict[str, Any]):
 
 @st.composite
 def edited(draw):
-    """Change one to three values of a calibration file by any magnitude."""
+    """Draw a calibration file in which one to three values are replaced by any others."""
     which = draw(st.sampled_from(range(len(TREES))))
     tree = Edited(json.loads(json.dumps(TREES[which])))
     own = [place for k, place in EDITS if k == which]
@@ -142,7 +142,7 @@ def edited(draw):
 
 
 def changed(which, place, value):
-    """Change one value of a calibration file."""
+    """Return a calibration file with one replaced value."""
     tree = Edited(json.loads(json.dumps(TREES[which])))
     branch = tree
     for key in place[:-1]:
@@ -153,7 +153,7 @@ def changed(which, place, value):
 
 
 def whole_range(of):
-    """List messages that pass through and beyond all temperatures of a calibration."""
+    """List messages over the temperature range of a calibration, and far outside of the range."""
     edges_c = [edge for regime_set in of.regime_sets() for edge in regime_set.temperature_range_c]
     middle = of.reference_temperature_c
     temperatures = [middle, middle + 0.5, *edges_c, middle, -273.0, 999.0, middle, middle]
@@ -163,7 +163,7 @@ def whole_range(of):
     now_ns = START_NS
     for k, (celsius, step_s) in enumerate(zip(temperatures, steps_s, strict=True)):
         for m in range(6):
-            # Each temperature is read six times, so that it does not count as a wrong reading.
+            # Each temperature is read six times, as a single reading may count as an outlier.
             now_ns += round(step_s / 6.0 * 1e9)
             sent.append(('board', now_ns, celsius))
             sent += [(name, now_ns, celsius + 0.1 * m) for name in of.sensors]
@@ -177,8 +177,8 @@ def whole_range(of):
 
 @settings(deadline=None, max_examples=max(120, settings.default.max_examples))
 @given(edited())
-# In the first example the variances of the axes differ by 23 powers of ten, in the second two
-# lags differ by rounding.
+# First example: variances of the axes differ by 23 powers of ten. Second: two lags differ by
+# rounding.
 @example(changed(1, ('axes', 'z', 'scale_factor'), 1.0))
 @example(changed(0, ('response', 3, 'sensor_share'), 1e-12))
 def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tree):
@@ -207,7 +207,7 @@ def test_whatever_file_is_accepted_gives_finite_numbers_over_its_whole_range(tre
             assert min(rate[3:]) > 0.0
     counters = compensator.counters
     assert counters.n_unsound == 0
-    # The output is empty only if samples are too fast, or temperatures are stale or missing.
+    # Without an output, samples were too fast, or temperatures too old or missing.
     assert n_sound or counters.n_too_fast or counters.n_stale or counters.n_no_temperature
     status = compensator.status()
     assert all(map(math.isfinite, status.state))
@@ -239,9 +239,9 @@ configs = st.builds(
 
 
 def largest(axis, regime, of):
-    """Bound the change of an axis' bias, and the relative change of its scale."""
+    """Return upper limits of the change of an axis' bias [counts] and of its relative scale."""
     edges = (*of.static.temperature_range_c, *of.dynamic.temperature_range_c)
-    # Curves continue along their tangents for up to a quarter of the ranges of both sets.
+    # Curves continue along their tangents by a quarter of the temperature range.
     t = max(abs(edge - of.reference_temperature_c) for edge in edges)
     t += 0.25 * (max(edges) - min(edges))
     curves = regime.axes()[axis]
@@ -258,7 +258,7 @@ def largest(axis, regime, of):
 
 
 def bound(of):
-    """Bound the specific force that a unit can output, from its calibration [m/s^2]."""
+    """Return an upper limit of the specific force corrected with a calibration [m/s^2]."""
     worst = 0.0
     for regime in (of.static, of.dynamic):
         for axis, reference in enumerate((of.axes.x, of.axes.y, of.axes.z)):
@@ -271,7 +271,7 @@ def bound(of):
 
 @settings(deadline=None)
 @given(st.sampled_from(UNITS), configs, messages)
-def test_any_messages_give_sound_numbers(of, config, sent):
+def test_the_output_for_any_messages_is_finite_and_bounded(of, config, sent):
     compensator = Compensator(of, config)
     limit = bound(of) * (1.0 + 1e-9)
     now_ns, last_ns, n_jumps, n_counts = START_NS, -math.inf, 0, 0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The README and the console examples of docs/cli.md: outputs and links are right."""
+"""Links in the README and outputs shown on docs/cli.md are right."""
 
 import re
 
@@ -28,7 +28,7 @@ def test_commands_of_the_page_give_the_output_shown(tmp_path, cli, once):
         assert is_alike(got, expected), f'{" ".join(words)}\n{got}'
 
 
-def test_commands_that_no_test_runs_exist():
+def test_commands_in_the_readme_exist():
     known = {c.name or c.callback.__name__ for c in app.registered_commands if c.callback}
     known |= {group.typer_instance.info.name for group in app.registered_groups}
     named = set(re.findall(r'(?:^|^\$ |`)thermo_comp (\w+)', README, re.MULTILINE))
@@ -42,12 +42,12 @@ def test_commands_that_no_test_runs_exist():
         assert (ROOT / script).is_file(), script
 
 
-def test_links_of_the_readme_lead_somewhere():
+def test_targets_of_the_links_in_the_readme_exist():
     for target in re.findall(r'\]\(([^)#]+)\)', README):
         assert (ROOT / target).exists(), target
 
 
-def test_the_calibration_s_keys_are_those_of_the_example():
+def test_the_excerpt_of_a_calibration_on_the_page_is_part_of_the_example():
     page = (ROOT / 'docs' / 'calibration_file.md').read_text(encoding='utf-8')
     (excerpt,) = (yaml.safe_load(text) for kind, text in FENCE.findall(page) if kind == 'yaml')
     example = yaml.safe_load((ROOT / 'config' / 'calibration.example.yaml').read_text())

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Fits of other people's recordings give the figures of docs/real_data.md.
-"""
+"""Fits to recordings that other people made give the figures of docs/real_data.md."""
 
 import re
 from contextlib import suppress
@@ -40,15 +38,15 @@ def means_of(result):
     return np.array([data.mean[data.position == p].mean(axis=0) for p in range(data.n_positions)])
 
 
-def test_the_residual_of_handheld_units_is_their_noise(unit):
+def test_the_residual_of_handheld_units_is_the_noise_of_their_samples(unit):
     assert 21 <= len(unit.positions) <= 23
-    # The noise is 0.48 to 0.57 mg in windows of 1 s, and higher in the fit's windows of 0.5 s.
+    # In windows of 1 s the noise is 0.48 to 0.57 mg; the fit has windows of 0.5 s.
     assert 0.5 < unit.residuals[-1].fitted.rms / MG < 0.9
     assert unit.residuals[-1].left_out.rms < 1.15 * unit.residuals[-1].fitted.rms
 
 
-def test_handheld_units_agree_with_a_direct_solution(unit):
-    # The direct solution fits |M (N - b) / K| - g, nine parameters, to the positions by scipy.
+def test_fits_of_handheld_units_agree_with_a_least_squares_solution_by_scipy(unit):
+    # scipy minimises |M (N - b) / K| - g of all positions over nine parameters.
     means = means_of(unit)
 
     def residual(parameters):
@@ -60,8 +58,7 @@ def test_handheld_units_agree_with_a_direct_solution(unit):
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = calibration.axes
-    # Fit and scipy weight positions differently: biases differ by less than 1 mg, scale factors by
-    # less than 1e-3.
+    # The fit weights positions by their length, this solution does not.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)
@@ -73,11 +70,11 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
     result = fit(sources, replace(OPTIONS, input=kind))
     calibration = result.calibration
     assert len(result.positions) == 6
-    # The prior sd of the misalignment of a MEMS is 1 %. Faces that are a degree off change the
-    # misalignment by less than 1 % of its prior sd.
+    # The prior sd of the misalignment of a MEMS is 0.01. Faces are tilted by up to 1 degree, which
+    # determines the misalignment by less than 1 % of this sd.
     np.testing.assert_allclose(calibration.misalignment, np.eye(3), atol=1e-4)
     np.testing.assert_allclose(calibration.misalignment_sd, 1e-2, rtol=0.01)
-    # Bias and scale by hand: half the sum and half the difference of opposite faces.
+    # Expected bias: half of the sum of opposite faces; scale factor: half of their difference.
     means = means_of(result)
     high, low = means.max(axis=0), means.min(axis=0)
     axes = calibration.axes
@@ -88,19 +85,19 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
 
 
 def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
-    # |a| jumps by +20 mg at 366 s and +17 mg at 468 s; a third jump is across gravity.
+    # |a| jumps by 20 mg at 366 s and by 17 mg at 468 s; a third jump is mostly across gravity.
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)
     jumps = re.findall(
         r'at ([\d.]+) s the sensor jumped by \+([\d.]+) mg along gravity', str(refused.value)
     )
-    # Times count from the first sample, 1.5 s after the zero of the log.
+    # Times in the message begin with the first sample, 1.5 s after time 0 of the log.
     assert [float(at) for at, _ in jumps] == pytest.approx([365.4, 465.4, 511.6], abs=0.2)
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
 
 
-def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, work):
+def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_plot(real_data, work):
     topics = Topics(part=Part(47.5, 358.5))
     result = fit(fit_sources([freezer_bag(real_data, work)], topics)[0], OPTIONS)
     z = result.calibration.static.z
@@ -115,10 +112,10 @@ def test_the_freezer_run_before_its_jumps_is_bias_over_temperature(real_data, wo
     ('length', 'n_sets', 'sets', 'drift', 'mg'),
     [(71.0, 2, (0, 1), 2.1, 0.19), (284.0, 5, (0, 3), 2.5, 0.8)],
 )
-def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
+def test_the_error_of_the_freezer_run_on_held_out_minutes(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # The 1420 s after the last jump are cut into parts, each corrected by a fit of other parts.
+    # The 1420 s after the last jump are cut into parts; each is corrected by a fit to other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [Part(start, start + length) for start in starts]
@@ -130,23 +127,24 @@ def test_the_freezer_run_on_minutes_that_the_fit_has_not_seen(
         ]
         calibration = fit(seen, OPTIONS).calibration
         for part in held_out:
-            # The freezer was knocked in some parts, which then have no minute at rest.
+            # Some parts have no minute at rest, because the freezer was knocked.
             with suppress(RecordingError):
                 judged = evaluate([bag], [('unit', calibration)], topics=Topics(part=part))
                 windows = judged.judgements['unit'].windows
                 raw += np.linalg.norm(windows.mean, axis=1).tolist()
                 left += windows.residual.tolist()
     assert len(raw) >= 17 * len(sets) // n_sets
-    # Compare drifts about their mean, because one attitude does not determine the constants.
+    # One attitude does not determine the constants, so compare the sd of |a|.
     assert np.std(raw) / MG == pytest.approx(drift, abs=0.2)
-    # Means of a minute have a noise of 0.19 mg; the fit extrapolates to the first of five parts.
+    # Means over 60 s have a noise of 0.19 mg. The first of five parts is outside the temperatures
+    # of its fit.
     assert np.sqrt(np.mean(np.square(left))) / MG == pytest.approx(mg, rel=0.35)
 
 
 @pytest.mark.slow
-def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
+def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
-    # The fitted parts follow the last jump; the freezer was knocked near 860 and 1134 s.
+    # Leave out the knocks of the freezer near 860 and 1134 s, and the time before the last jump.
     parts = [Part(518.5, 638.5), Part(860.5, 1130.5), Part(1134.5, 1938.5)]
     seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
     calibration = fit(seen, OPTIONS).calibration
@@ -158,12 +156,13 @@ def test_the_freezer_runs_gyroscope_on_four_minutes_held_out(real_data, work):
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # MPU6050 datasheet: 5 mdeg/s/sqrt(Hz); samples at 12.7 Hz without a filter have more noise.
+    # The data sheet of the MPU-6050 has 5 mdeg/s/sqrt(Hz); samples at 12.7 Hz without an
+    # anti-aliasing filter have a larger density.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 
 def test_no_recording_is_in_the_project():
-    # The project may show plots and numbers of the recordings, but not contain their files.
+    # The project shows plots and numbers of the recordings, and must not contain their files.
     tracked = ran('git', 'ls-files').stdout.split()
     names = ('temp-calibration.csv', 'mk_imu', 'annotated_session.csv')
     assert not [path for path in tracked if path.rsplit('/', 1)[-1].startswith(names)]

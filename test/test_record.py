@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`record` records a test position by position, from a growing bag and from a driver on DDS."""
+"""The command `record` writes a bag per position, from a growing bag or from a driver on DDS."""
 
 import json
 import shlex
@@ -30,7 +30,7 @@ START_NS = 1_767_225_600_000_000_000
 
 
 def write_session(path, ups=UPS, chunk_bytes=1 << 14):
-    """Write a bag of a unit that rests in each position in turn, and is handled between."""
+    """Write a bag of a unit that rests in each attitude in turn, with handling between rests."""
     rng = np.random.default_rng(5)
     program = parse_cyclogram(f'20 {SOAK_S:g}s')
     start_ns = START_NS
@@ -74,18 +74,18 @@ def contents(paths):
 def check_positions(result):
     assert result['is_complete']
     for position, up in zip(result['positions'], UPS, strict=True):
-        # The unit's bias changes the measured direction by less than a degree.
+        # The unit's bias gives the measured direction an error below 1 degree.
         assert np.array(position['up']) @ up > np.cos(np.radians(1.0))
         assert position['reason'] == ''
         assert set(position['thermometers']) == {'board', 'case', 'lid'}
-        # Cells beside a motion, three seconds long at 10 Hz, do not count as rest.
+        # Cells (3 s at 10 Hz) next to a motion do not count as rest.
         assert position['still_s'] == pytest.approx(SOAK_S, abs=20.0)
 
 
 def check_fit(result, cli, folder):
-    """Run the printed command, and compare the calibration with the truth."""
-    # Fit the model `golovach`, as only constants are compared: a model with a response takes ten
-    # times as long.
+    """Run the fit that `record` printed, and compare its constants with the true constants."""
+    # The model `golovach` is sufficient for constants; a model with a response takes ten times as
+    # long.
     given = '--gravity 9.80665 --model golovach'
     words = shlex.split(result['command'].replace('--gravity G', given))
     assert words.pop(0) == 'thermo_comp'
@@ -93,9 +93,9 @@ def check_fit(result, cli, folder):
     cli(*(part for word in words for part in (bags if '*' in word else [word])), cwd=folder)
     calibration = load_calibration(folder / 'unit.yaml')
     assert calibration.unit.serial == 'lab-7'
-    # The board is at 20.39 degC in all positions, which do not show the constants at 20 degC.
+    # The board is at 20.39 degC in all positions, so the constants are compared at 20.39 degC.
     bias, _, scale, _ = in_a_soak(calibration, 20.39)
-    # The sd of `record` follows from the noise of the positions.
+    # `record` computes `scale_sd` from the noise in the positions.
     assert scale / UNIT.scale_factor == pytest.approx(1.0, abs=5.0 * max(result['scale_sd']))
     true_bias = np.array(UNIT.bias_at_reference) / UNIT.scale_factor
     assert bias == pytest.approx(true_bias, abs=5.0 * 9.80665 * max(result['bias_sd_g']))
@@ -119,7 +119,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 class TestGrowing:
-    def test_every_message_comes_once_however_the_file_grows(self, session, tmp_path):
+    def test_each_message_of_a_growing_file_is_read_once(self, session, tmp_path):
         whole = session.read_bytes()
         growing = tmp_path / 'growing.mcap'
         growing.write_bytes(b'')
@@ -143,14 +143,14 @@ class TestGrowing:
         assert collected.pop('accel') == sent.pop('/accel/counts')
         assert {f'/temperature/{name}': own for name, own in collected.items()} == sent
 
-    def test_a_file_that_is_no_bag_is_refused(self, tmp_path):
+    def test_a_text_file_named_mcap_is_refused(self, tmp_path):
         with pytest.raises(RecordingError, match='no such file'):
             next(growing_blocks(tmp_path / 'no.mcap', Topics(), lambda _: True))
         (tmp_path / 'text.mcap').write_text('hello, this is no bag')
         with pytest.raises(RecordingError, match=r'text\.mcap'):
             list(growing_blocks(tmp_path / 'text.mcap', Topics(), lambda _: False))
 
-    def test_a_whole_bag_is_split_into_a_bag_per_position(self, session, cli, tmp_path):
+    def test_a_bag_of_several_positions_is_split_into_a_bag_for_each(self, session, cli, tmp_path):
         options = ('--positions', f'{N_POSITIONS}', '--soak', '80s', '-o', tmp_path / 'bags')
         finished = cli('record', session, *options, '--json')
         result = json.loads(finished.stdout)
@@ -161,7 +161,7 @@ class TestGrowing:
         assert contents(bags) == contents([session])
         assert f'position {N_POSITIONS}: good' in finished.stderr
 
-    def test_a_second_run_continues_the_folder(self, cli, tmp_path):
+    def test_a_second_run_of_record_continues_a_folder(self, cli, tmp_path):
         bags = tmp_path / 'bags'
         for number, part in enumerate((UPS[:2], UPS[2:3]), 1):
             bag = write_session(tmp_path / f'part{number}.mcap', part)
@@ -186,7 +186,7 @@ class TestGrowing:
 
 
 def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path):
-    # WHY: the recording of a killed run was left in a hidden file without a message.
+    # WHY: after a killed run the next run did not report the hidden file with its last bag.
     bags = tmp_path / 'bags'
     killed = subprocess.run(
         [sys.executable, '-c', CRASH, session, bags, str(START_NS + 200 * 10**9)], check=False
@@ -208,7 +208,7 @@ def test_a_bag_left_by_a_crash_is_reported_and_completed(session, cli, tmp_path)
     with open_recording(first, require=()) as reader:
         assert reader.info.truncated is None
         assert reader.info.metadata['serial'] == 'lab-7'
-    # `--finish` leaves an unreadable file in place.
+    # An unreadable hidden file is reported and not deleted.
     broken = bags / '.07.999999999-abcdef.partial.mcap'
     broken.write_bytes(b'no bag')
     printed = cli(*arguments, '--finish', code=None).stderr
@@ -256,7 +256,7 @@ class TestLive:
         assert code == 0
         check_positions(result)
         assert len(numbered_bags(bags)) == N_POSITIONS
-        # The recording ends when the last position is good, with all messages up to then.
+        # When the last position is complete the recording ends; no earlier message is missing.
         sent, got = contents([session]), contents(numbered_bags(bags))
         assert got.keys() == sent.keys()
         for topic, messages in got.items():
@@ -285,7 +285,7 @@ class TestLive:
         assert sorted(bags.iterdir()) == numbered_bags(bags)
 
     @pytest.mark.usefixtures('play')
-    def test_a_topic_of_another_type_is_named(self, tmp_path):
+    def test_a_topic_of_a_wrong_type_is_named(self, tmp_path):
         from geometry_msgs.msg import PointStamped
         from ros_helpers import Peer
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A jump of a recording's clock is shortened, other stamps stay, an invalid clock is refused."""
+"""A jump of a recording's clock is shortened to an hour; a clock that jumps often is refused."""
 
 from contextlib import suppress
 
@@ -19,7 +19,7 @@ STEP_NS = 10_000_000
 
 
 def blocks_of(path, stamp_ns, reading_ns):
-    """Write samples and temperature readings in the order given, and read them on one clock."""
+    """Write samples and readings with the given stamps, and read them with jumps shortened."""
     n = len(stamp_ns)
     log_ns = START_NS + STEP_NS * np.arange(n)
     with BagWriter(path) as bag:
@@ -45,7 +45,7 @@ def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path, jump_ns):
     blocks = blocks_of(
         tmp_path / 'bag.mcap', true_ns + jump_ns * after, (true_ns + jump_ns * after)[::100]
     )
-    # At equal log times the reading comes first, so the jump is before the sixth reading.
+    # At equal log times readings precede samples: the sixth reading is the first after the jump.
     hour = LONGEST_PAUSE_NS * after
     offsets = joined(blocks, 'accel') - true_ns
     assert offsets[:500].tolist() == [0] * 500
@@ -70,15 +70,15 @@ def test_a_clock_that_jumps_repeatedly_is_refused(tmp_path):
         blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
 
 
-def test_a_message_an_hour_is_no_recording(tmp_path):
+def test_a_recording_with_one_message_per_hour_is_refused(tmp_path):
     stamp_ns = START_NS + LONGEST_PAUSE_NS * np.arange(400)
     with pytest.raises(RecordingError, match=r'messages stamped over \d+ days'):
         blocks_of(tmp_path / 'bag.mcap', stamp_ns, stamp_ns[::10])
 
 
 @pytest.mark.parametrize(('zone_s', 'n'), [(3600, 40000), (-3600, 1000), (1800, 1000), (20, 1000)])
-def test_thermometers_of_another_time_zone_are_named(tmp_path, zone_s, n):
-    # WHY: `replay` silently corrected samples with the temperatures of another hour.
+def test_thermometers_with_stamps_of_another_time_zone_are_reported(tmp_path, zone_s, n):
+    # WHY: `replay` corrected samples with the temperatures of another hour, without a warning.
     true_ns = START_NS + STEP_NS * np.arange(n)
     text = f'board readings are stamped {zone_s:+} s from the samples around them: do the stamps'
     with suppress(RecordingError):
@@ -88,8 +88,8 @@ def test_thermometers_of_another_time_zone_are_named(tmp_path, zone_s, n):
     assert 'a fit needs one clock for the stamps of all topics' in survey.findings
 
 
-def test_samples_without_stamps_beside_stamped_thermometers_are_named(tmp_path):
-    # WHY: an Imu stamped 0 s was reported as a thermometer 50 years ahead: 'two clocks?'.
+def test_unstamped_samples_with_stamped_temperatures_are_reported(tmp_path):
+    # WHY: for samples stamped 0 s the message blamed the clock of the thermometers.
     true_ns = START_NS + STEP_NS * np.arange(1000)
     with pytest.raises(RecordingError, match='stamped 0 s: the driver does not stamp them'):
         blocks_of(tmp_path / 'bag.mcap', 0 * true_ns, true_ns[::10])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A truncated bag is read to its last complete message; a corrupt bag is one clear error."""
+"""A truncated bag is read up to its last complete message; a corrupt bag gives one message."""
 
 import resource
 import struct
@@ -45,7 +45,7 @@ def chunk_places(path):
 
 @lru_cache(maxsize=8)
 def small_bag(compression, use_chunking=True):
-    """Return a bag of 24 counts in three chunks, and the last chunk's position and length."""
+    """Return a bag of 24 messages in three chunks, and the last chunk's position and length."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.mcap')
         write_mcap(
@@ -57,7 +57,7 @@ def small_bag(compression, use_chunking=True):
 
 
 def every_cut(content, position, length):
-    """List cuts: at every byte of the last chunk, at every 17th byte after the chunk."""
+    """List the bytes at which to cut: all of the last chunk, every 17th after this chunk."""
     end = position + length
     return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
 
@@ -65,7 +65,7 @@ def every_cut(content, position, length):
 def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
-    # `last`: the end of each message of the last chunk, from the layout of a chunk.
+    # `last`: the position in the file at which each message of the last chunk ends.
     at = position + 9 + 40
     last = []
     while at < position + length:
@@ -89,8 +89,8 @@ def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
     assert read(path).info.truncated is None
 
 
-def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
-    """Content before a cut is decompressed: a compressed block is lost, not the whole chunk."""
+def test_the_messages_before_a_cut_in_a_large_chunk_are_read(tmp_path):
+    """The compressed blocks before a cut are decompressed, so at most one block is lost."""
     n = 60_000
     stamps = np.arange(n) * 2_500_000
     xyz = np.random.default_rng(3).integers(-30_000, 30_000, (n, 3))
@@ -102,8 +102,7 @@ def test_most_of_a_large_torn_chunk_is_saved(tmp_path):
         ((position, length),) = chunk_places(path)
         path.write_bytes(content[: position + length // 2])
         columns = read(path).columns
-        # Random numbers are incompressible: half of the bytes hold half of the messages, less a
-        # block.
+        # Random numbers are incompressible, so half of the bytes contain half of the messages.
         assert 0.4 * n < len(columns) < 0.6 * n
         assert (columns.accel == xyz[: len(columns)]).all()
 
@@ -119,14 +118,14 @@ def test_a_bag_cut_anywhere_is_read_or_refused(data, compression):
         path.write_bytes(content[:cut])
         result = outcome(path)
         if isinstance(result, RecordingError):
-            assert cut < 60, result  # only a file without a complete header contains nothing
+            assert cut < 60, result  # only a file without a complete header is refused
         else:
             assert result.info.truncated is not None
             assert_columns(result.columns, regular_messages(24)[: result.info.n_messages])
 
 
-def test_zeros_at_the_end_are_no_messages(tmp_path):
-    """No message with a part zeroed by a power failure is returned from a file of full length."""
+def test_messages_overwritten_by_zeros_are_not_returned(tmp_path):
+    """After a power failure the end of a file may be zeros; no message with zeros is returned."""
     messages = regular_messages(24)
     path = tmp_path / 'bag.mcap'
     for is_chunked in (True, False):
@@ -140,7 +139,7 @@ def test_zeros_at_the_end_are_no_messages(tmp_path):
                 assert_columns(result.columns, messages[:n])
 
 
-def test_the_torn_file_of_a_directory_is_named(tmp_path):
+def test_the_message_names_the_cut_file_of_a_directory(tmp_path):
     messages = regular_messages(40)
     write_rosbag2(tmp_path / 'bag', messages[:20])
     write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[20:])
@@ -161,7 +160,7 @@ def test_the_torn_file_of_a_directory_is_named(tmp_path):
     compression=st.sampled_from(['none', 'lz4', 'zstd', 'unchunked']),
     n_changes=st.integers(1, 6),
 )
-def test_changed_bytes_are_an_error_or_harmless(data, compression, n_changes):
+def test_a_bag_with_changed_bytes_is_refused_or_gives_valid_columns(data, compression, n_changes):
     is_chunked = compression != 'unchunked'
     content = bytearray(small_bag(compression if is_chunked else 'none', is_chunked)[0])
     for _ in range(n_changes):
@@ -180,7 +179,7 @@ def test_changed_bytes_are_an_error_or_harmless(data, compression, n_changes):
 
 @settings(max_examples=100, deadline=None)
 @given(content=st.binary(max_size=300), has_magic=st.booleans())
-def test_any_bytes_are_an_error_or_an_empty_bag(content, has_magic):
+def test_a_file_of_random_bytes_is_refused_or_an_empty_bag(content, has_magic):
     magic = b'\x89MCAP0\r\n' + b'\x01' + struct.pack('<Q', 8) + bytes(8)
     with tempfile.TemporaryDirectory() as folder:
         for name in ('bag.mcap', 'bag.db3', 'bag.bag'):
@@ -244,11 +243,11 @@ def test_false_lengths_in_a_file_need_little_memory(tmp_path, record, reason):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(RecordingError, match=reason):
         read(path)
-    # Whatever length a record states, the reader takes less than 100 MB (ru_maxrss is in KiB).
+    # For any stated length of a record the reader uses less than 100 MB (ru_maxrss is in KiB).
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
 
 
-def test_a_damaged_compressed_end_is_left_out(tmp_path):
+def test_a_damaged_last_chunk_is_left_out(tmp_path):
     content, position, length = small_bag('zstd')
     damaged = bytearray(content[: position + length])
     damaged[position + length // 2] ^= 255
@@ -257,7 +256,7 @@ def test_a_damaged_compressed_end_is_left_out(tmp_path):
     recording = read(path)
     assert str(recording.info.truncated).endswith('; its last chunk is damaged and left out')
     assert_columns(recording.columns, regular_messages(24)[: recording.info.n_messages])
-    # If the damaged chunk is also cut off, the message names the cut.
+    # If the file ends inside the damaged chunk, the message names the cut.
     path.write_bytes(damaged[:-5])
     assert 'ends inside a chunk' in str(read(path).info.truncated)
 
@@ -267,7 +266,7 @@ def test_a_nonsensical_summary_is_ignored_or_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     footer = len(content) - 37
     (summary,) = struct.unpack_from('<Q', content, footer + 9)
-    for at in (summary, summary + 9):  # opcode, then schema, of the summary's first record
+    for at in (summary, summary + 9):  # the opcode and the schema of a record
         changed = bytearray(content)
         changed[at : at + 8] = b'\xff' * 8
         path.write_bytes(changed)
@@ -289,7 +288,7 @@ def test_large_metadata_are_skipped_and_large_schemas_refused(tmp_path):
         read(path)
 
 
-def test_false_times_of_a_chunk_are_found(tmp_path):
+def test_a_chunk_with_wrong_declared_times_is_refused(tmp_path):
     content, position, _ = small_bag('none')
     path = tmp_path / 'bag.mcap'
     start, end = struct.unpack_from('<QQ', content, position + 9)
@@ -299,7 +298,7 @@ def test_false_times_of_a_chunk_are_found(tmp_path):
         read(path)
 
 
-def test_a_changed_number_is_found_by_the_checksum(tmp_path):
+def test_a_chunk_with_a_wrong_checksum_is_refused(tmp_path):
     content, position, length = small_bag('none')
     changed = bytearray(content)
     changed[position + length - 3] ^= 1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag with fewer messages than it states is reported; bags expand within limits."""
+"""Messages that a bag lists but lacks are reported; decompression is limited in memory."""
 
 import os
 import sqlite3
@@ -60,7 +60,7 @@ def test_a_conversion_reports_messages_that_the_bag_lacks(tmp_path, cli):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_a_topic_in_the_metadata_alone_is_reported(tmp_path, storage):
+def test_a_topic_that_only_the_metadata_list_is_reported(tmp_path, storage):
     bag = whole(tmp_path, storage)
     path = bag / 'metadata.yaml'
     content = yaml.safe_load(path.read_text())
@@ -78,7 +78,7 @@ def test_missing_messages_are_reported_at_the_end(tmp_path):
     with open_recording(tmp_path / 'bag.mcap') as reader:
         kind = reader.info.topics[ACCEL][0]
         reader.info = replace(reader.info, topics={**reader.info.topics, ACCEL: (kind, 64)})
-        for _ in range(2):  # the loss is reported once, however often the bag is read
+        for _ in range(2):  # the second reading of the bag does not repeat the report
             assert sum(map(len, reader.blocks())) == 40
         assert reader.info.truncated == f'{ACCEL}: 40 of 64 listed messages are in the bag'
 
@@ -132,7 +132,7 @@ def test_a_compressed_message_expands_within_limits(tmp_path):
 
 @pytest.mark.parametrize('packing', ['BZ2', 'LZ4'])
 def test_a_chunk_of_a_ros1_bag_expands_within_limits(tmp_path, packing, monkeypatch):
-    # WHY: to read a ROS 1 bag of 10 kB took a gigabyte of memory.
+    # WHY: reading a ROS 1 bag of 10 kB used 1 GB of memory.
     store, kind = get_typestore(Stores.ROS1_NOETIC), 'sensor_msgs/msg/Temperature'
     header, stamp = (
         store.types[name] for name in ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Any bag written by another tool gives the columns of its messages in a player's order."""
+"""Bags written by other tools: the columns have all messages, in the order of log times."""
 
 import shutil
 import tempfile
@@ -39,7 +39,7 @@ WIDTHS = {ACCEL: 3, IMU_IN: 37, BOARD: 2, CASE: 2, OTHER: 0}
 
 @st.composite
 def bags(draw, accel=ACCEL, lowest=-3):
-    """Draw messages in writing order: equal or falling log times, mixed frames and byte orders."""
+    """Draw messages with equal or falling log times, several frames and both byte orders."""
     frames = draw(st.lists(st.text('abcxyz_/é', max_size=24), min_size=1, max_size=3))
     topics = (accel, BOARD, CASE, OTHER)
     messages = []
@@ -94,8 +94,8 @@ def test_any_file_gives_its_messages_in_order_of_log_time(messages, **options):
             and options['index_types'] == IndexType.ALL
             and options['repeat']
         ):
-            # The expected order is that in which rosbags reads the file; versions of rosbags
-            # order equal log times differently.
+            # rosbags must read the file in the expected order; versions of rosbags sort messages
+            # with equal log times differently.
             order = [(log_ns, topic) for topic, log_ns, _ in read_with_rosbags(path)]
             wanted = [(m.log_ns, m.topic) for m in in_reading_order(messages)]
             assert [log_ns for log_ns, _ in order] == [log_ns for log_ns, _ in wanted]
@@ -145,7 +145,7 @@ def test_directories_written_by_rosbags_are_read(messages, storage, compression)
 @settings(max_examples=10, deadline=None)
 @given(messages=bags(lowest=1))
 def test_bags_of_ros_1_are_read(messages):
-    # Log times differ, because a ROS 1 bag has no order between topics for equal times.
+    # All log times differ: for equal log times a ROS 1 bag has no order between topics.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'bag.bag')
         write_rosbag1(path, messages)
@@ -155,7 +155,7 @@ def test_bags_of_ros_1_are_read(messages):
 
 
 @pytest.mark.parametrize('accel', [ACCEL, IMU_IN])
-def test_raw_messages_are_the_very_bytes(tmp_path, accel):
+def test_raw_messages_have_the_bytes_of_the_bag(tmp_path, accel):
     messages = regular_messages(accel=accel)
     write_mcap(tmp_path / 'bag.mcap', messages, chunk_size=900)
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
@@ -183,7 +183,7 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path):
     assert [frame for block in blocks for frame in [block.frame_id] * len(block)] == frames
     before, n_accel = 0, 0
     for block in blocks:
-        # `after`, the place of a reading among the samples, counts within the block.
+        # `after` is the index in the block of the first sample after a reading.
         after = block.temperatures['board'].after
         assert ((after >= 0) & (after <= len(block))).all()
         before += len(after)
@@ -193,20 +193,20 @@ def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path):
 
 
 def test_overlapping_chunks_of_single_topics_are_merged(tmp_path):
-    """Chunks per topic, with temperatures after their samples, are merged in log-time order."""
+    """A chunk has the messages of one topic in 0.1 s; messages are read in log-time order."""
     messages = regular_messages(200)
     by_topic = sorted(
         messages, key=lambda m: ((m.log_ns - START_NS) // 100_000_000, ALL_TOPICS.index(m.topic))
     )
     write_mcap(tmp_path / 'bag.mcap', by_topic, chunk_size=400)
-    # Messages with equal log times keep the order of the file: here counts before temperatures.
+    # Messages with equal log times keep the order of the file, here counts, then temperatures.
     assert_columns(read(tmp_path / 'bag.mcap').columns, in_reading_order(by_topic))
 
 
 def test_too_many_overlapping_chunks_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.mcap_file._MAX_HELD_BYTES', 4000)
     messages = regular_messages(200)
-    # Each chunk has every 40th message, so that each chunk covers the whole time.
+    # Each chunk has every 40th message, so it overlaps all other chunks in time.
     combed = [message for begin in range(40) for message in messages[begin::40]]
     write_mcap(tmp_path / 'bag.mcap', combed, chunk_size=400)
     with pytest.raises(RecordingError, match=r'too many of its chunks overlap in time'):
@@ -228,7 +228,7 @@ def test_raw_messages_of_overlapping_chunks_are_in_order_too(tmp_path):
     assert frames == [m.frame_id for m in wanted]
 
 
-def test_split_files_follow_each_other(tmp_path):
+def test_the_files_of_a_split_bag_are_read_in_order(tmp_path):
     messages = regular_messages(90)
     write_rosbag2(tmp_path / 'bag', messages[:50])
     write_mcap(tmp_path / 'bag' / 'bag_1.mcap', messages[50:80])
@@ -246,7 +246,8 @@ def test_split_files_follow_each_other(tmp_path):
     assert recording.info.truncated is None
     assert recording.info.n_messages == len(messages)
 
-    # A killed recorder writes no metadata.yaml; the numbers in the names give the order.
+    # Without metadata.yaml, as after the end of a recorder by a signal, numbers in the file names
+    # give the order.
     (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / 'bag' / 'bag_0.mcap')
     (tmp_path / 'bag' / 'bag_1.mcap').rename(tmp_path / 'bag' / 'bag_2.mcap')
     for text in (None, ''):
@@ -260,8 +261,8 @@ def test_split_files_follow_each_other(tmp_path):
         )
 
 
-def test_a_folder_of_bags_is_no_bag(tmp_path):
-    # WHY: bags of different positions were once read as the files of one truncated bag.
+def test_a_folder_of_several_bags_is_refused(tmp_path):
+    # WHY: bags of different positions in a folder were read as the files of one truncated bag.
     for name in ('01.mcap', '02.mcap'):
         (tmp_path / name).write_bytes(b'')
     with pytest.raises(RecordingError, match=r'folder of several bags: name its 2 \*\.mcap'):
@@ -326,7 +327,7 @@ def test_topics_can_be_named_by_input(tmp_path):
         Topics.named({'case': '/'})
 
 
-def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
+def test_the_only_topic_of_a_type_is_used_in_place_of_the_default_topic(tmp_path):
     path = written(tmp_path / 'one', 'imu/die', counts='imu/ticks')
     with open_recording(path, require=('accel', 'board')) as reader:
         assert reader.topics == {'accel': '/imu/ticks', 'board': '/imu/die'}
@@ -334,8 +335,8 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             '/imu/ticks, its only Vector3Stamped, is taken for counts; '
             '/imu/die, its only Temperature, is taken for board'
         )
-    # No board topic is chosen by type if the user names a topic, if two topics fit, or if the only
-    # topic is the case's.
+    # No board topic is chosen by its type if the user names a topic, if there are two topics of
+    # this type, or if the only topic is that of the case.
     with pytest.raises(RecordingError, match='my/die: no such topic'):
         open_recording(path, Topics(board='my/die'), require=('board',))
     for topics in (('imu/die', 'baro/air'), ('temperature/case',), ('x/temperature/case',)):
@@ -344,8 +345,8 @@ def test_the_only_topic_of_a_type_stands_in_for_the_usual_one(tmp_path):
             open_recording(several, require=('board',))
 
 
-def test_two_thermometers_of_other_names_are_offered(tmp_path):
-    # WHY: `fit` read neither thermometer, and said only that no temperature was recorded.
+def test_a_message_names_both_thermometers_if_neither_has_the_default_topic(tmp_path):
+    # WHY: `fit` read neither thermometer; its message was that no temperature was recorded.
     path = written(tmp_path / 'two', 'imu/die', 'baro/air')
     with open_recording(path, require=('accel',)) as reader:
         assert 'board' not in reader.topics
@@ -357,7 +358,7 @@ def test_two_thermometers_of_other_names_are_offered(tmp_path):
         assert reader.info.chosen is None
 
 
-def test_two_passes_over_a_recording_are_equal(tmp_path, monkeypatch):
+def test_a_recording_can_be_read_twice_with_equal_results(tmp_path, monkeypatch):
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 100)
     path = tmp_path / 'bag.mcap'
     write_mcap(path, regular_messages(2000), chunk_size=2000)
@@ -386,6 +387,6 @@ def test_a_closed_recording_refuses_to_read(tmp_path):
     for name in ('bag.mcap', 'bag.bag'):
         with open_recording(tmp_path / name) as reader:
             pass
-        reader.close()  # to close a closed reader has no effect
+        reader.close()  # closing a closed reader has no effect
         with pytest.raises(RecordingError, match=rf'{name}: the recording is closed'):
             next(reader.blocks())

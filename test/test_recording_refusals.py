@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Unknown layouts, encodings or topics, and files that are no bags, are refused with a reason."""
+"""Wrong layouts, encodings and topics, and files that are not bags, are refused with a reason."""
 
 import os
 import struct
@@ -58,7 +58,7 @@ def declared(encoding='cdr', kind='geometry_msgs/msg/Vector3Stamped'):
         (b'\x00\x01\x00\x00' + bytes(80), 'does not fit'),
     ],
 )
-def test_messages_of_another_layout_are_named(tmp_path, data, reason):
+def test_messages_of_a_wrong_layout_are_refused(tmp_path, data, reason):
     path = tmp_path / 'bag.mcap'
     path.write_bytes(whole_file(declared(), short_message(data)))
     with pytest.raises(RecordingError, match=rf'bag\.mcap: {ACCEL}: .*{reason}'):
@@ -81,7 +81,7 @@ def test_ros_1_messages_in_an_mcap_file_are_read(tmp_path):
     assert block.raw['accel'].data.tobytes() == serialize(message)
 
 
-def test_messages_in_another_encoding_are_named(tmp_path):
+def test_messages_in_a_wrong_encoding_are_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     both = declared() + declared('ros1').replace(
         struct.pack('<HH', 1, 1), struct.pack('<HH', 2, 1)
@@ -100,7 +100,7 @@ def refused(path, reason, *given):
         open_recording(path, *given)
 
 
-def test_paths_that_are_no_bag_are_refused(tmp_path):
+def test_paths_that_are_not_a_bag_are_refused(tmp_path):
     refused(tmp_path / 'nowhere', 'nowhere: no such file or directory')
     refused(tmp_path / ('x' * 300), 'cannot be opened: File name too long')
     os.mkfifo(tmp_path / 'pipe.mcap')
@@ -137,7 +137,7 @@ def test_paths_that_are_no_bag_are_refused(tmp_path):
         refused(tmp_path / 'folder', reason)
 
 
-def test_absent_topics_and_topics_of_other_types_are_refused(tmp_path):
+def test_absent_topics_and_topics_of_a_wrong_type_are_refused(tmp_path):
     path = tmp_path / 'bag.mcap'
     messages = regular_messages(8)
     write_mcap(path, messages)
@@ -167,7 +167,7 @@ def test_a_required_topic_without_messages_is_refused(tmp_path):
     refused(path, '/temperature/case: the topic has no messages')
 
 
-def test_two_topics_that_fit_are_ambiguous(tmp_path):
+def test_two_topics_with_a_matching_name_are_refused_as_ambiguous(tmp_path):
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         for unit in ('a', 'b'):
@@ -177,8 +177,8 @@ def test_two_topics_that_fit_are_ambiguous(tmp_path):
         assert reader.topics == {'accel': '/b/accel/counts'}
 
 
-def test_names_from_a_bag_cannot_forge_lines(tmp_path):
-    """WHY: a topic's name may contain anything; an error must be one line of a terminal."""
+def test_topic_names_with_control_characters_are_escaped_in_messages(tmp_path):
+    """A topic's name may contain any characters; a message must stay one line on a terminal."""
     path = tmp_path / 'bag.mcap'
     with BagWriter(path) as bag:
         for row in range(30):
@@ -189,7 +189,7 @@ def test_names_from_a_bag_cannot_forge_lines(tmp_path):
     assert len(str(caught.value)) < 3000
 
 
-def test_torn_bags_of_other_storages_are_one_line(tmp_path):
+def test_cut_db3_and_bag_files_give_a_message_of_one_line(tmp_path):
     messages = [*regular_messages(400), Message(OTHER, 0)]
     write_rosbag2(tmp_path / 'bag', messages, storage='sqlite3')
     write_rosbag1(tmp_path / 'bag.bag', messages)
@@ -202,7 +202,7 @@ def test_torn_bags_of_other_storages_are_one_line(tmp_path):
 
 
 def driver_bag(path, *topics, metadata=None):
-    """Write five messages per topic, whose kind is Imu, Temperature, Bool or Vector3Stamped."""
+    """Write five messages per topic, of type Imu, Temperature, Bool or Vector3Stamped."""
     stamp_ns = START_NS + np.arange(5) * 10**7
     with BagWriter(path, metadata=metadata or {}) as bag:
         for topic, kind in topics:
@@ -220,25 +220,25 @@ def driver_bag(path, *topics, metadata=None):
 @pytest.mark.parametrize(
     ('topics', 'taken'),
     [
-        # The driver's topic of REP 145 is chosen; the vector of the magnetometer is not a force.
+        # imu/data_raw of REP 145 is chosen, the vector of a magnetometer is not.
         ([('imu/data_raw', 'imu'), ('imu/mag', 'vector')], '/imu/data_raw'),
-        # Free acceleration and angular rate of an Xsens are vectors, but no specific force.
+        # Free acceleration and angular rate of an Xsens are vectors, and not chosen.
         ([('imu/data', 'imu'), ('filter/free_acceleration', 'vector')], '/imu/data'),
         ([('imu/data', 'imu'), ('imu/angular_velocity', 'vector')], '/imu/data'),
-        # A filter's input, imu/data_raw, is chosen, not the filter's output, imu/data.
+        # imu/data_raw, the input of a filter, is chosen, its output imu/data is not.
         ([('imu/data', 'imu'), ('imu/data_raw', 'imu')], '/imu/data_raw'),
         ([('a/imu/data_raw', 'imu'), ('a/accel/counts', 'vector')], '/a/accel/counts'),
         ([('adc/words', 'vector'), ('imu/mag', 'vector')], '/adc/words'),
-        # Neither of two equivalent topics is chosen, nor a vector that is not a force.
+        # Of two topics of equal rank no topic is chosen, nor is a magnetometer.
         ([('left/imu', 'imu'), ('right/imu', 'imu'), ('adc/words', 'vector')], None),
         ([('imu/mag', 'vector')], None),
-        # A topic is the node's output if it has the regime topics beside it.
+        # imu/data_raw is an output of the node if regime/dynamic has the same namespace.
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], None),
         ([('a/imu/data_raw', 'imu'), ('regime/dynamic', 'flag')], '/a/imu/data_raw'),
         ([('imu/data_raw', 'imu'), ('regime/dynamic', 'flag'), ('d/imu', 'imu')], '/d/imu'),
     ],
 )
-def test_an_imu_topic_beats_a_guess_by_type(tmp_path, topics, taken):
+def test_an_imu_topic_is_chosen_before_a_vector_topic_of_unknown_meaning(tmp_path, topics, taken):
     path = driver_bag(tmp_path / 'bag', *topics)
     with open_recording(path, require=()) as reader:
         assert reader.topics.get('accel') == taken
@@ -254,7 +254,7 @@ def test_the_input_that_the_user_names_is_compensated(tmp_path):
             assert reader.topics['accel'] == taken
 
 
-def test_a_topic_corrected_already_is_refused_with_the_reason(tmp_path):
+def test_a_topic_that_thermo_comp_wrote_is_refused_as_input(tmp_path):
     path = driver_bag(
         tmp_path / 'bag', ('imu/data_raw', 'imu'), metadata={'corrected_by': 'thermo_comp 0.1'}
     )
@@ -266,7 +266,7 @@ def test_a_topic_corrected_already_is_refused_with_the_reason(tmp_path):
         assert reader.topics['accel'] == '/imu/data_raw'
 
 
-def test_one_topic_for_two_inputs_is_refused_by_its_name(tmp_path):
+def test_one_topic_for_two_inputs_is_refused_with_its_name(tmp_path):
     path = driver_bag(tmp_path / 'bag', ('accel/counts', 'vector'), ('imu/temperature', 'celsius'))
     for second in ('case', 'temperature/lid'):
         names = {'board': '/imu/temperature', second: 'imu/temperature'}

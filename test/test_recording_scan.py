@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a chunk are found, with and without an index, equal those of a plain loop."""
+"""A scan of a chunk, with or without an index, finds the same messages as a plain loop."""
 
 import struct
 
@@ -43,7 +43,7 @@ def listed(messages):
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
-#: Contents of messages that look like records, with the lengths of real records.
+#: Contents of messages that look like records.
 DECEITFUL = [
     b'\x05' * 40, message(1, 5, b'\x05' * 9), (message(1, 7, b'') * 3)[:40],
     struct.pack('<BQ', MESSAGE, 22 + 40) * 4, bytes(40),
@@ -78,8 +78,8 @@ def index_of(entries):
 
 @settings(max_examples=120, deadline=None)
 @given(data=records(), cut=st.integers(0, 200), tail=st.binary(max_size=30), drawn=st.data())
-def test_a_scan_equals_the_plain_loop_and_a_false_index_changes_nothing(data, cut, tail, drawn):
-    """WHY: offsets into payloads that look like records could give false samples."""
+def test_a_scan_with_a_right_or_false_index_equals_a_plain_loop(data, cut, tail, drawn):
+    """WHY: an index that points into the content of a message could give false samples."""
     torn = data[: len(data) - cut] + tail
     wanted, wanted_others, wanted_end = one_by_one(torn)
     if all(log_ns < 2**63 for _, _, _, log_ns in wanted):
@@ -87,7 +87,7 @@ def test_a_scan_equals_the_plain_loop_and_a_false_index_changes_nothing(data, cu
         messages, reason = scan_records(
             np.frombuffer(torn, np.uint8), lambda _, content: others.append(content)
         )
-        # The message before a record of zeros may end in zeros that do not belong to the message.
+        # If zeros follow a message, its end may be lost, too, so the scan leaves it out.
         is_wiped = len(torn) >= wanted_end + 9 and torn[wanted_end] == 0
         assert listed(messages) == (wanted[:-1] if is_wiped else wanted)
         assert others == wanted_others

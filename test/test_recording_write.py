@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Other tools read a written bag, which is complete or does not exist."""
+"""Written bags are read by other tools; a bag exists under its name only when complete."""
 
 import os
 import tempfile
@@ -39,7 +39,7 @@ def imu_columns(rng, n):
     is_file=st.booleans(),
     seed=st.integers(0, 1000),
 )
-def test_rosbags_and_mcap_read_back_what_was_written(
+def test_rosbags_and_mcap_read_the_written_messages(
     counts, frame_id, compression, chunk_bytes, is_file, seed
 ):
     rng = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
             '/accel/counts': 'c', '/temperature/board': 't', '/imu/data_raw': 'i',
             '/regime/dynamic': 'b', '/diagnostics': 'r',
         }  # fmt: skip
-        # Messages are ordered in the file by flush, then log time, then call.
+        # The file has the messages of each flush in order of log time, then of the calls.
         wanted = [
             (log_ns, name) for _, log_ns, name in sorted(written, key=lambda entry: entry[:2])
         ]
@@ -90,7 +90,7 @@ def test_rosbags_and_mcap_read_back_what_was_written(
             assert rosbag.message_count == len(wanted)
             assert {c.topic for c in rosbag.connections} == set(names)
             listed = [(log_ns, names[c.topic]) for c, log_ns, _ in rosbag.messages()]
-        # For equal log times across chunks the order depends on the version of rosbags.
+        # Versions of rosbags sort messages with equal log times in different chunks differently.
         assert [log_ns for log_ns, _ in listed] == sorted(log_ns for log_ns, _ in wanted)
         assert sorted(listed) == sorted(wanted)
         if counts[-1] and len(counts) == 1:
@@ -140,7 +140,7 @@ def test_metadata_of_a_written_bag_are_read_back(tmp_path, name):
         assert read_recording(tmp_path / name, require=()).info.metadata == pairs
 
 
-def test_the_directory_is_what_rosbag2_writes(tmp_path):
+def test_a_written_directory_equals_that_of_rosbag2(tmp_path):
     small(tmp_path / 'bag', metadata={'serial': '7'})
     assert {p.name for p in (tmp_path / 'bag').iterdir()} == {'metadata.yaml', 'bag_0.mcap'}
     content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
@@ -171,8 +171,8 @@ def test_the_directory_is_what_rosbag2_writes(tmp_path):
     assert yaml.safe_load(metadata['rosbag2']['serialized_metadata']) == content
 
 
-def test_metadata_of_a_bare_file_have_its_final_name(tmp_path):
-    """WHY: a bag is written under a temporary name, which must not be in its metadata."""
+def test_metadata_of_an_mcap_file_contain_its_final_name(tmp_path):
+    """A bag is written under a temporary name, which must not be in its metadata."""
     small(tmp_path / 'bag.mcap')
     with (tmp_path / 'bag.mcap').open('rb') as stream:
         (metadata,) = make_reader(stream).iter_metadata()
@@ -195,7 +195,7 @@ def test_a_raw_message_needs_a_definition(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path, name):
+def test_an_existing_output_stays_until_the_new_output_is_complete(tmp_path, name):
     path = tmp_path / name
     small(path, 1.0)
     with pytest.raises(OutputError, match='exists already'):
@@ -220,7 +220,7 @@ def test_an_existing_output_stays_until_the_new_one_is_whole(tmp_path, name):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_an_output_is_never_put_in_the_place_of_something_else(tmp_path):
+def test_an_output_never_replaces_a_file_or_folder_that_is_no_bag(tmp_path):
     (tmp_path / 'home').mkdir()
     (tmp_path / 'home' / 'thesis.tex').write_text('ten years of work')
     (tmp_path / 'file').write_text('')
@@ -279,8 +279,9 @@ def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
-def test_regime_topics_are_offered_as_the_node_offers_them(tmp_path, name):
-    # WHY: a bag of `replay` offered `regime/stamped` as volatile: a late subscriber got no regime.
+def test_regime_topics_of_a_bag_have_the_qos_of_the_node(tmp_path, name):
+    # WHY: a bag of `replay` had `regime/stamped` as volatile, so on playing the bag a subscriber
+    # that joined later got no regime.
     with BagWriter(tmp_path / name) as bag:
         bag.write_bool('imu0/regime/dynamic', [1], [True])
         for topic in ('imu0/regime/stamped', '/diagnostics'):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit is repeated with rests in pieces of an hour, which detects supports that tilt slowly."""
+"""A second fit divides rests into pieces of about an hour, to detect slowly tilting supports."""
 
 import sys
 from dataclasses import replace
@@ -21,12 +21,12 @@ from thermo_comp.fitting.options import FitOptions
 from thermo_comp.fitting.reduction import reduce_source
 from thermo_comp.fitting.refit_checks import in_pieces, of_whole_rests
 
-# The package exports a function of the same name.
+# `from thermo_comp.fitting import fit` gives the function of this name, not the module.
 fit_module = sys.modules['thermo_comp.fitting.fit']
 
 
 @given(n_minutes=st.integers(10, 400), window_s=st.sampled_from([30.0, 60.0]))
-def test_the_pieces_of_a_rest_are_the_rest(n_minutes, window_s):
+def test_the_pieces_of_a_rest_contain_every_window_of_the_rest(n_minutes, window_s):
     rest = Rest(np.random.default_rng(1), duration_s=60.0 * n_minutes, rate_hz=2.0)
     bag = reduce_source(rest.source(), window_s=window_s, full_scale=None)
     pieces = in_pieces(bag)
@@ -37,13 +37,13 @@ def test_the_pieces_of_a_rest_are_the_rest(n_minutes, window_s):
         np.testing.assert_array_equal(np.concatenate(parts), np.concatenate(whole))
     assert sum(p.n_whole for p in pieces.intervals) == sum(r.n_whole for r in bag.intervals)
     hours = [len(piece.time) * bag.window_s / 3600.0 for piece in pieces.intervals]
-    # Pieces are nearest to an hour: between 40 min and 90 min, if the rest is longer than that.
+    # If a rest is divided, its pieces are as close to an hour as possible: 40 to 90 min.
     assert len(hours) == len(bag.intervals) or (min(hours) > 0.66 and max(hours) < 1.51)
     assert pieces.intervals[0].start_ns == bag.intervals[0].start_ns
     assert pieces.intervals[-1].end_ns == bag.intervals[-1].end_ns
 
 
-def test_the_reports_of_pieces_become_those_of_rests(rng):
+def test_the_reports_of_the_pieces_of_a_rest_are_combined(rng):
     bag = reduce_source(Rest(rng, duration_s=7200.0, rate_hz=2.0).source(), full_scale=None)
     first, second = in_pieces(bag).intervals
     reports = [
@@ -61,7 +61,7 @@ def test_the_reports_of_pieces_become_those_of_rests(rng):
 
 
 def test_a_rest_of_one_sample_has_a_report(rng):
-    # WHY: the first rest of a real recording had one sample, and its fit ended in a division by 0.
+    # WHY: the fit of a real recording, whose first rest had one sample, ended in a division by 0.
     bag = reduce_source(Rest(rng, duration_s=600.0, rate_hz=2.0).source(), full_scale=None)
     (rest,) = bag.intervals
     single = replace(rest, end_ns=rest.start_ns, time=rest.time[:1])
@@ -69,8 +69,8 @@ def test_a_rest_of_one_sample_has_a_report(rng):
     assert of_whole_rests([report], [replace(bag, intervals=(single,))]) == (report,)
 
 
-def test_a_refused_second_fit_keeps_the_first(rng, monkeypatch):
-    # WHY: pieces of rests may determine less than the rests, and their fit may be refused.
+def test_if_the_second_fit_is_refused_the_first_is_kept(rng, monkeypatch):
+    # WHY: the fit of the pieces may be refused, because each piece contains less data than a rest.
     first_fit = fit_module._fit
 
     def refusing(*args, **given):
@@ -89,11 +89,11 @@ def test_a_refused_second_fit_keeps_the_first(rng, monkeypatch):
 
 
 @pytest.mark.slow
-def test_supports_that_tilt_slowly_have_an_attitude_per_hour():
-    # WHY: tilts of 60 urad within 4 h left 12 to 15 ug in another program, of 0.7 ug by noise.
+def test_slowly_tilting_supports_are_fitted_with_an_attitude_per_hour():
+    # WHY: tilts of 60 urad within 4 h caused errors of 12 to 15 ug in another temperature program.
     _, study, _ = slow_drift(1)
     calibration = strangers.fitted(study)
     assert any('may tilt from hour to hour' in note for note in calibration.provenance.notes)
     tests = {'': [minutes(bag) for bag in study.tests['']]}
-    # Twelve positions average tilts of 60 urad, 42 ug RMS: without the tilts 12 ug are left.
+    # The tilts of 42 ug RMS, averaged over twelve positions, leave an error of 12 ug.
     assert strangers.scored(study, calibration, tests)[''].vector < 12.0

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The regime detector detects ramps early, with few false alarms, in short runs; long runs are in
-benchmarks/regime.py.
+The regime detector detects ramps early and with few false alarms (benchmarks/regime.py has long
+runs).
 
-All runs are seeded. The limits allow for the scatter of medians: the median of 12 delays scatters
-by 1.4 s at 1 mK, and by 4 s with coarse steps.
+All runs are seeded. The limits allow for the scatter of the median of 12 onset delays: 1.4 s for a
+sensor with 1 mK of noise, 4 s for a sensor with steps of 62.5 mK.
 """
 
 import math
@@ -45,7 +45,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return the switches after each onset, and how many ramps began static."""
+    """Run n ramps; return the switches after each onset, and the number of static starts."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -77,7 +77,7 @@ def headline():
     [
         ('1 mK', 45.0, 90.0),
         ('10 mK', 150.0, 180.0),
-        # Readings in steps of 62.5 mK must step twice, 94 mK on average: median 146 s, +-6 s.
+        # Two steps of 62.5 mK are necessary, a change of 94 mK on average: 146 s, +-6 s.
         ('1 mK, 62.5 mK steps', 158.0, 180.0),
         ('10 mK, 62.5 mK steps', 150.0, 180.0),
     ],
@@ -92,16 +92,16 @@ def test_the_onset_of_a_ramp_is_detected_early(headline, sensor, median_s, late_
 
 
 @pytest.mark.parametrize(('sensor', 'threshold'), [('1 mK', 9.65), ('10 mK', 8.87)])
-def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
-    # The bound is the delay of Page's CUSUM with known ramp, baseline and noise; its thresholds
-    # (log likelihood ratios) for one false alarm in 50 h are those of docs/regime.md.
+def test_the_onset_delay_is_below_twice_that_of_a_cusum_test(headline, sensor, threshold):
+    # A CUSUM test that is given ramp, baseline and noise has the shortest delay; docs/regime.md
+    # has its thresholds (log likelihood ratios) for one false alarm in 50 h.
     noise = SENSORS[sensor][0]
     rng = np.random.default_rng(4)
     k = np.arange(1.0, 121.0)
     signature = lagged(np.append(0.0, k), [(0.0, 0.5)], LAG_S)[1:]
     delays = []
     for _ in range(40):
-        # The likelihood-ratio test with known onset is faster than CUSUM by at most a second.
+        # This likelihood-ratio test, given the onset, too, is at most 1 s faster than CUSUM.
         x = signature + rng.normal(0.0, noise, len(k))
         ratio = np.cumsum(signature * x - 0.5 * signature**2) / noise**2
         delays.append(k[np.argmax(ratio > threshold)])
@@ -119,16 +119,16 @@ def test_onset_takes_less_than_twice_the_bound(headline, sensor, threshold):
         (0.01, 0.0, 0.5, 900.0, 0.1, 900.0),
         (0.001, 0.0625, 0.2, 1200.0, 1.0, 3600.0),
         (0.01, 0.0625, 3.0, 300.0, 10.0, 3600.0),
-        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # a ramp slow enough to become the baseline
+        (0.01, 0.0625, 0.2, 180.0, 10.0, 2400.0),  # a ramp as slow as a drift of the baseline
         (0.01, 1.0, 0.2, 900.0, 10.0, 7200.0),
         (0.01, 1.0, 3.0, 180.0, 1.0, 2400.0),
     ],
 )
-def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt, end_s):
+def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_min, lag, dt, end_s):
     delays, _ = onsets(noise, quantum, rate_k_min, lag, 2 if dt < 1.0 else 3, dt=dt, end_s=end_s)
     for each in delays:
         assert [regime for _, regime, _ in each] in ([DYNAMIC], [STATIC, DYNAMIC])
-        # The slowest ramp, 0.2 K/min behind a lag of 15 min, needs two steps of 1 K.
+        # The longest delay is that of two steps of 1 K at 0.2 K/min behind a lag of 15 min.
         assert each[-1][0] < 0.5 * end_s
 
 
@@ -141,8 +141,9 @@ def test_no_ramp_is_missed_and_none_flickers(noise, quantum, rate_k_min, lag, dt
         '10 mK, 62.5 mK steps',
     ],
 )
-def test_soaks_have_no_false_switches(sensor):
-    # At 0.05 switches an hour, two per false ramp, more than 2 false ramps in 15 h have p < 0.01.
+def test_three_soaks_of_5_h_have_at_most_two_false_switches(sensor):
+    # The setting allows 0.05 switches per hour, two per false alarm: more than two false alarms in
+    # 15 h have a probability below 1 %.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -163,11 +164,10 @@ def test_soaks_have_no_false_switches(sensor):
     assert n_openings <= 2
 
 
-def test_the_rate_of_false_alarms_is_that_of_the_setting():
-    # The signal is noise without ripple, and 20 alarms an hour are permitted. Rice's formula
-    # counts crossings, which come in groups and coincide between the filters, so it is an upper
-    # bound of separate alarms: 1000 in 50 h. The lower limit of the alarms shows that the
-    # detector is active.
+def test_the_rate_of_false_alarms_is_below_that_of_the_setting():
+    # The setting allows 20 alarms per hour, 1000 in 50 h; the signal is noise. The threshold is
+    # set by Rice's formula for crossings, which come in groups, so there are fewer separate
+    # alarms. The lower limit shows that the detector is active.
     settings = ThermometerSettings(0.01, lag_s=LAG_S)
     test = ChangeDetector(settings, 0.2 / 60.0, ripple=0.0, false_alarms=20.0 / 3600.0)
     rng = np.random.default_rng(6)
@@ -187,9 +187,9 @@ def test_the_rate_of_false_alarms_is_that_of_the_setting():
 
 
 @pytest.mark.parametrize('dt', [0.1, 1.0, 10.0])
-def test_threshold_is_that_of_the_filters_noise(dt):
+def test_the_threshold_follows_from_the_noise_of_the_filter(dt):
     # Expected threshold: filter gain by the Riccati equation, noise and correlation by the impulse
-    # response, alarms by Rice's formula. `_tune` omits terms of second order in `pace`, up to 4 %.
+    # response, alarms by Rice's formula. `_tune` neglects second-order terms, up to 4 %.
     test = ChangeDetector(ThermometerSettings(0.01, lag_s=LAG_S), 0.2 / 60.0, 0.0, 0.02 / 3600.0)
     test._tune(dt)
     for threshold, power in zip(test._thresholds, test._powers, strict=True):
@@ -227,7 +227,7 @@ def test_the_regime_is_unknown_until_there_are_enough_readings():
 
 
 def run_once(corners, *, noise=0.001, quantum=0.0, lag=LAG_S, begin=-1800.0, end=8000.0, **parts):
-    """Return the switches of a run; `parts`, functions of (t, readings), may change readings."""
+    """Return the switches of a run; `parts`: functions of (t, readings) that change readings."""
     rng = np.random.default_rng(8)
     t = np.arange(begin, end)
     truths = dict(zip(('case', 'board'), case_and_board(t, corners, lag), strict=True))
@@ -245,8 +245,8 @@ def gone(t, readings):
 RAMP = [(0.0, 0.5), (3600.0, 0.0)]
 
 
-def test_the_dynamic_regime_ends_when_the_lag_has_died_away():
-    # The board rate falls to 0.05 K/min 50 min after the ramp; dwell adds 60 s, noise 10 %.
+def test_the_dynamic_regime_ends_when_the_board_rate_is_below_the_relaxed_rate():
+    # The end is when the board's rate has been below 0.05 K/min for the dwell time, 60 s.
     changes = run_once(RAMP)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
     t = np.arange(3600.0, 12000.0)
@@ -263,17 +263,17 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
         switches(detector_settings(0.001, relaxed_rate_k_min=rate), t, case, board)[-1][0]
         for rate in (0.025, 0.05, 0.1)
     ]
-    # The longer lag, LAG_S, decides: the rate of the board halves in a time of lag * ln 2.
+    # The longest lag, LAG_S, determines the end: the board's rate halves in LAG_S * ln 2.
     assert ends[0] - ends[1] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
     assert ends[1] - ends[2] == pytest.approx(LAG_S * math.log(2.0), rel=0.25)
 
 
 @pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
 def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
-    # The case lags by 3 min, the board by another 15 min. After the ramp the case's rate falls as
-    # exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): they reach the relaxed rate, a
-    # tenth of the ramp's, after 7 and 38 min. Steps of 62.5 mK hide the last 5 min of the case's
-    # change.
+    # The case lags the chamber by 3 min, the board lags the case by 15 min. After the ramp the
+    # case's rate falls as exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): they reach
+    # the relaxed rate, 0.1 of the ramp's, after 7 and 38 min. Readings with steps of 62.5 mK do
+    # not show the last 5 min of the case's change.
     noise, quantum = SENSORS[sensor]
     lag, behind = 180.0, 900.0
     board_too = DetectorSettings(
@@ -291,7 +291,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # With `end_condition: case` the board has no effect; without a case the board decides.
+    # With `end_condition: case` the board has no effect; without case readings it has no effect.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -302,8 +302,8 @@ TRIANGLE = [(0.0, 0.5), (3600.0, -0.5), (7200.0, 0.5), (10800.0, 0.0)]
 
 @pytest.mark.parametrize('lost', [None, 'case', 'board'])
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
-def test_a_reversal_is_no_rest(lost, quantum):
-    # Where a ramp reverses, coarse readings are constant for minutes; the regime stays dynamic.
+def test_the_regime_stays_dynamic_at_a_reversal_of_the_ramp(lost, quantum):
+    # At a reversal of the ramp, readings with steps of 62.5 mK are constant for minutes.
     parts = {lost: gone} if lost else {}
     changes = run_once(TRIANGLE, quantum=quantum, end=16000.0, **parts)
     assert [regime for _, regime, _ in changes] == [STATIC, DYNAMIC, STATIC]
@@ -322,7 +322,7 @@ def regimes_and_directions(settings, case_readings, board_readings):
     return states
 
 
-def test_direction_follows_a_reversal():
+def test_the_direction_changes_when_the_case_reverses():
     rng = np.random.default_rng(8)
     t = np.arange(-1800.0, 7200.0)
     readings = [read(x, 0.001, 0.0, rng) for x in case_and_board(t, TRIANGLE)]
@@ -330,14 +330,14 @@ def test_direction_follows_a_reversal():
     directions = {at: direction for at, (_, direction) in zip(t, states, strict=True)}
     assert directions[-100.0] == 0
     assert directions[600.0] == directions[3600.0] == 1
-    # The case reverses lag * ln(2 - exp(-ramp / lag)) = 616 s after the chamber.
+    # The case reverses LAG_S * ln(2 - exp(-3600 s / LAG_S)) = 616 s after the chamber.
     turn = next(at for at in directions if at > 3600.0 and directions[at] == -1)
     assert turn == pytest.approx(3600.0 + 616.0, abs=60.0)
     assert directions[7199.0] == -1
 
 
-def test_a_held_reading_does_not_turn_the_direction():
-    # WHY: temperatures measured every 30 s, but published every second, gave false reversals.
+def test_repeated_readings_do_not_change_the_direction():
+    # WHY: temperatures measured every 30 s and published every second gave false reversals.
     rng = np.random.default_rng(1)
     t = np.arange(-2400.0, 6000.0)
     truths = case_and_board(t, [(0.0, 2.0), (3000.0, 0.0)], 300.0)
@@ -346,14 +346,14 @@ def test_a_held_reading_does_not_turn_the_direction():
     assert seen == {(UNKNOWN, 0), (STATIC, 0), (DYNAMIC, 1)}
 
 
-def test_a_start_in_a_ramp_is_dynamic():
+def test_the_first_regime_is_dynamic_if_readings_begin_in_a_ramp():
     changes = run_once([(-9000.0, 0.5), (1800.0, 0.0)])
     assert [regime for _, regime, _ in changes] == [DYNAMIC, STATIC]
     assert changes[0][0] < -1740.0
     assert changes[0][2] == 1
 
 
-def test_a_board_that_died_does_not_hold_the_dynamic_state():
+def test_the_dynamic_regime_ends_by_the_case_if_the_board_thermometer_fails():
     settings = detector_settings(0.001)
     case, board = Thermometer(settings.case), Thermometer(settings.board)
     detector = RegimeDetector(settings)
@@ -369,7 +369,7 @@ def test_a_board_that_died_does_not_hold_the_dynamic_state():
 
 
 @pytest.mark.parametrize('quantum', [0.0, 0.0625])
-def test_cooling_mirrors_heating(quantum):
+def test_switches_are_equal_in_heating_and_cooling(quantum):
     rng = np.random.default_rng(8)
     t = np.arange(-1800.0, 7500.0)
     settings = detector_settings(0.001, quantum)
@@ -379,7 +379,7 @@ def test_cooling_mirrors_heating(quantum):
 
 
 def test_switches_do_not_depend_on_the_origin_of_time():
-    # A shift of the stamps by whole nanoseconds must not change a bit.
+    # The switches must be equal to the bit if all stamps are shifted.
     rng = np.random.default_rng(8)
     t = np.arange(0.0, 3000.0)
     settings = detector_settings(0.001)
@@ -418,7 +418,7 @@ def test_switches_do_not_depend_on_the_origin_of_time():
         (CompensatorConfig, {'gravity_tolerance_m_s2': -0.1}, 'must be at least 0'),
     ],
 )
-def test_settings_refuse_contradictions(settings, changes, text):
+def test_contradictory_detector_settings_are_refused(settings, changes, text):
     (name,) = changes
     with pytest.raises(ValueError, match=f'`{name}` {text}'):
         settings(**changes)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The offline run equals, bit for bit, a compensator that gets the samples in the bag's order."""
+"""`replay` gives the bits of a compensator that processes the bag's messages one by one."""
 
 import csv
 import dataclasses
@@ -29,7 +29,7 @@ SECOND_NS = 1_000_000_000
 
 
 def thermal_test(path, minutes=30.0, rate_hz=5.0, serial='', imu=False):
-    """Write a bag of a ramp between two soaks, with a lagging board; flush seven times."""
+    """Write a bag, in seven parts, of a ramp between two soaks with a board that lags."""
     rng = np.random.default_rng(7)
     n = round(minutes * 60.0 * rate_hz)
     stamps = START_NS + np.rint((np.arange(n) + 1.0) * (1e9 / rate_hz)).astype(np.int64)
@@ -113,7 +113,7 @@ def output_of(path):
     return read_recording(path, topics, require=('accel',)).columns, flags
 
 
-def test_replay_equals_the_stream_bit_for_bit(tmp_path):
+def test_replay_gives_the_bits_of_single_samples(tmp_path):
     bag = thermal_test(tmp_path / 'bag', rate_hz=3.0)
     calibration = rich_calibration()
     result = replay(bag, calibration, tmp_path / 'out')
@@ -125,7 +125,7 @@ def test_replay_equals_the_stream_bit_for_bit(tmp_path):
     assert block.accel.tobytes() == np.ascontiguousarray(expected[:, :3]).tobytes()
     full = expected[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]]
     assert block.imu.linear_acceleration_covariance.tobytes() == full.tobytes()
-    # A message of counts has neither orientation nor rate, so none is stated (REP 145).
+    # Counts have no orientation and no rate, which an Imu message marks by -1 (REP 145).
     assert set(block.imu.orientation_covariance[:, 0]) == {-1.0}
     assert set(block.imu.angular_velocity_covariance[:, 0]) == {-1.0}
     assert block.frame_id == 'imu_link'
@@ -157,7 +157,7 @@ def test_replay_of_constants_needs_no_thermometer(tmp_path):
         replay(bag, rich_calibration(), tmp_path / 'other')
 
 
-def test_imu_input_passes_everything_else_through(tmp_path):
+def test_orientation_and_rate_of_imu_messages_are_copied_unchanged(tmp_path):
     unit = Unit('T-1', 'm/s^2', 160.0, 0.1)
     bag = thermal_test(tmp_path / 'bag', minutes=5.0, imu=True)
     calibration = calibrated(unit=unit, gyroscope=None)
@@ -179,7 +179,7 @@ def test_imu_input_passes_everything_else_through(tmp_path):
         assert getattr(after.imu, name).tobytes() == kept.tobytes(), name
 
 
-def test_inputs_are_copied_as_they_are(tmp_path):
+def test_inputs_are_copied_unchanged(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=3.0)
     replay(bag, rich_calibration(), tmp_path / 'out', keep_inputs=True)
     with AnyReader([bag]) as before, AnyReader([tmp_path / 'out']) as after:
@@ -196,7 +196,7 @@ def test_inputs_are_copied_as_they_are(tmp_path):
     assert copies == messages
 
 
-def test_another_unit_is_refused_unless_the_user_says_so(tmp_path):
+def test_a_calibration_of_another_unit_is_refused_unless_the_user_states_the_serial(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, serial='T-2')
     calibration = rich_calibration()
     for serial in (None, 'T-2'):
@@ -218,7 +218,7 @@ def test_an_imu_is_refused_by_a_calibration_of_counts(tmp_path):
 
 
 def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
-    # Small blocks, so that the short bag has many; a cycle of 2 ms, so that 500 Hz are allowed.
+    # The short bag has many small blocks; with a cycle of 2 ms, samples at 500 Hz are accepted.
     monkeypatch.setattr('thermo_comp.recording.blocks.BLOCK_MESSAGES', 1 << 11)
     calibration = rich_calibration()
     unit = dataclasses.replace(calibration.unit, cycle_time_s=0.002)
@@ -238,14 +238,14 @@ def test_memory_does_not_grow_with_the_bag(tmp_path, monkeypatch):
         parts, held_bytes = zip(*held, strict=True)
         assert list(parts) == sorted(parts)
         assert parts[-1] == 1.0
-    # With three times the messages, only the list of regime flags is larger.
+    # The long bag has three times the messages; only its list of regime flags needs more memory.
     assert peaks[1] < 1.1 * peaks[0]
     third = len(parts) // 3
     assert max(held_bytes[-third:]) < 1.15 * max(held_bytes[:third])
 
 
 @pytest.mark.parametrize('imu', [False, True])
-def test_a_table_holds_what_the_bag_holds(tmp_path, imu):
+def test_an_output_table_has_the_values_of_the_output_bag(tmp_path, imu):
     pq = pytest.importorskip('pyarrow.parquet', reason='pyarrow is the extra `parquet`')
     bag = thermal_test(tmp_path / 'bag', imu=imu)
     calibration = rich_calibration()
@@ -284,13 +284,13 @@ def test_a_table_holds_what_the_bag_holds(tmp_path, imu):
     assert imu or set(regimes) == {'unknown', 'static', 'dynamic'}
 
 
-def test_a_table_holds_no_other_topics(tmp_path):
+def test_copies_of_other_topics_into_a_table_are_refused(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=1.0)
     with pytest.raises(OutputError, match='can only contain the corrected'):
         replay(bag, rich_calibration(), tmp_path / 'out.csv', all_topics=True)
 
 
-def test_topics_that_cannot_be_copied_leave_nothing_behind(tmp_path):
+def test_a_topic_that_cannot_be_copied_leaves_no_output(tmp_path):
     bag = tmp_path / 'bag.bag'
     write_rosbag1(bag, [*regular_messages(40), Message(OTHER, START_NS)])
     with pytest.raises(RecordingError, match=f"{OTHER}: .* encoded as 'ros1', expected cdr"):
@@ -299,7 +299,7 @@ def test_topics_that_cannot_be_copied_leave_nothing_behind(tmp_path):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_all_topics_copies_every_topic(tmp_path, storage):
+def test_the_option_all_topics_copies_every_topic(tmp_path, storage):
     inputs = thermal_test(tmp_path / 'inputs', minutes=2.0)
     mcap = tmp_path / 'bag'
     stamps = START_NS + np.arange(-3, 150) * 10**9

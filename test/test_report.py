@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate is true and complete; its page loads no file and runs no script."""
+"""The certificate has all required statements; its page loads no file and runs no script."""
 
 import re
 import tracemalloc
@@ -29,7 +29,7 @@ VOID = {'meta', 'br', 'path', 'use', 'rect', 'image'}
 
 
 class Page(HTMLParser):
-    """Reads a page like a browser: tags, their attributes, text."""
+    """Collects the tags, attributes and texts of a page."""
 
     def __init__(self, text):
         super().__init__()
@@ -69,7 +69,7 @@ def words_of(evidence):
 
 
 def bare():
-    """Make the smallest evidence for a page: a calibration without bags."""
+    """Make the evidence for a page of a calibration without bags."""
     return evidence_of_bags([], fitted().calibration)
 
 
@@ -88,8 +88,8 @@ def page():
     return Page(certificate())
 
 
-def test_certificate_of_a_fit_states_the_expected_facts(page):
-    assert not page.open  # the page closes every tag
+def test_the_certificate_of_a_fit_has_the_expected_statements(page):
+    assert not page.open  # every tag is closed
     for fact in (
         'Unit thermostatted-0001',
         evidence().calibration.provenance.created,
@@ -109,14 +109,14 @@ def test_certificate_of_a_fit_states_the_expected_facts(page):
     assert not re.search(r'\bnan\b', page.text)
 
 
-def test_certificate_has_the_residual_of_each_position_left_out(page):
+def test_the_certificate_has_the_left_out_residual_of_each_position(page):
     shown = [position.residual_rms.get(LEFT_OUT) for position in evidence().positions]
     assert shown == [*LEFT_OUT_RMS, None]
     assert 'left out, µg RMS' in page.text
     assert 'Left out: RMS of |f| − g by a fit to the other positions' in page.text
 
 
-def test_page_needs_no_network_and_runs_nothing(page):
+def test_the_page_loads_no_file_and_runs_no_script(page):
     assert not page.names() & {'script', 'img', 'link', 'iframe', 'object', 'embed', 'form'}
     for tag, attributes in page.tags:
         for name, value in attributes.items():
@@ -127,13 +127,13 @@ def test_page_needs_no_network_and_runs_nothing(page):
     assert "default-src 'none'" in style
 
 
-def test_page_has_each_id_once_and_refers_to_ids_it_has(page):
+def test_the_ids_of_the_page_are_unique_and_all_references_exist(page):
     ids = [attributes['id'] for _, attributes in page.tags if 'id' in attributes]
     assert len(set(ids)) == len(ids)
     assert set(re.findall(r'(?:url\(|href=")#([^)"]*)', page.source)) <= set(ids)
 
 
-def test_the_page_states_whether_a_bag_is_of_the_fit(opened):
+def test_the_page_states_whether_a_bag_was_fitted(opened):
     calibration = fitted().calibration
     assert 'positions in bags of the fit' in Page(certificate()).text
     unseen = evidence_of_bags(opened, calibration)
@@ -148,7 +148,7 @@ def test_a_page_of_a_bag_alone_shows_temperatures_derivatives_and_flag(opened, t
     seen = evidence_of_bags(opened)
     shown = seen.shown
     truth = run(0).truth
-    # In the middle of the first ramp the case heats at about the chamber's 1.5 K/min.
+    # In the middle of the first ramp the rate of the case is near the chamber's, 1.5 K/min.
     ramp = (shown.time > 17 * 60) & (shown.time < 21 * 60)
     assert 1.0 < np.mean(shown.case_rate[ramp]) * 60.0 < 1.6
     dynamic = np.zeros(len(truth.grid_s), bool)
@@ -167,8 +167,8 @@ def test_a_page_of_a_bag_alone_shows_temperatures_derivatives_and_flag(opened, t
     assert all(figure.question in page.text for figure in figures_of(seen))
 
 
-def test_no_text_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
-    # A browser shows names, serials, notes and hashes of a certificate as text, not as HTML.
+def test_texts_of_a_bag_or_a_calibration_are_escaped_in_the_page(tmp_path):
+    # Names, serials, notes and hashes in a certificate must be text, not HTML.
     evil = '<script>alert("x")</script>'
     bag = write_bag(
         tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", frame_id=evil, serial=evil
@@ -189,8 +189,8 @@ def test_no_text_of_a_bag_or_a_calibration_becomes_markup(tmp_path):
     assert not any(name.startswith('on') for _, attributes in page.tags for name in attributes)
 
 
-def test_hours_of_bag_stay_a_small_page():
-    # The bag has a day of readings at 2 Hz and of windows: hundreds of points per pixel.
+def test_the_page_of_a_bag_of_a_day_is_small():
+    # Readings of a day at 2 Hz are hundreds of points per pixel.
     shown, windows = evidence().shown, evidence().windows
     time = np.arange(0.0, 86400.0, 0.5)
     value = 20.0 + 15.0 * np.sin(time / 9000.0) + np.random.default_rng(1).normal(size=len(time))
@@ -205,7 +205,7 @@ def test_hours_of_bag_stay_a_small_page():
     assert len(render_report(long, figures=drawn_figures(figures)).encode()) < 1_900_000
 
 
-def test_bag_is_read_in_bounded_memory(tmp_path):
+def test_a_bag_is_read_for_a_page_in_limited_memory(tmp_path):
     simulated = run(0)
     n_times = 50
     with BagWriter(tmp_path / 'long.mcap') as writer:
@@ -220,17 +220,17 @@ def test_bag_is_read_in_bounded_memory(tmp_path):
     finally:
         tracemalloc.stop()
     assert opened.n_samples == n_times * len(simulated.counts)
-    # All samples and stamps in memory would take more than 32 bytes a sample, a block takes less.
+    # All samples and stamps in memory would need more than 32 bytes per sample.
     assert peak < 64 * opened.n_samples
 
 
-def test_calibration_alone_makes_a_page_and_its_figures_as_png(tmp_path):
+def test_a_calibration_without_bags_gives_a_page_and_figures_as_png(tmp_path):
     folder = tmp_path / 'new' / 'figures'
     page = page_of(bare(), tmp_path, figures=folder)
     assert 'no recording was judged' in page.text
     assert '01.mcap' in page.text
     assert f'{1:064x}' in page.text
-    # Without bags, only the figures of the calibration are drawn.
+    # Without bags only the figures of the calibration are drawn.
     names = [figure.name for figure in figures_of(evidence())]
     without_bags = [name for name in names if name in ('functions', 'step', 'hysteresis')]
     files = sorted(folder.iterdir())
@@ -252,7 +252,7 @@ def test_the_page_is_written_atomically(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['figures', 'page.html']
 
 
-def test_the_verdict_has_a_colour(opened):
+def test_each_verdict_has_a_colour_in_the_page(opened):
     assert evidence().level in ('good', 'reserved')
     calibration = fitted().calibration
     narrow = {

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate has the statements of the laboratory, uncertainties and correct rounding."""
+"""The certificate: statements of the laboratory, uncertainty budget, rounding of values."""
 
 import math
 from dataclasses import replace
@@ -57,16 +57,16 @@ def lab(folder, text=LAB):
         (1.23456789, math.nan, ('1.23457', '–')), (1.5, 0.0, ('1.50000', '–')),
     ],
 )  # fmt: skip
-def test_uncertainties_have_two_digits_and_values_their_place(value, expanded, text):
+def test_uncertainties_have_two_digits_and_values_end_at_the_same_digit(value, expanded, text):
     assert rounded(value, expanded) == text
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e5))
-def test_rounding_moves_neither_by_more_than_half_a_digit(value, expanded):
+def test_rounding_changes_a_value_by_at_most_half_a_digit(value, expanded):
     text, of_it = rounded(value, expanded)
     assert float(of_it) == pytest.approx(expanded, rel=0.0501)
     assert len(of_it.replace('.', '').strip('0')) <= 2
-    # Rounding an uncertainty to two digits changes it by at most a twentieth.
+    # Rounding to two digits changes an uncertainty by at most 5 %.
     assert abs(float(text.replace('−', '-')) - value) <= 0.0501 * expanded + 1e-9 * abs(value)
 
 
@@ -82,7 +82,7 @@ def test_statements_of_a_laboratory_are_printed_and_other_fields_blank(tmp_path)
         assert text in page, text
     # Two fields are blank: the address of the customer, and the place of the signature.
     assert page.count('class="blank"') == 2
-    # The margin of each printed page contains certificate and unit, whatever their names.
+    # The margin of each printed page has the numbers of certificate and unit, in CSS escapes.
     margin = (
         'certificate\\0000202026\\00002d017\\00002c\\000020unit\\000020thermostatted\\00002d0001'
     )
@@ -118,7 +118,7 @@ def test_statements_of_a_laboratory_are_printed_and_other_fields_blank(tmp_path)
         ('operator: ' + 'x' * 70_000, 'bytes, at most'),
     ],
 )
-def test_a_mistake_in_the_statements_is_one_sentence(tmp_path, text, said):
+def test_a_wrong_entry_in_the_statements_gives_a_message_of_one_line(tmp_path, text, said):
     path = lab(tmp_path, text)
     with pytest.raises(ThermoCompError) as caught:
         load_certificate_info(path, 'unit-1')
@@ -128,7 +128,7 @@ def test_a_mistake_in_the_statements_is_one_sentence(tmp_path, text, said):
     assert '\n' not in message
 
 
-def test_the_example_is_accepted_and_is_what_the_page_shows():
+def test_the_example_file_equals_its_block_in_the_documentation():
     example = ROOT / 'config' / 'lab.example.yaml'
     info = load_certificate_info(example)
     # The example file states all fields except the remarks and the serial of the unit.
@@ -138,7 +138,7 @@ def test_the_example_is_accepted_and_is_what_the_page_shows():
     assert example.read_text(encoding='utf-8') in page
 
 
-def test_statements_that_are_no_text_file_are_refused(tmp_path):
+def test_statements_that_are_not_a_text_file_are_refused(tmp_path):
     with pytest.raises(ThermoCompError, match='cannot be read: No such file'):
         load_certificate_info(tmp_path / 'none.yaml')
     (tmp_path / 'binary.yaml').write_bytes(b'number: \xff')
@@ -148,17 +148,17 @@ def test_statements_that_are_no_text_file_are_refused(tmp_path):
     assert load_certificate_info(tmp_path / 'empty.yaml') == CertificateInfo()
 
 
-def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
+def test_the_uncertainty_budget_adds_up_to_the_claimed_sd(tmp_path):
     standards = {source.name: source.standard for source in budget(evidence(), CertificateInfo())}
     assert standards['gravity'] is None
     assert standards['thermometers'] is None
-    # Noise, attitude and model add up to the claimed sd; the residual is below the claimed sd.
+    # The residual is below the claimed sd, so noise, attitude and model add up to the claimed sd.
     windows = evidence().judgement.windows
     claim = float(np.sqrt(np.mean(windows.claimed_sd[windows.is_inside] ** 2)))
     parts = [standards[name] for name in ('noise', 'attitude', 'model')]
     assert float(np.linalg.norm(parts)) == pytest.approx(claim)
     assert standards['repeatability'] == 0.0
-    # The laboratory states uncertainties of gravity and thermometers, which join the budget.
+    # Uncertainties of gravity and thermometers that the laboratory states are in the budget.
     info = load_certificate_info(lab(tmp_path))
     stated = budget(evidence(), info)
     by_name = {contribution.name: contribution.standard for contribution in stated}
@@ -167,7 +167,7 @@ def test_budget_adds_up_to_what_the_calibration_claims(tmp_path):
     assert combined(stated) == pytest.approx(expected)
 
 
-def test_residual_beyond_the_claim_is_repeatability():
+def test_a_residual_above_the_claimed_sd_is_listed_as_repeatability():
     judgement, claim = evidence().judgement, combined(budget(evidence(), CertificateInfo()))
     doubtful = replace(evidence(), judgement=replace(judgement, left_out_rms=3.0 * claim))
     standards = {source.name: source.standard for source in budget(doubtful, CertificateInfo())}
@@ -176,8 +176,9 @@ def test_residual_beyond_the_claim_is_repeatability():
     assert whole == pytest.approx(3.0 * claim)
 
 
-def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
-    # WHY: U = 0.00037 was printed for a scale factor without a stated uncertainty of gravity.
+def test_without_a_stated_uncertainty_of_gravity_that_of_scale_factors_is_withheld(tmp_path):
+    # WHY: the uncertainty of gravity was not stated, and U = 0.00037 was printed for the scale
+    # factor, as if gravity had no error.
     rows = {result.quantity: result for result in results(evidence(), CertificateInfo(), ())}
     assert rows['scale factor x'].expanded == '–'
     assert rows['bias x'].expanded != '–'
@@ -186,7 +187,7 @@ def test_uncertainty_is_withheld_where_gravity_s_is_not_stated(tmp_path):
     assert 'combined, without gravity' in page
     info = load_certificate_info(lab(tmp_path))
     assert 'withheld' not in render_report(evidence(), figures=[], info=info)
-    # The gravity uncertainty given to the fit is in the covariance, and is not counted twice.
+    # An sd of gravity that the fit was given is in the covariance, so nothing is withheld.
     stated = replace(evidence(), gravity_sd=2e-5)
     assert 'withheld' not in render_report(stated, figures=[])
     assert {source.name: source.standard for source in budget(stated, info)}['gravity'] == 0.0
@@ -205,7 +206,7 @@ def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
             at = float(row.temperature.replace('−', '-'))
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
             numbers = [float(cell.replace('−', '-')) for cell in row[2:]]
-            # Tolerance: half a digit of each value, and slope times rounding of the temperature.
+            # Values and temperatures are rounded; the tolerance is half of the last digit.
             slack = 0.06 * abs(table.bias_slope) + 0.06 * numbers[1]
             assert numbers[0] == pytest.approx(bias[k] / MICRO_G, abs=slack)
             assert numbers[1] == pytest.approx(2.0 * sd[k] / MICRO_G, rel=0.06)
@@ -227,8 +228,8 @@ def without_uncertainty(calibration):
 
 
 @pytest.mark.parametrize('is_known', [True, False])
-def test_values_and_deviations_have_one_place_where_u_is_withheld(is_known, tmp_path):
-    # WHY: a scale of -1777 ppm had fewer decimals than its deviation of 23.12 ppm.
+def test_values_and_deviations_have_equal_decimals_if_u_is_withheld(is_known, tmp_path):
+    # WHY: the scale was printed as -1777 ppm, its deviation as 23.12 ppm.
     calibration = fitted().calibration
     if not is_known:
         calibration = without_uncertainty(calibration)
@@ -243,7 +244,7 @@ def test_values_and_deviations_have_one_place_where_u_is_withheld(is_known, tmp_
                 text, expanded, deviation = cells[k : k + 3]
                 n_withheld += expanded == '–'
                 assert len(text.partition('.')[2]) == len(deviation.partition('.')[2])
-                # A withheld uncertainty does not change the numbers by more than their rounding.
+                # With and without the uncertainty the numbers are equal within their rounding.
                 for value, place in ((text, k), (deviation, k + 2)):
                     half = 0.5 * 10.0 ** -len(value.partition('.')[2])
                     number, expected = (
@@ -262,15 +263,15 @@ def test_values_and_deviations_have_one_place_where_u_is_withheld(is_known, tmp_
         ((20.0, 20.5), [20.0, 20.5]),
     ],
 )
-def test_temperatures_of_the_table_are_round(ends, expected):
+def test_temperatures_of_the_table_are_round_numbers(ends, expected):
     assert table_temperatures(*ends).tolist() == expected
 
 
-def test_the_uncertainty_of_gravity_is_that_of_the_scale_factors(tmp_path):
+def test_the_uncertainty_of_gravity_is_part_of_that_of_the_scale_factors(tmp_path):
     info = load_certificate_info(lab(tmp_path, 'gravity: {standard_uncertainty_m_s2: 9.80665e-3}'))
     rows = {result.quantity: result for result in results(evidence(), info, ())}
     scale = fitted().calibration.axes.x.scale_factor
-    # The expanded uncertainty is twice that of gravity, 1e-3, which is far above the fit's.
+    # The relative uncertainty of gravity, 1e-3, is far above that of the fit; U is twice 1e-3.
     assert float(rows['scale factor x'].expanded) == pytest.approx(2e-3 * scale, rel=0.05)
     assert (
         rows['bias x']
@@ -278,7 +279,7 @@ def test_the_uncertainty_of_gravity_is_that_of_the_scale_factors(tmp_path):
     )
 
 
-def test_conformity_is_stated_to_a_limit_alone():
+def test_conformity_is_stated_only_with_a_tolerance():
     judgement = replace(evidence().judgement, tolerance=100.0 * MICRO_G)
     statement, rule = conformity(replace(evidence(), judgement=judgement))
     assert statement == 'The unit conforms to the limit of 100 µg.'
@@ -292,7 +293,7 @@ def test_conformity_is_stated_to_a_limit_alone():
 
 
 @pytest.mark.usefixtures('no_figures')
-def test_fit_and_report_take_the_statements_of_a_laboratory(cli, tmp_path):
+def test_fit_and_report_print_the_statements_of_a_laboratory(cli, tmp_path):
     save_calibration(fitted().calibration, tmp_path / 'unit.yaml')
     given = ('-c', tmp_path / 'unit.yaml', '-o', tmp_path / 'page.html', '--certificate-info')
     cli('report', *given, lab(tmp_path))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures are legible without colour, with the right numbers; browsers show the pages."""
+"""Figures have the right numbers and are legible without colour; browsers display the pages."""
 
 import re
 import shutil
@@ -30,8 +30,8 @@ from thermo_comp.unit.gravity import MICRO_G
 pytestmark = pytest.mark.usefixtures('equal_fits_once')
 
 
-def test_bias_and_scale_curves_by_hand():
-    # Bias: 0.3 counts/K, and 0.3 counts/K times the lag, 10 (1 - exp(-1)) K after 10 min.
+def test_drawn_bias_and_scale_curves_agree_with_formulas():
+    # The bias is 0.3 counts/K times t plus 0.3 counts/K times the lag of 600 s.
     static, dynamic = (
         regime_set(*[axis_set((0.0, 0.3), (1.0, 7e-5), delta=delta)] * 3, rate_range_k_min=(0, 2))
         for delta in (0.0, 0.5)
@@ -54,8 +54,8 @@ def test_bias_and_scale_curves_by_hand():
 
 
 @pytest.mark.slow
-def test_a_soak_measures_what_the_calibration_lacks():
-    # Make the scale of all axes wrong by 30 ppm in every soak.
+def test_measured_errors_in_soaks_are_those_of_the_scale_factors():
+    # In soaks the scale factors of all axes have an error of 30 ppm.
     windows = evidence().windows
     up = np.array([position.up for position in evidence().positions])[windows.position]
     length = np.where(windows.is_dynamic, 1.0, 1.0 + 30e-6) * windows.gravity
@@ -64,27 +64,27 @@ def test_a_soak_measures_what_the_calibration_lacks():
     assert len(temperature) >= len(wrong.positions)
     bias, scale = errors[:, :3], errors[:, 3:]
     known = np.isfinite(scale)
-    assert known.any(axis=1).all()  # some axis senses half of gravity or more
+    assert known.any(axis=1).all()  # at least one axis measures half of gravity or more
     assert scale[known] == pytest.approx(30.0, rel=1e-4)
     assert np.linalg.norm(bias, axis=1) == pytest.approx(30.0, rel=1e-4)
 
 
-def test_metres_of_a_navigator_by_hand():
-    # A bias of 1 mg gives a position error of 9.80665e-3 * 1800 m in 60 s, a bias of 1 ug at most
-    # 1e-6 Earth diameters.
+def test_position_errors_of_a_navigator_agree_with_hand_numbers():
+    # In 60 s a bias of 1 mg causes an error of 9.80665e-3 * 1800 m; without a limit of time a bias
+    # of 1 ug causes an error of at most 1e-6 Earth diameters.
     assert position_error(1e3 * MICRO_G, 60.0) == pytest.approx(17.652, rel=1e-4)
     assert schuler_peak(MICRO_G) == pytest.approx(12.742, rel=1e-4)
 
 
-def test_map_of_the_sphere_keeps_areas():
+def test_the_map_of_the_sphere_preserves_areas():
     assert of_bags.equal_area((0.0, 0.0, 1.0), 1) == (0.0, 0.0)
     assert of_bags.equal_area((0.0, 1.0, 0.0), -1) == (0.0, 1.0)
-    # The cap above 45 degrees is 1 - sin 45 of a hemisphere and maps to the same part of the disc.
+    # The cap above 45 degrees has 1 - sin 45 of the area of a hemisphere, and of the disc.
     x, y = of_bags.equal_area((np.sqrt(0.5), 0.0, np.sqrt(0.5)), 1)
     assert x**2 + y**2 == pytest.approx(1.0 - np.sqrt(0.5))
 
 
-def test_trace_covers_the_bag_without_a_gap():
+def test_the_drawn_trace_covers_the_bag_without_a_gap():
     bag = fitted().bags[0]
     stretches = shown_bag(bag, 0, DetectorSettings()).stretches
     assert stretches[0].regime == Regime.UNKNOWN
@@ -95,7 +95,7 @@ def test_trace_covers_the_bag_without_a_gap():
         assert (before.regime, before.direction) != (after.regime, after.direction)
 
 
-def test_trace_without_a_case_sensor_follows_the_board():
+def test_the_drawn_trace_without_a_case_thermometer_is_that_of_the_board():
     bag = fitted().bags[0]
     bag = replace(bag, temperatures={'board': bag.board})
     shown = shown_bag(bag, 0, DetectorSettings())
@@ -105,7 +105,7 @@ def test_trace_without_a_case_sensor_follows_the_board():
 
 
 def look(line):
-    """Return the properties that distinguish lines without colour: dashes, marker, darkness."""
+    """Return dashes, marker and darkness of a line, which distinguish lines without colour."""
     dashes, colour = line._unscaled_dash_pattern, line.get_color()
     marker = f'{line.get_marker()} {line.get_markerfacecolor()}'
     darkness = round(float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))), 1)
@@ -120,7 +120,7 @@ def look(line):
         of_bags.draw_every_position,
     ],
 )  # fmt: skip
-def test_figures_are_legible_in_black_and_white(draw):
+def test_lines_of_figures_differ_without_colour(draw):
     with drawing():
         figure = draw(evidence())
         figure.draw_without_rendering()
@@ -139,7 +139,7 @@ def test_the_area_of_a_ring_is_proportional_to_the_residual_of_its_position():
         lines = [line for axes in of_bags.draw_positions(evidence()).axes for line in axes.lines]
     rings = [line for line in lines if line.get_marker() == 'o' and line.get_mfc() == 'none']
     areas = np.sort([ring.get_markersize() ** 2 for ring in rings])
-    # A position without a left-out residual has a ring without area.
+    # A position without a left-out residual has a ring of area 0.
     rms = np.sort([place.residual_rms.get(LEFT_OUT, 0.0) for place in evidence().positions])
     assert areas / areas[-1] == pytest.approx(rms / rms[-1])
 
@@ -154,14 +154,14 @@ def test_numbers_have_three_to_four_digits(value, text):
     assert number(value) == text
 
 
-def test_label_of_a_drawing_is_escaped():
+def test_the_label_of_a_drawing_is_escaped():
     with drawing():
         text = svg(of_bags.draw_temperatures(evidence()), 'x', '"><script>')
     assert '<script>' not in text
     assert 'aria-label="&quot;&gt;&lt;script&gt;"' in text
 
 
-def test_rates_are_those_of_the_gyroscope():
+def test_the_figure_of_rates_shows_the_bias_of_the_gyroscope():
     unit = rich_calibration()
     with drawing():
         figure = of_unit.draw_rates(replace(evidence(), calibration=unit))
@@ -193,8 +193,8 @@ def browser():
     return path
 
 
-def test_browser_draws_the_page_for_a_phone_whole_and_without_a_complaint(tmp_path):
-    # A headless browser has no window as narrow as a phone, but a frame in it can be.
+def test_a_browser_draws_the_page_at_390_pixels_without_errors(tmp_path):
+    # A headless browser has a smallest window width; a frame in the window can be 390 px wide.
     (tmp_path / 'page.html').write_text(certificate(), encoding='utf-8')
     frame = tmp_path / 'frame.html'
     frame.write_text("""<iframe src="page.html" style="width:390px;height:800px;border:0"></iframe>
@@ -234,5 +234,5 @@ def test_no_printed_page_is_empty(tmp_path):
     assert 5 <= len(pages) <= 12
     for page in pages:
         drawn = re.search(rb'\n%s 0 obj.*?stream\r?\n' % page, printed, re.DOTALL)
-        # A page with content has over 200 lines of drawing commands; an empty page has few.
+        # A printed page with content has over 200 lines of drawing commands.
         assert zlib.decompressobj().decompress(printed[drawn.end() :]).count(b'\n') > 200

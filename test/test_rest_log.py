@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node logs rests on DDS; a killed node or a full disk damages the rest log little."""
+"""The rest log of the node: content, size, and damage by a killed node or a full disk."""
 
 import json
 import signal
@@ -38,7 +38,7 @@ def rest(number):
     return Rest(stamp, 1000, (1.0, -2.0, 2941.25), (3.0,) * 3, (*state, 0.25, 0.0), (0.5,))
 
 
-def test_a_rest_with_rates_and_a_rest_without_rates_survive_the_log():
+def test_rests_with_and_without_angular_rates_are_read_back_unchanged():
     between = ('board', 600.0, 60.0, 'case', 0.4)
     memory = MemorySpec(('case',), (('board', 60.0), between), ((600.0, 0.8, *between[2:]),),
                         ('case',))  # fmt: skip
@@ -81,8 +81,8 @@ def finder():
     )
 
 
-def test_windows_are_means_of_ten_seconds_at_rest():
-    # Rests of 25 s and, in another attitude after 1 s of handling, 21 s give two windows each.
+def test_logged_windows_are_means_over_10_s_at_rest():
+    # A rest of 25 s and, after 1 s of handling, a rest of 21 s: each gives two windows of 10 s.
     first, second = standing(25 * RATE_HZ), standing(21 * RATE_HZ, 2)[:, [2, 1, 0]]
     handled = first[:RATE_HZ] + np.linspace(0.0, 900.0, RATE_HZ)[:, None]
     samples = np.concatenate((first, handled, second))
@@ -93,7 +93,7 @@ def test_windows_are_means_of_ten_seconds_at_rest():
     for row, part in zip(whole, parts, strict=True):
         assert np.allclose(row.mean, part.mean(axis=0), atol=1e-9)
         assert np.allclose(row.sd, part.std(axis=0), rtol=0.05)
-    # The result does not depend on the blocks in which the samples arrive.
+    # Samples in blocks of any size give equal windows.
     pieces, rests = finder(), []
     for cut in np.split(np.arange(len(samples)), [7, 333, 334, 1201]):
         rests += pieces.add(stamps[cut], samples[cut])
@@ -103,8 +103,8 @@ def test_windows_are_means_of_ten_seconds_at_rest():
 
 @pytest.mark.parametrize('rate', [1.0, 2.0, 3.3, 5.0, 50.0, 2000.0])
 def test_rests_are_found_at_any_rate_of_samples(rate, rng):
-    # Two minutes of rest in two attitudes, with scattered stamps. Up to `RATE_HZ` the noise of a
-    # sample is constant, at higher rates the noise density.
+    # Rests of one minute in two attitudes, with jitter of the stamps. Samples up to `RATE_HZ` have
+    # equal noise, samples at higher rates equal noise density.
     n = round(120 * rate)
     cycles = np.arange(n) + 0.1 * rng.uniform(-1.0, 1.0, n)
     stamps = START_NS + np.rint(cycles * SECOND_NS / rate).astype(np.int64)
@@ -112,7 +112,7 @@ def test_rests_are_found_at_any_rate_of_samples(rate, rng):
     samples = (30.0, -20.0, 2941.0) + 300.0 * NOISE * excess * rng.standard_normal((n, 3))
     samples[n // 2 :] = samples[n // 2 :, [2, 1, 0]]
     whole = finder().add(stamps, samples)
-    # At most two windows are lost at the change of attitude, and one at the end of the samples.
+    # At most two windows are lost at the change of attitude, and one window at the end.
     assert sum(row.n for row in whole) >= 0.6 * n
     assert len(whole) >= 6
     for row in whole:
@@ -146,8 +146,8 @@ def test_motion_and_bad_samples_are_not_logged_as_rests(fault):
     assert finder().add(stamps, samples) == []
 
 
-def test_windows_of_a_rest_of_a_day_are_kept_ever_more_rarely():
-    # Windows kept of a rest: 60 in 10 min, one a minute up to 1 h, then one in 5 min.
+def test_a_long_rest_is_logged_with_increasing_intervals():
+    # A rest is logged by 60 windows in its first 10 min, one per min up to 1 h, then one in 5 min.
     kept, searching = 0, finder()
     samples = standing(6 * 60)
     for minute in range(71):
@@ -157,7 +157,7 @@ def test_windows_of_a_rest_of_a_day_are_kept_ever_more_rarely():
 
 
 @given(st.integers(0, 2000), st.integers(0, 255))
-def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
+def test_a_damaged_rest_log_loses_only_the_damaged_lines(place, value):
     content = encode(START) + b''.join(encode(rest(k)) for k in range(9))
     whole, n_damaged = decode(content)
     assert n_damaged == 0
@@ -168,7 +168,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [row for _, row in decode(bytes(changed))[0]]
-    # A changed byte in a rest log loses one rest, a lost newline two, a damaged start line all.
+    # A wrong byte loses one rest; a wrong newline loses two; a wrong start line loses all.
     assert all(row in [rest(k) for k in range(9)] for row in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 
@@ -181,7 +181,7 @@ def test_a_torn_or_changed_file_loses_the_damaged_lines_alone(place, value):
     ),
     st.integers(0, 6),
 )
-def test_a_line_with_a_checksum_may_hold_anything(value, place):
+def test_a_line_with_a_right_checksum_and_wrong_content_is_counted_as_damaged(value, place):
     good = json.loads(encode(rest(0))[9:])
     for data in (value, [*good[:place], value, *good[place + 1 :]]):
         text = json.dumps(data).encode()
@@ -203,7 +203,7 @@ def test_thinning_halves_the_rests_and_keeps_each_start():
     assert [start for start, _ in decode(content)[0]] == starts
 
 
-def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
+def test_the_size_of_a_rest_log_is_limited_per_day_and_in_total(tmp_path, monkeypatch):
     monkeypatch.setattr(rest_log, 'DAY_BYTES', 2000)
     monkeypatch.setattr(rest_log, 'FOLDER_BYTES', 5000)
     monkeypatch.setattr(rest_log, '_UNTHINNED_BYTES', 500)
@@ -217,7 +217,7 @@ def test_a_log_is_bounded_by_day_and_in_all(tmp_path, monkeypatch):
     assert len(sizes) == 6
     assert max(sizes) <= 2000
     assert sum(sizes) <= 5000 + 2000
-    # The files of the oldest days were thinned most, and no file was removed.
+    # Old files lost more rests than new files, and no file was removed.
     assert sizes[0] < sizes[-1] / 2
     assert log.n_rests == len(logged(tmp_path))
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')
@@ -234,14 +234,14 @@ def test_rests_lost_on_a_full_disk_are_counted(small_disk):
     assert log.reason == 'No space left on device'
 
 
-def test_the_node_logs_rests_and_a_kill_tears_at_most_one_line(tmp_path, unit, peer):
+def test_a_killed_node_damages_at_most_one_line_of_its_rest_log(tmp_path, unit, peer):
     folder = tmp_path / 'rests'
     samples = standing(200 * RATE_HZ)
     words = node_arguments(unit, f'rest_log:={folder}')
     sent = 0
 
     def until(condition, what):
-        """Send samples, a second at a time: the node may not yet have discovered the driver."""
+        """Send samples of 1 s until a condition holds; samples before discovery are lost."""
         nonlocal sent
         pause = threading.Event()
         for _ in range(len(samples) // RATE_HZ):
@@ -261,7 +261,7 @@ def test_the_node_logs_rests_and_a_kill_tears_at_most_one_line(tmp_path, unit, p
     with file.open('ab') as torn:
         torn.write(encode(rest(9))[:40])
     before = logged(folder)
-    # Restart the node in the same folder: it appends after the torn line.
+    # A node that is started with this folder appends rests after the incomplete line.
     with node_in_thread(*words) as node:
         heard = peer.listen(DiagnosticArray, '/diagnostics')
         peer.join(node)

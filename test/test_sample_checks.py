@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid samples (stuck, zero, too fast) are treated alike in streams and in blocks."""
+"""Invalid samples (stuck, zero, too fast) are rejected, one by one and in blocks alike."""
 
 import math
 
@@ -47,7 +47,7 @@ def run(compensator, events):
 
 
 def recording(n, rate_hz, sample, start_ns=0):
-    """Make events of n samples, sample(k) being the k-th, with both temperatures at 1 Hz."""
+    """Make events of the samples sample(0) to sample(n - 1), and of both temperatures at 1 Hz."""
     events = []
     second = start_ns // SECOND_NS
     for k in range(n):
@@ -59,7 +59,7 @@ def recording(n, rate_hz, sample, start_ns=0):
     return events
 
 
-def test_few_equal_samples_are_chance_however_long_they_take(rng):
+def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
     compensator = Compensator(calibration())
     stuck = at_rest(rng)
     run(compensator, recording(STUCK_SAMPLES, 1.0, lambda _: stuck))
@@ -77,8 +77,8 @@ def test_few_equal_samples_are_chance_however_long_they_take(rng):
     st.sampled_from([0, 1, 49, 60]),
 )
 @settings(max_examples=300, deadline=None)
-def test_standstills_are_found_however_long_the_batch(parts, cuts, period):
-    # Parts of a recording in which each axis stands or changes with each sample; with a NaN.
+def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
+    # In each part of a recording an axis is constant or changes with each sample; some are NaN.
     stands = np.repeat([which >> np.arange(3) & 1 for _, which in parts], [n for n, _ in parts], 0)
     samples = 1.0 + np.cumsum(1.0 - stands.reshape(-1, 3), axis=0)
     samples[7::97, 1] = np.nan
@@ -100,7 +100,7 @@ def test_standstills_are_found_however_long_the_batch(parts, cuts, period):
             collected += batched.find(stamps[begin:end], samples[begin:end]).tolist()
         begin = end
     assert collected == expected
-    # NaN before the first sample.
+    # `last` is NaN before the first sample.
     np.testing.assert_array_equal(batched.last, single.last)
     for run, other in zip(single.runs, batched.runs, strict=bool(single.runs)):
         np.testing.assert_array_equal(np.hstack(run), np.hstack(other))
@@ -108,7 +108,7 @@ def test_standstills_are_found_however_long_the_batch(parts, cuts, period):
 
 @pytest.mark.parametrize('axis', range(3))
 @pytest.mark.parametrize('value', [0.0, 123.0])
-def test_one_axis_that_stands_while_the_others_move_is_stuck(axis, value):
+def test_a_constant_axis_is_stuck_if_the_other_axes_change(axis, value):
     compensator = Compensator(calibration())
 
     def sample(k):
@@ -121,9 +121,9 @@ def test_one_axis_that_stands_while_the_others_move_is_stuck(axis, value):
     assert compensator.counters.n_stuck == 799
 
 
-def test_one_axis_that_stands_at_rest_is_not_stuck(rng):
+def test_a_constant_axis_at_rest_is_not_stuck(rng):
     compensator = Compensator(calibration())
-    # The noise is less than a step, and two axes are at the edge of a step.
+    # Noise is below a rounding step: x is constant, y and z are at an edge and alternate.
     run(
         compensator,
         recording(
@@ -139,7 +139,7 @@ def test_one_axis_that_stands_at_rest_is_not_stuck(rng):
     assert compensator.counters.n_out == 5000
 
 
-def test_a_user_may_switch_checks_of_samples_off():
+def test_checks_of_samples_can_be_switched_off():
     compensator = Compensator(
         calibration(), CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
     )
@@ -147,7 +147,7 @@ def test_a_user_may_switch_checks_of_samples_off():
     assert compensator.counters.n_out == 1000
 
 
-def test_a_buffer_that_is_emptied_at_once_is_no_rate(rng):
+def test_samples_in_bursts_are_not_taken_for_too_fast(rng):
     compensator = Compensator(calibration())
     events = []
     for burst in range(60):
@@ -158,7 +158,7 @@ def test_a_buffer_that_is_emptied_at_once_is_no_rate(rng):
     assert compensator.counters.n_too_fast == 0
 
 
-def test_an_acceleration_at_another_rate_has_another_noise(rng):
+def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
     unit = calibration(
         unit=Unit('T-1', 'm/s^2', 100.0, 0.01), axes=Axes(*[AxisReference(1.0, 0.0)] * 3)
     )
@@ -168,28 +168,28 @@ def test_an_acceleration_at_another_rate_has_another_noise(rng):
         recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
     )
     assert len(rows) == 8000
-    # At four times the rate samples average over a quarter of the time: four times the variance.
+    # At four times the calibrated rate a sample averages 1/4 of the time and has 4 times the
+    # variance.
     assert rows[-1][3] / rows[0][3] == pytest.approx(4.0, rel=1e-6)
 
 
-def test_gravity_is_that_of_the_place_or_of_the_calibration(rng):
+def test_the_gravity_check_uses_local_gravity_or_that_of_the_calibration(rng):
     for local, expected in ((0.0, 0.0), (GRAVITY + 2e-3, -2e-3)):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
         run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
-        # Tolerance: noise of 1.4 mm/s^2 in each of some 110 samples, plus rounding errors of 0.05
-        # counts.
+        # The tolerance is that of a mean of 110 samples with a noise of 1.4 mm/s^2, and rounding.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
 
 
-def test_the_total_counts_every_reason_once():
+def test_the_number_of_samples_is_the_sum_of_all_reasons():
     counters = Counters(**{name: 2**k for k, name in enumerate(DROPPED)})
     assert counters.n_in == 2 ** len(DROPPED) - 1
 
 
 @st.composite
 def stretches(draw):
-    """Draw stretches of samples, each of one kind, with temperatures between the samples."""
+    """Draw events: sequences of samples, each with a kind of fault or none, and temperatures."""
     events = []
     stamp_ns = 0
     k = 0

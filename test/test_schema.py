@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each type hint accepts its plain values; an error names the key of any other value."""
+"""Plain data become dataclasses by their type hints; a message names the key of a wrong value."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -62,7 +62,7 @@ def test_a_dataclass_is_unchanged_by_a_round_trip_of_plain_values(drawing):
     assert build(Drawing, plain(drawing)) == drawing
 
 
-def test_nothing_is_converted_but_integers_to_floats():
+def test_only_integers_for_floats_are_converted():
     built = build(Drawing, {'name': 'ab', 'corner': [1, 2], 'layer': '3'})
     assert built == Drawing('ab', corner=(1.0, 2.0), layer='3')
     assert [type(value) for value in built.corner] == [float, float]
@@ -98,7 +98,7 @@ def test_nothing_is_converted_but_integers_to_floats():
         ({'name': 'ab', 'frame': {'radius': '1'}}, 'frame.radius', "valid number, got '1'"),
     ],
 )
-def test_values_of_wrong_type_are_refused_by_key(data, key, message):
+def test_the_message_about_a_wrong_value_names_its_key(data, key, message):
     with pytest.raises(SchemaError, match=message) as caught:
         build(Drawing, data)
     assert caught.value.key == key

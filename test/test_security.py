@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes from outside are never executed; the node opens only topics and services of the policy."""
+"""Data from outside cannot fill the memory or open other files; the node obeys its policy."""
 
 import xml.etree.ElementTree as ET
 
@@ -30,7 +30,7 @@ def allowed():
     return collected
 
 
-def test_the_policy_allows_what_the_node_opens_and_no_more(tmp_path):
+def test_the_policy_permits_exactly_the_topics_and_services_of_the_node(tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from ros_helpers import node_in_thread
 
@@ -65,7 +65,7 @@ def one_reading(path):
 
 
 def test_metadata_with_nested_aliases_is_refused(tmp_path):
-    # WHY: merge keys with aliases multiply: 30 lines of YAML expand to 10^28 entries.
+    # WHY: each line refers to the line before nine times: 30 lines of YAML give 10^28 entries.
     bag = one_reading(tmp_path / 'bag')
     metadata = bag / 'metadata.yaml'
     metadata.write_text(f'{metadata.read_text()}\n{BOMB}\n')

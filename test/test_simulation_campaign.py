@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Chamber programs, simulated tests and ready-made units are as described."""
+"""Chamber programs, plans, units and converter of the simulation agree with their description."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -29,7 +29,7 @@ def _history(temperature, step=1.0):
 
 
 @pytest.mark.parametrize('kind', ['own-lags', 'switched-load', 'slow-noise', 'convection'])
-def test_a_record_is_the_run_of_a_bag(kind):
+def test_a_record_of_arrays_equals_a_run_of_simulate(kind):
     unit = triad(kind, 1)
     _, record = arrays(unit, [STATION, STATION], 3)
     run = simulate(unit, PROGRAM, STATION.up, rate_hz=4.0, seed=3001, start_ns=0)
@@ -43,8 +43,8 @@ def test_a_record_is_the_run_of_a_bag(kind):
 
 
 @pytest.mark.parametrize('kind', TRIAD_NAMES)
-def test_a_perfect_model_leaves_the_noise(kind):
-    """The noise in means over 60 s, floor of every accuracy: 0.65 ug in |f|, 1.12 ug in f."""
+def test_the_true_thermal_model_leaves_only_noise(kind):
+    """In means over 60 s the noise is 0.65 ug in |f| and 1.12 ug in the vector."""
     unit = triad(kind, 2)
     errors, norms = [], []
     for record in arrays(unit, plan('held-out', 2), 7):
@@ -53,16 +53,16 @@ def test_a_perfect_model_leaves_the_noise(kind):
         norms.append(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY / MICRO_G)
     vector = np.sqrt(np.mean(np.concatenate(errors)))
     if kind == 'slow-noise':
-        # The random walk has a mean square of 9 * 7.3 / 2 ug^2 per axis in 7.3 h; the wide limits
-        # allow for the scatter of 3 runs.
+        # In 7.3 h the random walk has a mean square of 9 * 7.3 / 2 ug^2 per axis; three runs
+        # determine the RMS to a factor of two.
         assert 4.0 < vector < 20.0
     else:
-        # The RMS of 1311 means scatters by 2 % (norm) and 1.2 % (vector); the limits are 5 sd.
+        # The RMS of 1311 means is uncertain by 2 % (norm) and 1.2 % (vector); limits: 5 times.
         assert np.sqrt(np.mean(np.concatenate(norms) ** 2)) == pytest.approx(0.65, abs=0.065)
         assert vector == pytest.approx(1.12, abs=0.07)
 
 
-def test_plans_are_what_their_names_say():
+def test_plans_have_the_stated_durations_and_attitudes():
     hours = {
         name: sum(p.program.duration_s for p in plan(name, 1)) / 3600.0 for name in PLAN_NAMES
     }
@@ -75,7 +75,7 @@ def test_plans_are_what_their_names_say():
         ups = np.array([p.up for p in plan(name, 1)])
         np.testing.assert_allclose(np.linalg.norm(ups, axis=1), 1.0)
         assert np.any(ups != np.array([p.up for p in plan(name, 2)]))
-    # In the three chamber positions of tumble-3 gravity along each axis varies by 0.5 g or more.
+    # From position to position of the chamber in tumble-3, f of each axis varies by over 0.5 g.
     assert np.ptp(np.array([p.up for p in plan('tumble-3', 1)][18:]), axis=0).min() > 0.5
     fitted = np.array([p.up for p in plan('chamber-18', 1)])
     held_out = np.array([p.up for p in plan('held-out', 1)])
@@ -85,17 +85,17 @@ def test_plans_are_what_their_names_say():
 
 
 def test_a_slipping_joint_has_a_closed_hysteresis_loop():
-    """The hysteresis of a bias between warming and cooling is independent of the rate."""
+    """The bias depends on the path of the temperature, not on its rate."""
     there_and_back = np.concatenate([np.linspace(0, 5, 200), np.linspace(5, 0, 200)])
     for is_gradual in (False, True):
         effect = SlipEffect('a', 1.0, is_gradual, bias=(2.0, 0.0, 0.0))
         quick, _ = effect.change(_history(there_and_back))
         slow, _ = effect.change(_history(np.repeat(there_and_back, 7), 60.0))
         np.testing.assert_array_equal(slow[::7], quick)
-        # The joint slips at a stress of 1 K, its width, in either direction: bias +-2 ug.
+        # The joint slips at a stress of +-1 K: with 2 ug/K the bias is +-2 ug.
         assert quick[199, 0] == pytest.approx(2.0, rel=0.01)
         assert quick[-1, 0] == pytest.approx(-2.0, rel=0.02)
-        # A second cycle ends where the first ended: the loop is closed.
+        # A second cycle ends with the bias of the first cycle, so the loop is closed.
         twice, _ = effect.change(_history(np.concatenate([there_and_back] * 2)))
         assert twice[-1, 0] == pytest.approx(quick[-1, 0], rel=0.02)
 
@@ -109,7 +109,7 @@ def test_the_effect_of_heat_flow_is_even_and_zero_at_rest():
     assert warm[0, 0] == 0.0
 
 
-def test_a_saturated_effect_of_heat_flow_is_on_or_off():
+def test_a_saturated_effect_of_heat_flow_has_two_values():
     up = np.stack([np.array([0.0, 0.5, 50.0]), np.full(3, 2.0)], axis=1)
     up[:, 0] += 2.0
     effect = FlowEffect('a', 'b', 2.0, 0.5, True, 1, bias=(1.0, 0.0, 0.0))
@@ -117,8 +117,8 @@ def test_a_saturated_effect_of_heat_flow_is_on_or_off():
     np.testing.assert_allclose(bias[:, 0], [0.0, 1.0, 2.0], atol=1e-3)
 
 
-def test_a_switched_load_heats_its_part():
-    """The warming is zero before the load, and at last that of the steady heat balance."""
+def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
+    """Before the load the warming is zero; at the end it is that of the steady heat balance."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))
@@ -130,12 +130,12 @@ def test_a_switched_load_heats_its_part():
     )
     warmer = of_part(on, 'board') - of_part(off, 'board')
     np.testing.assert_allclose(warmer[: int(spell)], 0.0, atol=1e-9)
-    # The load's 0.5 W flow through 0.4 W/K to the case and about 4 W/K to the air.
+    # The load of 0.5 W flows through 0.4 W/K to the case, and from there to the air.
     to_air = next(link.conductance for link in unit.network.links if link.a == 'air')
     assert warmer[-1] == pytest.approx(0.5 / 0.4 + 0.5 / to_air, rel=1e-6)
 
 
-def test_a_typed_program_is_read_as_written():
+def test_a_chamber_program_is_read_from_text():
     program = parse_cyclogram('20 30min, 35@0.5 1h; -5.5@1.5\n-5.5 90s, 20')
     np.testing.assert_allclose(program.temperature_c, [20, 20, 35, 35, -5.5, -5.5, 20])
     np.testing.assert_allclose(
@@ -158,7 +158,7 @@ def test_a_typed_program_is_read_as_written():
         (f'20, {"9" * 400}', 'finite numbers'),
     ],
 )
-def test_a_typed_program_that_cannot_be_read_is_refused(text, message):
+def test_a_wrong_chamber_program_is_refused_with_the_step(text, message):
     with pytest.raises(ValueError, match=message):
         parse_cyclogram(text)
 
@@ -178,7 +178,7 @@ def _static(unit, board):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_constants_hold_at_the_reference(name):
+def test_bias_and_scale_changes_are_0_at_the_reference_temperature(name):
     unit = unit_of(name, 3)
     bias, scale = _static(unit, np.array([20.0]))
     np.testing.assert_allclose(bias, 0.0, atol=1e-9)
@@ -188,13 +188,13 @@ def test_constants_hold_at_the_reference(name):
 
 
 @pytest.mark.parametrize('seed', range(8))
-def test_bare_quartz_has_the_published_slopes(seed):
-    """Q-Flex class: scale 68..87 ppm/K at 5..35 degC, 0.31 ppm/K^2; bias 0.3..5 ug/K."""
+def test_the_preset_bare_quartz_has_the_published_slopes(seed):
+    """Q-Flex: scale slope 68 to 87 ppm/K at 5 to 35 degC (0.31 ppm/K^2), bias 0.3 to 5 ug/K."""
     unit = unit_preset('bare-quartz', seed)
     board = np.array([4.5, 5.5, 19.5, 20.0, 20.5, 34.5, 35.5])
     bias, scale = _static(unit, board)
     cold, hot = (scale[1] - scale[0]) * 1e6, (scale[6] - scale[5]) * 1e6
-    # The slopes of simulated units scatter by 1 % about the published slopes.
+    # The slopes of simulated units differ by 1 % (1 sd) from the published slopes.
     np.testing.assert_allclose(cold, 68.0, atol=1.5)
     np.testing.assert_allclose(hot, 87.0, atol=1.5)
     curvature = 2.0 * (scale[4] + scale[2] - 2.0 * scale[3]) * 1e6
@@ -204,13 +204,13 @@ def test_bare_quartz_has_the_published_slopes(seed):
 
 
 @pytest.mark.parametrize('seed', range(8))
-def test_mems_bias_moves_by_hundreds_of_micro_g(seed):
+def test_the_bias_slope_of_the_preset_mems_is_90_to_550_ug_per_k(seed):
     bias, _ = _static(unit_preset('mems', seed), np.array([19.5, 20.5]))
     slope = np.abs(bias[1] - bias[0])
     assert np.all((slope > 90.0) & (slope < 550.0))
 
 
-def test_specimens_differ_by_seed_and_are_reproducible():
+def test_equal_seeds_give_equal_units_and_other_seeds_other_units():
     for name in NAMES:
         assert unit_of(name, 1) == unit_of(name, 1)
         assert unit_of(name, 1) != unit_of(name, 2)
@@ -219,18 +219,18 @@ def test_specimens_differ_by_seed_and_are_reproducible():
         unit_preset('laser')
 
 
-def test_sum_of_counts_is_the_integral_within_one_count(rng):
+def test_the_sum_of_counts_is_the_integral_within_one_count(rng):
     charge = rng.uniform(-3000.0, 3000.0, (200_000, 3))
     start = first_charge(7)
     counts, _ = balanced(charge, start)
-    # Sums of charge and counts differ by 0 to 1 count at every cycle; 1e-6 is float rounding.
+    # At each cycle sum of charge less sum of counts is 0 to 1 count; 1e-6 is the rounding error.
     short = np.cumsum(charge, axis=0) + start / 2.0**40 - np.cumsum(counts, axis=0)
     assert short.min() > -1e-6
     assert short.max() < 1.0 + 1e-6
 
 
-def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing():
-    """A day ends at the exact count; a float sum of 1e9 counts has no digits for fractions."""
+def test_the_sum_of_counts_of_a_day_at_100_hz_is_exact_to_one_count():
+    """The charge is a third of a count above a whole number in each of 8.8 million cycles."""
     charge = np.full((400_000, 1), 2978.0 + 1.0 / 3.0)
     remainder = np.zeros(1, dtype=np.int64)
     total, n_cycles = 0, 0
@@ -239,11 +239,11 @@ def test_a_day_at_100_hz_of_a_third_of_a_count_loses_nothing():
         total += int(counts.sum())
         n_cycles += len(counts)
     exact = n_cycles * Fraction(8935, 3)
-    # The remainder has steps of 2^-40 count, which add to at most 8e-6 count in 8.8e6 cycles.
+    # The remainder has steps of 2^-40 counts; in 8.8e6 cycles the rounding adds up to 8e-6 counts.
     assert abs(total - exact) < 1 + 1e-4
 
 
-def test_blocks_of_any_size_give_the_same_counts(rng):
+def test_blocks_of_any_size_give_equal_counts(rng):
     charge = rng.normal(0.0, 2e4, (10_000, 3))
     start = first_charge(1)
     whole, last = balanced(charge, start)
@@ -256,13 +256,13 @@ def test_blocks_of_any_size_give_the_same_counts(rng):
         np.testing.assert_array_equal(remainder, last)
 
 
-def test_output_saturates_at_the_words_ends_and_recovers():
+def test_the_converter_saturates_at_16_bits_and_recovers():
     charge = np.array([[4e4, -4e4, 0.5], [0.5, 0.5, 0.5], [0.5, 0.5, 0.5]])
     counts, _ = balanced(charge, np.zeros(3, dtype=np.int64))
     np.testing.assert_array_equal(counts, [[32767, -32768, 0], [0, 0, 1], [1, 1, 0]])
 
 
-def test_without_a_carry_each_cycle_is_rounded_by_itself():
+def test_without_a_carried_remainder_each_cycle_is_rounded_separately():
     charge = np.full((5, 3), 10.4)
     counts, _ = rounded(charge, first_charge(0))
     np.testing.assert_array_equal(counts, 10)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated runs agree with closed forms and integrators, whatever the size of a block."""
+"""Simulated runs agree with closed formulas and with numerical integration, in any blocks."""
 
 import math
 from dataclasses import replace
@@ -37,7 +37,7 @@ def _joined(blocks, name, *, is_truth=False):
 
 @pytest.mark.parametrize('block_size', [1777, 6000, 10**6])
 @pytest.mark.parametrize('name', ['thermostatted', 'mems'])
-def test_blocks_are_the_whole_bit_for_bit(name, block_size):
+def test_a_run_in_blocks_equals_the_whole_run_bit_for_bit(name, block_size):
     options = {'rate_hz': 20.0, 'seed': 9}
     arguments = (unit_preset(name, 1), rippled(SHORT), UP)
     whole = simulate(*arguments, **options)
@@ -54,7 +54,7 @@ def test_blocks_are_the_whole_bit_for_bit(name, block_size):
         assert block.board_stamp_ns[-1] <= block.accel_stamp_ns[-1]
 
 
-def test_same_seed_same_bits_other_seed_other_bits(unit):
+def test_equal_seeds_give_equal_runs_and_other_seeds_other_runs(unit):
     first, again, other = (simulate(unit, SHORT, UP, seed=seed) for seed in (5, 5, 6))
     for column in COLUMNS:
         np.testing.assert_array_equal(getattr(first, column), getattr(again, column))
@@ -73,8 +73,8 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
     )
 
 
-def test_a_further_error_source_changes_no_other_numbers(unit):
-    """Thermometer noise changes only the readings; a drifting bias is added to equal noise."""
+def test_a_further_error_source_does_not_change_the_other_random_numbers(unit):
+    """Thermometer noise does not change counts; drift of the bias does not change their noise."""
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)
     assert np.all(noisy.board != plain.board)
@@ -85,12 +85,12 @@ def test_a_further_error_source_changes_no_other_numbers(unit):
         plain.truth.scale - 1.0
     ) * unit.scale_factor * (plain.truth.specific_force @ np.linalg.inv(unit.M).T)
     difference = np.cumsum(plain.counts - still.counts, axis=0) - np.cumsum(moved, axis=0)
-    # Each count sum is within one count of its integral; both runs start with equal remainders.
+    # The sum of counts is within one count of its integral; both runs begin with equal remainders.
     assert np.abs(difference).max() < 1.0 + 1e-6
 
 
-def test_counts_follow_the_truth(unit):
-    """Without noise the sum of the counts equals that of ``bias + K scale inverse(M) f``."""
+def test_the_sum_of_counts_without_noise_is_the_integral_of_the_truth(unit):
+    """The sum of counts is that of ``bias + K scale inverse(M) f`` within one count."""
     run = simulate(noiseless(unit), DEMO, UP, rate_hz=50.0)
     truth = run.truth
     s = truth.specific_force @ np.linalg.inv(unit.M).T
@@ -100,27 +100,27 @@ def test_counts_follow_the_truth(unit):
     assert np.linalg.norm(truth.specific_force) == pytest.approx(STANDARD_GRAVITY)
 
 
-def test_white_noise_has_its_density(unit):
-    """Welch's spectrum is ``2 density^2``; 60 s means scatter by ``density / sqrt(60)``."""
+def test_simulated_white_noise_has_the_stated_density(unit):
+    """The one-sided spectrum is ``2 density^2``; means over 60 s have ``density / sqrt(60)``."""
     still = replace(unit, drift=())
     run = simulate(still, parse_cyclogram('soak'), UP, rate_hz=50.0, seed=3)
     accel = run.counts / np.array(unit.scale_factor) / MICRO_G
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
-    # The converter carries its remainder: rounding noise rises with f^2, 1 (ug)^2/Hz at 0.4 Hz.
+    # With a carried remainder, rounding noise rises with f^2; it is 1 (ug)^2/Hz at 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
-    # The mean of 128 lines, each averaged over 87 half-overlapping segments, scatters by 1 %.
+    # The mean of 128 lines, each a mean over 87 half-overlapping segments, is uncertain by 1 %.
     np.testing.assert_allclose(
         power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
     )
     means = accel.reshape(-1, 3000, 3).mean(axis=1)
-    # The standard deviation of 240 means scatters by 4.6 %; the limit is three times 4.6 %.
+    # The sd of 240 means is uncertain by 4.6 %; the limit is three times 4.6 %.
     np.testing.assert_allclose(
         means.std(axis=0), np.array(unit.noise_density) / np.sqrt(60.0), rtol=0.15
     )
 
 
 @pytest.mark.parametrize('quantum', [0.0625, 1.0])
-def test_quantised_readings_lie_on_the_lattice(unit, quantum):
+def test_quantised_readings_are_multiples_of_the_quantum(unit, quantum):
     coarse = simulate(unit.with_thermometers(quantum=quantum), DEMO, UP, rate_hz=1.0)
     fine = simulate(unit, DEMO, UP, rate_hz=1.0)
     np.testing.assert_array_equal(coarse.board % quantum, 0.0)
@@ -129,7 +129,7 @@ def test_quantised_readings_lie_on_the_lattice(unit, quantum):
 
 
 @pytest.mark.parametrize('rate_hz', [0.1, 0.7, 10.0])
-def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
+def test_simulated_thermometers_have_the_stated_rate_and_noise(unit, rate_hz):
     run = simulate(unit, DEMO, UP, rate_hz=1.0, temperature_rate_hz=rate_hz)
     np.testing.assert_allclose(np.diff(run.case_stamp_ns) * 1e-9, 1.0 / rate_hz, atol=2e-9)
     assert run.case_stamp_ns[0] == START_NS
@@ -138,7 +138,7 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
         (run.case_stamp_ns - START_NS) * 1e-9, run.truth.grid_s, of_part(run.truth, 'case')
     )
     error = run.case - true
-    # 540 readings with 5 mK of noise determine the mean to 0.2 mK and the sd to 3 %; limits: 5 sd.
+    # 540 readings (noise 5 mK) determine the mean to 0.2 mK, the sd to 3 %; limits: 5 times.
     assert error.mean() == pytest.approx(0.0, abs=1.1e-3)
     assert error.std() == pytest.approx(0.005, rel=0.16)
 
@@ -146,7 +146,7 @@ def test_thermometers_have_their_rate_and_noise(unit, rate_hz):
 @pytest.mark.parametrize(
     ('n', 'least'), [(6, 0.0), (9, 0.4), (12, 0.6), (18, 0.7), (24, 0.8), (26, 1.2), (40, 2.0)]
 )
-def test_positions_determine_the_nine_terms(n, least):
+def test_nine_or_more_positions_determine_nine_terms_of_a_quadric(n, least):
     """Nine or more positions determine all terms of a quadric: bias, scale, misalignment."""
     up = positions(n, 5)
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1.0)
@@ -158,7 +158,7 @@ def test_positions_determine_the_nine_terms(n, least):
     assert np.abs(up.sum(axis=0)).max() < 0.1 * n
 
 
-def test_a_run_refuses_impossible_arguments(unit):
+def test_wrong_arguments_of_simulate_are_refused(unit):
     with pytest.raises(ValueError, match='`rate_hz` must be positive, got 0'):
         simulate(unit, SHORT, UP, rate_hz=0.0)
     with pytest.raises(ValueError, match='`temperature_rate_hz` must be positive, got 0'):
@@ -169,7 +169,7 @@ def test_a_run_refuses_impossible_arguments(unit):
         simulate(unit, SHORT, UP, gravity=float('nan'))
 
 
-# Both solutions of a thermal network are closed forms: they differ by rounding, at tens of degC.
+# Rounding error of closed solutions of a thermal network, at some 10 degC [K].
 ROUNDING = 1e-9
 
 
@@ -177,8 +177,8 @@ def response_of(network, time, air):
     return ThermalResponse(network, np.array(time), np.array(air))
 
 
-def test_two_parts_follow_a_ramp_as_solved_by_hand():
-    """The chain air - case - board, with heat flowing back, equals its closed form."""
+def test_two_parts_follow_a_ramp_like_the_closed_solution():
+    """The chain air - case - board, in which heat also flows from board to case."""
     c0, c1, g0, g1, rate = 700.0, 300.0, 3.0, 0.4, 1.0 / 60.0
     network = ThermalNetwork(
         {'case': c0, 'board': c1}, (Link(AIR, 'case', g0), Link('case', 'board', g1))
@@ -186,7 +186,7 @@ def test_two_parts_follow_a_ramp_as_solved_by_hand():
     trace, determinant = -(g0 + g1) / c0 - g1 / c1, g0 * g1 / (c0 * c1)
     root = math.sqrt(trace * trace - 4.0 * determinant)
     modes = np.array([(trace + root) / 2.0, (trace - root) / 2.0])
-    # In a ramp the link to the air carries the heat of case and board, the inner link the board's.
+    # In a ramp, heat for case and board flows from the air, heat for the board from the case.
     lag = np.array([(c0 + c1) / g0, (c0 + c1) / g0 + c1 / g1])
     shapes = np.array([modes + g1 / c1, [g1 / c1, g1 / c1]])
     amplitude = np.linalg.solve(shapes, lag)
@@ -216,23 +216,23 @@ def test_presets_agree_with_a_numerical_integrator(name):
         (0.0, program.duration_s), states[0], method='LSODA', t_eval=time, rtol=1e-10, atol=1e-10,
         max_step=60.0,
     )  # fmt: skip
-    # The numerical integrator errs by 2e-5 K, as it steps over the corners of the program.
+    # The integrator has an error of 2e-5 K, because it steps over the corners of the program.
     np.testing.assert_allclose(states, solved.y.T, atol=2e-5)
 
 
-def test_creep_relaxes_towards_its_part():
-    """After a step of the part's temperature the creep decays with its time constant."""
+def test_creep_decays_with_its_time_constant():
+    """The bias after a step of the part's temperature decays with the time constant."""
     step = np.full((7201, 1), 10.0)
     step[0] = 0.0
     history = PartHistory(('case',), step, np.zeros(1), 1.0)
     bias, scale = CreepEffect('case', 7200.0, bias=(1.0, 2.0, 0.0)).change(history)
-    # The step lasts one interval of 1 s, 1.4e-4 of the time constant.
+    # The tolerance is the length of the step, 1 s, relative to the time constant.
     np.testing.assert_allclose(bias[-1], np.array([10.0, 20.0, 0.0]) * math.exp(-1.0), atol=2e-3)
     np.testing.assert_array_equal(scale, 0.0)
 
 
-def test_still_state_obeys_the_heat_balance():
-    """In the steady state all power leaves through the path to the air."""
+def test_the_steady_state_obeys_the_heat_balance():
+    """In the steady state the heat flow to the air is the power of all parts."""
     unit = unit_preset('bare-quartz', 5)
     warm = unit.network.equilibrium(12.0)
     to_air = next(link for link in unit.network.links if AIR in (link.a, link.b))
@@ -247,7 +247,7 @@ def test_still_state_obeys_the_heat_balance():
     )
 
 
-def test_thermostat_holds_its_part_and_spends_what_leaks():
+def test_a_thermostat_keeps_its_part_within_0_2_k_by_the_power_that_leaks():
     unit = unit_preset('thermostatted', 2)
     network = unit.network
     heat = network.thermostat
@@ -265,11 +265,11 @@ def test_thermostat_holds_its_part_and_spends_what_leaks():
     program = parse_cyclogram('fast')
     response = response_of(network, program.time_s, program.temperature_c)
     grid = np.arange(0.0, program.duration_s, 30.0)
-    # In air that changes by 30 K, at up to 3 K/min, the oven keeps the head within 0.2 K.
+    # The air changes by 30 K at up to 3 K/min.
     assert np.ptp(response.temperatures(grid)[:, head]) < 0.2
 
 
-def test_an_oven_refuses_air_that_it_cannot_hold_off():
+def test_an_oven_refuses_air_above_its_set_temperature():
     network = unit_preset('thermostatted', 0).network
     with pytest.raises(ValueError, match=r'air of 5\.\.90 degC needs -.* W of the thermostat'):
         response_of(network, [0.0, 60.0], [5.0, 90.0])

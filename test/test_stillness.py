@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""No rest is found in a flight, but each short rest of a hand-held unit is found."""
+"""The reduction finds short rests of a hand-held unit, and no rest in a flight of a drone."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def ground(rng, seconds):
 
 
 def hover(rng, seconds, vibration):
-    """Make a flight: thrust of about g, a slow sway by some degrees, propeller vibration."""
+    """Simulate a drone: thrust of about g, a slow sway by 3 degrees, vibration of propellers."""
     time = time_of(seconds)
     tilt = np.radians(3.0) * np.sin(2.0 * np.pi * time[:, None] / np.array((5.0, 7.0)))
     thrust = GRAVITY * (1.0 + 0.03 * np.sin(2.0 * np.pi * time / 11.0))
@@ -47,7 +47,7 @@ def hover(rng, seconds, vibration):
 
 
 @pytest.mark.parametrize('with_gyro', [True, False])
-def test_a_flight_is_no_rest(rng, with_gyro):
+def test_no_rest_is_found_in_a_flight(rng, with_gyro):
     accel, gyro = hover(rng, 120.0, vibration=1.0)
     with pytest.raises(
         FitError, match=r'log: no still interval: the samples scatter by at least 9\d mg'
@@ -55,8 +55,8 @@ def test_a_flight_is_no_rest(rng, with_gyro):
         reduce_bag(source(accel, gyro if with_gyro else None), OPTIONS)
 
 
-def test_a_smooth_flight_is_recognised_by_its_gyroscope(rng):
-    # A noisy sensor at rest may scatter by 15 mg, but no gyroscope at rest shows 4 deg/s.
+def test_a_flight_with_little_vibration_is_recognised_by_its_gyroscope(rng):
+    # A noisy accelerometer at rest may scatter by 15 mg, but the sway reaches rates of 4 deg/s.
     accel, gyro = hover(rng, 120.0, vibration=15.0 * MG)
     with pytest.raises(FitError, match='the angular rate mostly varies more than at rest'):
         reduce_bag(source(accel, gyro), OPTIONS)
@@ -72,7 +72,7 @@ def test_only_the_time_on_the_ground_of_a_flight_is_a_rest(rng):
     assert ends[1][0] > 252.0
 
 
-def test_the_user_s_noise_decides_what_is_a_rest(rng):
+def test_the_noise_stated_by_the_user_decides_what_is_a_rest(rng):
     accel, _ = hover(rng, 120.0, vibration=15.0 * MG)
     quiet, _ = ground(rng, 30.0)
     options = FitOptions(gravity=GRAVITY, input='m/s^2', still_sd=10.0 * MG)
@@ -81,7 +81,7 @@ def test_the_user_s_noise_decides_what_is_a_rest(rng):
     assert len(reduce_bag(source(quiet), options).intervals) == 1
 
 
-def test_a_gyroscope_that_drifts_with_temperature_rests(rng):
+def test_a_rest_is_found_although_the_gyroscope_drifts_with_temperature(rng):
     accel, gyro = ground(rng, 1200.0)
     gyro[:, 0] += np.radians(10.0) * np.linspace(0.0, 1.0, len(gyro)) ** 2
     bag = reduce_bag(source(accel, gyro), OPTIONS)
@@ -90,7 +90,7 @@ def test_a_gyroscope_that_drifts_with_temperature_rests(rng):
 
 
 def by_hand(rng, n_rests, rest_s, shaky, misalignment=0.0):
-    """Make hand-held rests with turns between; shaky rests have four times the noise."""
+    """Simulate hand-held rests with turns between; rests in `shaky` have four times the noise."""
     ups = positions(n_rests, 4)
     matrix = np.eye(3)
     matrix[1, 0] = matrix[2, 1] = misalignment
@@ -108,19 +108,19 @@ def by_hand(rng, n_rests, rest_s, shaky, misalignment=0.0):
 
 
 @pytest.mark.parametrize(('rest_s', 'shaky'), [(6.0, (2, 5, 9)), (3.5, (0, 3, 7))])
-def test_each_short_rest_is_found(rng, rest_s, shaky):
+def test_each_short_rest_of_a_hand_held_unit_is_found(rng, rest_s, shaky):
     accel = by_hand(rng, 10, rest_s, shaky)
     result = fit([source(accel)], OPTIONS)
     assert len(result.positions) == 10
     axes = result.calibration.axes
-    # The mean of a rest has an error of 0.2 to 0.6 mg: 350 samples, noise of 3 to 12 mg.
+    # With 350 samples and a noise of 3 to 12 mg the mean of a rest has an error of 0.2 to 0.6 mg.
     np.testing.assert_allclose([axes.x.bias, axes.y.bias, axes.z.bias], (0.3, -0.2, 0.1),
                                atol=1.5 * MG)  # fmt: skip
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
-def test_motion_does_not_pass_for_a_rest_in_the_scan(rng):
-    # At the end the unit is pushed for 10 s, with the noise of a shaky rest but 1.04 g.
+def test_motion_is_not_taken_for_a_rest(rng):
+    # For the last 10 s |f| is 1.04 g, with the noise of a shaky rest: the unit is accelerated.
     accel = by_hand(rng, 14, 6.0, (3,), misalignment=5e-3)
     time = time_of(10.0)
     push = GRAVITY * np.array((0.0, 0.6, 0.8)) * 1.04 + 0.0 * time[:, None]
@@ -130,7 +130,7 @@ def test_motion_does_not_pass_for_a_rest_in_the_scan(rng):
     assert result.residuals[-1].fitted.rms < 2.0 * MG
 
 
-def test_the_user_sets_the_shortest_rest(rng):
+def test_the_user_can_set_the_length_of_the_shortest_rest(rng):
     accel = by_hand(rng, 10, 3.5, ())
     bag = reduce_bag(source(accel), FitOptions(gravity=GRAVITY, input='m/s^2', min_rest_s=2.0))
     assert len(bag.intervals) == 10
@@ -140,8 +140,8 @@ def test_the_user_sets_the_shortest_rest(rng):
         FitOptions(gravity=GRAVITY, min_rest_s=0.0)
 
 
-def test_a_ramp_moves_no_unit_at_rest(rng):
-    # A drift of 60 ug per cell, 60 times the noise, is not a motion; a knock of 0.1 mrad is.
+def test_a_drift_in_a_ramp_is_not_taken_for_a_motion(rng):
+    # A drift of 60 ug per cell, 60 times the noise, is no motion; a tilt by 0.1 mrad at once is.
     time = np.arange(7200.0)
     stamps = START_NS + np.rint(time * 1e9).astype(np.int64)
     ramp = np.clip(time - 1800.0, 0.0, 2400.0) * 2e-3 * MG

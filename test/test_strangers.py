@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The units and the scores of benchmarks/strangers.py agree with closed forms."""
+"""Simulated units and scores of benchmarks/strangers.py agree with closed formulas."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def test_a_node_lags_a_ramp_by_its_time_constant():
     assert board - states[-1, units.PARTS] == pytest.approx(0.01 * lags, rel=1e-6)
 
 
-def test_the_integration_is_exact_on_the_way():
+def test_the_integration_is_exact_at_each_step_of_a_ramp():
     # The lag of x behind a ramp u from rest is u - x = rate * tau * (1 - exp(-t / tau)).
     A, b, h = np.array([[-1 / 300.0]]), np.array([1 / 300.0]), np.zeros(1)
     at = np.arange(0.0, 1500.0, 5.0)
@@ -66,7 +66,7 @@ def test_the_integration_is_exact_on_the_way():
 
 
 def test_still_air_changes_the_temperature_of_the_hidden_node():
-    # In still air the hidden node has another temperature than chamber data predict.
+    # (hidden node - board) / (case - board) in a ramp differs between still air and chamber.
     shares = []
     for environment in (units.CHAMBER, units.STILL_AIR):
         _, states = ramp(unit(), 0.01, 12, environment)
@@ -75,8 +75,8 @@ def test_still_air_changes_the_temperature_of_the_hidden_node():
     assert abs(shares[1] - shares[0]) > 0.3
 
 
-def test_noise_bias_scale_and_misalignment_follow_their_definition():
-    # corrected = M (measured - bias) / scale must give the force, except for white noise.
+def test_simulated_samples_have_the_stated_noise_bias_scale_and_misalignment():
+    # M (samples - bias) / scale must give the true force plus white noise.
     given = unit(
         bias=np.array([100.0, -200.0, 300.0]), gain=np.array([0.01, -0.02, 0.03]),
         misalignment=np.array([1e-3, 2e-3, -3e-3]), density=5.0,
@@ -89,7 +89,7 @@ def test_noise_bias_scale_and_misalignment_follow_their_definition():
     n = len(error)
     sd = 5.0 * UG * np.sqrt(0.5)
     assert np.abs(error.mean(axis=0)).max() < 4.0 * sd / np.sqrt(n)
-    # An sd from n samples has a relative sd of 1 / sqrt(2 n); gain and M change the noise by 3 %.
+    # The sd of n errors is uncertain by 1 / sqrt(2 n); gain and M change the noise by 3 %.
     assert error.std(axis=0) == pytest.approx([sd] * 3, rel=0.03 + 4.0 / np.sqrt(2 * n))
 
 
@@ -98,22 +98,22 @@ def test_a_support_tilts_with_the_square_of_temperature():
     bag = record(unit(), units.program(20, 10, (35, 1, 60)), LEVEL, rng_of('tilt'), tilt=axis)
     case = np.interp(bag.time_s - 1.0, *bag.temperatures['case'])
     angle = np.arctan2(-bag.force[:, 1], bag.force[:, 2])
-    # Tolerance: the case is interpolated between readings 5 s apart; the largest tilt is 225 urad.
+    # The tolerance is the error of interpolation between case readings 5 s apart.
     assert angle == pytest.approx(1e-6 * (case - 20.0) ** 2, abs=5e-7)
     assert np.linalg.norm(bag.force, axis=1) == pytest.approx(GRAVITY)
 
 
-def test_cold_start_is_as_cold_as_the_air_and_then_warms_up():
+def test_a_cold_start_begins_at_the_temperature_of_the_air():
     given = unit(heat_k=2.0)
     cold = record(given, cases.FROST, LEVEL, rng_of('cold'), is_cold=True)
     warm = record(given, cases.FROST, LEVEL, rng_of('cold'))
     for bag, heat in ((cold, 0.0), (warm, 2.0)):
         board, case = bag.temperatures['board'][1][0], bag.temperatures['case'][1][0]
-        # Tolerance: the chamber's ripple of 0.03 K, and self-heating for 0.3 s at the start.
+        # The tolerance allows for the chamber's ripple, 0.03 K, and self-heating within 0.3 s.
         assert board - case == pytest.approx(heat, abs=0.1)
 
 
-def test_a_carried_remainder_loses_no_part_of_a_count():
+def test_the_sum_of_samples_with_carried_remainders_is_exact_to_half_a_count():
     words = np.full((1000, 3), 0.3)
     kept, lost = (units.quantised(words, carries) for carries in (True, False))
     assert np.abs(np.cumsum(kept, axis=0) - np.cumsum(words, axis=0)).max() <= 0.5
@@ -125,13 +125,13 @@ def test_flicker_noise_has_a_flat_allan_deviation():
     for size in (10, 100, 1000):
         means = noise.reshape(-1, size, 3).mean(axis=1)
         deviation = np.sqrt(0.5 * np.mean(np.diff(means, axis=0) ** 2))
-        # Tolerance: 39 differences of three axes determine the Allan deviation to 7 %.
+        # 39 differences of each of three axes determine the Allan deviation to 7 %.
         assert deviation == pytest.approx(3.0, rel=0.2)
 
 
 @pytest.fixture
 def recorded(monkeypatch):
-    """Replace `record` by a function that notes its arguments; return the notes of a bag."""
+    """Replace `record` by a function that stores its arguments; return the arguments of a bag."""
     notes = {}
 
     def note(given, corners, up, rng, *, name='bag', **keys):
@@ -147,7 +147,7 @@ def recorded(monkeypatch):
 
 
 @pytest.mark.parametrize('case', sorted(cases.CASES))
-def test_held_out_bags_take_no_part_in_the_fit(case, recorded):
+def test_the_fit_has_none_of_the_held_out_bags_and_none_of_their_programs(case, recorded):
     labels = []
     for study in cases.CASES[case][0](1):
         labels.append(study.label)
@@ -163,7 +163,7 @@ def test_held_out_bags_take_no_part_in_the_fit(case, recorded):
     assert len(set(labels)) == len(labels)
 
 
-def test_turn_on_draws_its_positions_and_its_shifts(recorded):
+def test_bias_offsets_of_the_case_turn_on_have_the_stated_sd(recorded):
     collected = {}
     for number in range(1, 9):
         for study in cases.turn_on(number):
@@ -173,11 +173,11 @@ def test_turn_on_draws_its_positions_and_its_shifts(recorded):
     assert set(collected) == expected
     for (_, label), shifts in collected.items():
         sd, n = float(label.split()[2]), np.size(shifts)
-        # An sd from n draws has a relative sd of 1 / sqrt(2 n).
+        # The sd of n random offsets is uncertain by 1 / sqrt(2 n).
         assert np.std(shifts) == pytest.approx(sd, rel=5.0 / np.sqrt(2 * n), abs=1e-12)
 
 
-def test_the_bound_falls_with_noise_and_with_data():
+def test_the_cramer_rao_bound_is_proportional_to_noise_over_root_of_the_data():
     rng = rng_of('bound')
     given = cases.navigation(rng, part_s=np.zeros(3))
     up = spread(12, rng)
@@ -187,14 +187,14 @@ def test_the_bound_falls_with_noise_and_with_data():
     assert louder == pytest.approx(2.0 * sd, rel=1e-6)
     twice = cases.bias_bound(given, np.concatenate((up, up)), bags + bags)
     assert twice == pytest.approx(sd / np.sqrt(2.0), rel=1e-6)
-    # If only the bias were unknown, its sd would be the noise of the mean of all samples.
+    # If the bias were the only unknown, its sd would be the noise of the mean of all samples.
     least = UG * given.density / np.sqrt(sum(len(bag.time_s) for bag in bags) * 2.0)
     assert (sd > least).all()
     assert (sd < 100.0 * least).all()
 
 
 def of_attitudes(given, board):
-    """Make minute means of a unit in all attitudes at some temperatures of the board."""
+    """Return means of a unit in all attitudes of `ATTITUDES` at each board temperature."""
     force = GRAVITY * np.repeat(ATTITUDES, len(board), axis=0)
     at = np.tile(board, len(ATTITUDES))
     parts = np.repeat(at[:, None], 3, axis=1)
@@ -213,7 +213,7 @@ def curved_unit():
     )  # fmt: skip
 
 
-def test_a_cubic_by_scipy_finds_a_cubic_and_constants_do_not():
+def test_the_scipy_cubic_fits_a_cubic_bias_and_constants_do_not():
     given = curved_unit()
     fit, held = (
         of_attitudes(given, np.linspace(5, 35, 7)),
@@ -223,13 +223,13 @@ def test_a_cubic_by_scipy_finds_a_cubic_and_constants_do_not():
         strangers.error_of([by_norm([fit], order=order)(held)], [held], is_drift=False)
         for order in (3, 0)
     )
-    # The cubic neglects products of small terms, such as misalignment times bias: below 5 ug.
+    # The scipy cubic neglects products of small terms, such as misalignment times bias: 5 ug.
     assert cubic.vector < 5.0
     assert constants.vector > 50.0
 
 
-def test_constants_by_scipy_bound_the_scale_of_few_attitudes():
-    # Without a bound on the scale, a fit to one noisy attitude makes all forces equal.
+def test_a_scipy_fit_to_one_attitude_does_not_change_the_scatter_of_forces():
+    # WHY: without bounds, a fit to one attitude found scale factors that made all forces equal.
     rng = rng_of('few')
     samples = GRAVITY * LEVEL + 0.3 * rng.standard_normal((200, 3))
     few = Minutes(samples, np.full(200, 20.0), np.full((200, 3), np.nan))
@@ -237,13 +237,13 @@ def test_constants_by_scipy_bound_the_scale_of_few_attitudes():
     assert force.std(axis=0) == pytest.approx(samples.std(axis=0), rel=0.4)
 
 
-def test_a_bias_at_the_reference_is_held_against_its_bound():
-    # The bias of x in the calibration is wrong by 1 count, 1 / 300 m/s^2.
+def test_the_bias_score_is_error_over_bound_and_error_over_claimed_sd():
+    # In the calibration the bias of x has an error of 1 count, 1 / 300 m/s^2.
     bias = np.array([0.1, -0.2, 0.3])
     axes = Axes(*(AxisReference(300.0, 300.0 * b) for b in bias + np.array([1 / 300.0, 0.0, 0.0])))
     bound = cases.Bound(unit(counts=300.0), bias, np.full(3, 1e-3))
     study = cases.Study('', (), {}, bound=bound)
-    # The calibration claims a bias sd of 2e-3 m/s^2, and 5e-3 m/s^2 for another turn-on.
+    # The calibration claims a bias sd of 2e-3 m/s^2; the 5e-3 m/s^2 of a turn-on are not counted.
     again = axis_set(residual_sd_m_s2=5e-3)
     known = regime_set(x=again, y=again, z=again)
     unknown = calibration(axes=axes, static=known, dynamic=known)
@@ -257,7 +257,7 @@ def test_a_bias_at_the_reference_is_held_against_its_bound():
     assert score.bound_ratio == pytest.approx(1 / 0.3 / np.sqrt(3.0))
 
 
-def test_a_cubic_by_scipy_finds_a_pose_s_drift():
+def test_the_scipy_cubic_fits_the_drift_in_a_single_pose():
     given = replace(curved_unit(), scale_curve=ZEROS)
     minutes_ = [
         of_attitudes(given, board) for board in (np.linspace(5, 35, 31), np.array([9.0, 22]))
@@ -271,7 +271,7 @@ def test_a_cubic_by_scipy_finds_a_pose_s_drift():
     assert error.vector < 1e-6
 
 
-def test_minutes_are_means_of_whole_minutes():
+def test_minutes_averages_whole_minutes_of_a_bag():
     time_s = np.arange(1.0, 151.0)
     samples = np.repeat(time_s[:, None], 3, axis=1)
     mean = minutes(Bag('', time_s, samples, {'board': (time_s, 2.0 * time_s)}))
@@ -280,7 +280,7 @@ def test_minutes_are_means_of_whole_minutes():
     assert np.isnan(mean.force).all()
 
 
-def test_a_ratio_is_1_where_errors_are_as_claimed():
+def test_the_ratio_is_1_if_errors_have_the_claimed_covariance():
     rng = rng_of('ratio')
     n = 20000
     truth = np.broadcast_to(GRAVITY * LEVEL, (n, 3))
@@ -289,13 +289,13 @@ def test_a_ratio_is_1_where_errors_are_as_claimed():
     claim = np.broadcast_to(root @ root.T, (n, 3, 3))
     out = strangers.Corrected(truth + error, claim, np.zeros(3))
     scores = strangers.score([out], [Minutes(truth, np.zeros(n), truth)], is_drift=False)
-    # 20000 windows determine an RMS to half a percent.
+    # The RMS of 20000 windows is uncertain by 0.5 %.
     assert (scores.ratio, scores.norm_ratio) == pytest.approx((1.0, 1.0), rel=0.02)
     assert scores.claim == pytest.approx(scores.vector, rel=0.02)
 
 
-def test_a_claim_of_a_minute_is_the_noise_of_its_mean():
-    # The calibration of the tests only claims white noise and the rounding of counts.
+def test_the_claimed_sd_of_a_minute_is_the_noise_of_its_mean():
+    # This calibration claims white noise and rounding of counts only.
     samples = np.tile(300.0 * GRAVITY * LEVEL, (30000, 1))
     samples[::2] += 1.0
     samples[1::2] -= 1.0
@@ -306,7 +306,7 @@ def test_a_claim_of_a_minute_is_the_noise_of_its_mean():
     assert out.force == pytest.approx(np.tile(GRAVITY * LEVEL, (5, 1)))
 
 
-def test_minutes_that_are_not_published_may_be_few():
+def test_a_score_is_infinite_if_3_percent_of_the_minutes_are_missing():
     truth = np.broadcast_to(GRAVITY * LEVEL, (100, 3))
     force = truth + UG
     claim = np.broadcast_to(UG**2 * np.eye(3), (100, 3, 3))
@@ -317,7 +317,7 @@ def test_minutes_that_are_not_published_may_be_few():
         assert scores.ratio == pytest.approx(expected)
 
 
-def test_a_row_names_exactly_the_limits_it_misses():
+def test_misses_names_exactly_the_limits_that_a_row_violates():
     baselines = {'cubic': Score(50.0, 100.0), 'constants': Score(40.0, 200.0)}
 
     def missed(fit, title='ageing'):
@@ -332,7 +332,7 @@ def test_a_row_names_exactly_the_limits_it_misses():
     assert missed(Score(13.0, 90.0, 1.0, 1.0, 90.0), 'kink') == ['norm 13 > 12']
 
 
-def test_a_row_with_more_data_is_compared_with_the_row_without():
+def test_a_joint_fit_is_compared_with_the_fit_to_the_chamber_bags():
     alone, joint = Score(20.0, 40.0, 1.0, 1.0, 40.0), Score(9.0, 30.0, 1.0, 1.0, 40.0)
     rows = rows_of([Result('third-node alone: its attitude', 1, {'fit': alone}),
                     Result('third-node joint: its attitude', 1, {'fit': joint})])  # fmt: skip
@@ -341,14 +341,14 @@ def test_a_row_with_more_data_is_compared_with_the_row_without():
 
 
 @pytest.mark.parametrize('name', ['units', 'cases', 'baselines', 'limits'])
-def test_generators_and_judge_share_no_code_with_the_package(name):
+def test_the_simulation_and_the_limits_import_nothing_of_the_package(name):
     source = (ROOT / 'benchmarks' / f'strangers_{name}.py').read_text(encoding='utf-8')
     imports = [line for line in source.splitlines() if 'import ' in line]
     assert imports
     assert not [line for line in imports if 'thermo_comp' in line]
 
 
-def test_each_case_has_a_limit_and_each_limit_a_case():
+def test_each_case_has_a_limit_and_each_limit_has_a_case():
     names = (*strangers.RECORDED, *cases.CASES)
     assert all(any(key.startswith(name) for key in LIMITS) for name in names)
     assert all(any(key.startswith(name) for name in names) for key in LIMITS)
@@ -356,24 +356,24 @@ def test_each_case_has_a_limit_and_each_limit_a_case():
 
 
 def carried_bag():
-    """Make a bag of a day at 1 Hz: attitude changed after 5 h, bumps for two minutes at 10 h."""
+    """Return a day at 1 Hz: a turn to a second attitude after 5 h, handling for 2 min at 10 h."""
     time_s = np.arange(1.0, 86401.0)
     force = np.where((time_s > 18000.0)[:, None], GRAVITY * LEVEL, GRAVITY * ATTITUDES[0])
     force[36000:36120] = 0.5
     return Bag('day', time_s, force, {'board': (time_s, np.full(len(time_s), 20.0))})
 
 
-def test_rests_of_a_recording_are_its_long_stays():
+def test_rests_are_stays_in_one_attitude_without_their_first_and_last_minute():
     rows = rests_of(carried_bag())
     expected = [(60, 17940), (18060, 35940), (36180, 86340)]
     assert [(rest.start, rest.stop) for rest in rows] == expected
 
 
-def test_blocks_go_by_the_clock_and_share_no_sample():
+def test_blocks_begin_at_multiples_of_3_h_and_share_no_sample():
     bag = carried_bag()
     blocks = blocks_of(part(bag, slice(9000, 86400), 'rest'), 'rest')
     assert list(blocks) == list(range(8))
     times = np.concatenate([block.time_s for block in blocks.values()])
-    # The recording's last sample would be a block of one sample, which is left out.
+    # The last sample, at 24 h, begins a block of a single sample, which is too short.
     assert times.tolist() == bag.time_s[9000:-1].tolist()
     assert all((block.time_s // 10800.0 == number).all() for number, block in blocks.items())

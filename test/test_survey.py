@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A survey of a recording lists the data that a fit lacks."""
+"""A survey of a recording reports data that a fit needs and that are missing or faulty."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_a_good_recording_has_no_findings(tmp_path):
     assert result.still_s == pytest.approx(3600.0, abs=15.0)
     board = result.thermometers['board']
     assert (board.lowest, board.highest) == (5.0, 35.0)
-    # The ramps are 30 K in 20 minutes, up and down.
+    # The temperature rises and falls by 30 K in 20 minutes.
     assert board.steepest_heating_k_min == pytest.approx(1.5, rel=0.01)
     assert board.steepest_cooling_k_min == pytest.approx(-1.5, rel=0.01)
 
@@ -68,7 +68,7 @@ def test_a_good_recording_has_no_findings(tmp_path):
           'samples with a stamp not later than an earlier stamp: 1; these samples are left out']),
     ],
 )  # fmt: skip
-def test_faults_of_a_recording_are_named(tmp_path, temperature, options, text):
+def test_faults_of_a_recording_are_reported(tmp_path, temperature, options, text):
     findings = survey(tmp_path / 'bag', temperature, **options).findings
     assert [part for part in text if not any(part in found for found in findings)] == []
 
@@ -80,8 +80,8 @@ def test_faults_of_a_recording_are_named(tmp_path, temperature, options, text):
         (7200.0, 'than an hour (1 times): a fit takes each jump'),
     ],
 )
-def test_samples_after_a_clock_was_set_back_are_counted(tmp_path, back_s, text):
-    # WHY: with a clock set back by 10 min a fit lost 10 min, but the survey reported one stamp.
+def test_samples_after_a_backward_jump_of_the_clock_are_counted(tmp_path, back_s, text):
+    # WHY: if the clock jumps back by 10 min, a fit leaves out 10 min; the survey counted 1 sample.
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0), gap_s=-back_s)
     assert any(text in finding for finding in result.findings)
 
@@ -94,8 +94,8 @@ def test_a_missing_cooling_ramp_is_reported(tmp_path):
     ]
 
 
-def test_a_quantum_is_no_ramp(tmp_path):
-    # Temperatures alternate between whole degrees: 1 K within 1 s is not a ramp of 60 K/min.
+def test_steps_of_a_coarse_thermometer_are_not_taken_for_ramps(tmp_path):
+    # Readings in steps of 1 K alternate between two values, which is no ramp of 60 K/min.
     flips = 20.0 + (np.arange(3600) % 2)
     result = survey(tmp_path / 'bag', flips)
     board = result.thermometers['board']

@@ -36,7 +36,7 @@ BAD_SERIALS = ('', 'a\nb', 'a\x1b[2J', 'x' * (LONGEST_SERIAL + 1), '\u202e', 'a\
 
 
 @given(st.text())
-def test_one_line_is_one_harmless_line(text):
+def test_text_from_outside_is_printed_as_one_line_without_escape_sequences(text):
     shown = one_line(text)
     assert len(shown.splitlines()) <= 1
     assert not {unicodedata.category(c) for c in shown} & {'Cc', 'Cf', 'Cs', 'Zl', 'Zp'}
@@ -46,8 +46,8 @@ def test_one_line_is_one_harmless_line(text):
         assert shown == text
 
 
-def test_an_error_is_one_harmless_line():
-    # WHY: paths, keys and topics in messages come from outside, and may hold escape sequences.
+def test_an_error_is_printed_as_one_line_without_escape_sequences():
+    # WHY: paths, keys and topics in messages come from outside, and may contain escape sequences.
     for error in (
         ThermoCompError(FORGED),
         CalibrationError('cannot be read', FORGED, FORGED),
@@ -70,7 +70,7 @@ def test_impossible_serials_are_refused(serial):
 
 
 @pytest.mark.parametrize('serial', ['42', 'Блок 7', 'x' * LONGEST_SERIAL])
-def test_possible_serials_are_accepted(serial):
+def test_permitted_serials_are_accepted(serial):
     assert valid_serial(serial) == serial
 
 
@@ -84,7 +84,7 @@ def test_possible_serials_are_accepted(serial):
     ],
     ids=lambda command: command[0],
 )
-def test_an_impossible_serial_as_an_option_is_refused(command, capsys):
+def test_an_option_with_an_impossible_serial_is_refused(command, capsys):
     assert run([*command, '--serial', FORGED]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('thermo_comp: error: ')
@@ -140,7 +140,7 @@ def test_any_terminal_can_show_names_and_serials(tmp_path, cli, monkeypatch, enc
         content = terminal.read()
         assert ('Блок' if encoding == 'utf-8' and not more else r'\u0411') in content
         assert r'not \udcff utf-8.yaml' in content
-    if encoding == 'latin-1':  # the file's name as the user wrote it
+    if encoding == 'latin-1':  # test this encoding in a new process, too
         assert r'\u0411' in cli('info', name, PYTHONIOENCODING=encoding).stdout
     absent = cli('info', tmp_path / os.fsdecode(b'no\xff.mcap'), code=1)
     assert r'no\udcff.mcap: ' in absent.stderr

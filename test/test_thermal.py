@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermal tracker agrees with closed forms: memory, blend of sets, lost sensors, restart."""
+"""The thermal tracker agrees with closed forms: lags, blend of sets, lost sensors, restart."""
 
 import math
 
@@ -27,25 +27,25 @@ def feed(tracker, board, case=None, *, start_s=0, step_s=1):
 
 
 @pytest.mark.parametrize('step_s', [1, 10])
-def test_memory_of_a_ramp_is_the_closed_form(step_s):
-    # A ramp of rate r after a soak gives m = T - L = r tau (1 - exp(-t / tau)).
+def test_the_lag_in_a_ramp_agrees_with_the_closed_form(step_s):
+    # In a ramp of rate r after a soak the board is r tau (1 - exp(-t / tau)) ahead of the part.
     tracker = ThermalTracker(DetectorSettings(), LAG)
     soak_s, ramp_s, rate = 6000, 1800, 0.5 / 60.0
     t = np.arange(0, soak_s + ramp_s + 1, step_s)
     feed(tracker, 20.0 + rate * np.maximum(t - soak_s, 0.0), step_s=step_s)
     end_ns = int(t[-1]) * SECOND_NS
     expected = rate * TAU_S * (1.0 - math.exp(-ramp_s / TAU_S))
-    # The thermometer follows the ramp late, which changes the lag by some 10 mK of 6.5 K.
+    # The delay of the thermometer changes the result by about 10 mK of 6.5 K.
     lag = Layout(LAG).places[Lag('board', TAU_S)]
     assert tracker.sample(end_ns)[lag] == pytest.approx(expected, abs=0.05)
     assert tracker.is_settled(end_ns)
 
 
-def test_memory_start_is_unknown_and_settles():
+def test_the_lag_is_unknown_at_the_start_and_known_after_some_time():
     tracker = ThermalTracker(DetectorSettings(), LAG)
     feed(tracker, np.full(10, 20.0))
     assert not tracker.is_settled(10 * SECOND_NS)
-    # The start sd of 3 K for a lag of an hour is 1.5 K for a lag of 900 s, and 50 mK after 3061 s.
+    # A lag of 900 s has an sd of 1.5 K at the start, which decays to 50 mK within 3061 s.
     feed(tracker, np.full(5000, 20.0), start_s=10)
     settled_s = TAU_S * math.log(1.5 / MEMORY_SETTLED_SD)
     assert not tracker.is_settled(round((settled_s - 10.0) * 1e9))
@@ -102,12 +102,12 @@ def test_the_dynamic_weight_is_linear_over_the_transition_time():
     assert weights[-1] == 1.0
 
 
-def test_no_transition_time_is_the_hard_switch_of_the_paper():
+def test_a_transition_time_of_zero_switches_the_sets_at_once():
     tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(transition_time_s=0.0))
     assert set(ramp(tracker).tolist()) == {0.0, 1.0}
 
 
-def test_the_rate_of_a_lost_case_is_replaced_by_the_board_s():
+def test_without_a_lost_case_sensor_the_rate_of_the_board_is_used():
     tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(case_timeout_s=10.0), 600.0)
     t = np.arange(0, 1000)
     board = 20.0 + 0.01 * t
@@ -115,7 +115,7 @@ def test_the_rate_of_a_lost_case_is_replaced_by_the_board_s():
     assert tracker.sample(999 * SECOND_NS)[GRADIENT] == pytest.approx(6.0, abs=0.05)
     feed(tracker, 20.0 + 0.01 * np.arange(1000, 1100), start_s=1000)
     state = tracker.sample(1099 * SECOND_NS)
-    # The closed form of a first-order lag in a ramp is lag times rate.
+    # In a ramp the board lags the case by rate times lag, 0.01 K/s times 600 s.
     assert state[GRADIENT] == pytest.approx(600.0 * 0.01, abs=0.1)
     assert math.sqrt(state[VAR_GRADIENT]) >= LOST_GRADIENT_RELATIVE_SD * 5.9
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thermometer's estimates agree with closed-form temperatures, also with outliers."""
+"""Estimates of temperature and rate agree with the true ones, also if readings are outliers."""
 
 import math
 
@@ -48,11 +48,11 @@ def settled(noise=0.001, n=600, **changes):
 
 @pytest.fixture(scope='module')
 def errors():
-    """Return squared errors and claimed variances per sensor, in runs of soak, ramp and soak."""
+    """Return times, squared errors and claimed variances by sensor, in a soak, a ramp, a soak."""
     collected = {}
     for name, (noise, quantum, dt) in SENSORS.items():
         runs = []
-        # One run at 10 Hz suffices: it has as many readings as ten runs at 1 Hz.
+        # A run at 10 Hz has as many readings as ten runs at 1 Hz, so one run is sufficient.
         for seed in range(1 if dt < 1.0 else 3):
             rng = np.random.default_rng([seed, 1])
             t = np.arange(-SOAK_S, RAMP_S + 3600.0, dt)
@@ -79,9 +79,9 @@ PARTS = {
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_claimed_variances_match_squared_errors(errors, sensor, part):
-    # Ideally, the mean squared error equals the claimed variance. In soaks and ramps the claimed
-    # variance is a few times too large, as it allows for the onset or end of a ramp at any time.
-    # The mean over the few independent errors of a coarse sensor scatters by a factor of 2.
+    # In soaks and ramps the claimed variance is a few times the mean squared error, because it
+    # allows for the onset or end of a ramp at any time. Sensors with steps have few independent
+    # errors, whose mean square is uncertain by a factor of 2.
     begin, end = PARTS[part]
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= begin) & (rows[:, 0] < end)]
@@ -101,27 +101,27 @@ def test_claimed_variances_match_squared_errors(errors, sensor, part):
     ],
 )  # fmt: skip
 def test_errors_in_a_ramp_are_bounded(errors, sensor, temperature_k, rate_k_min):
-    # The limits are 1.5 times measured errors; steps of 1 K determine the rate to 10 %.
+    # The limits are 1.5 times the errors of an earlier run of this test.
     rows = errors[sensor]
     rows = rows[(rows[:, 0] >= 600.0) & (rows[:, 0] < RAMP_S)]
     assert math.sqrt(np.mean(rows[:, 1])) < temperature_k
     assert 60.0 * math.sqrt(np.mean(rows[:, 2])) < rate_k_min
 
 
-def test_a_crossed_edge_locates_the_temperature():
-    # A reading in steps of 1 K changes from 20 to 21 degC at 20.5 degC, which is the estimate.
+def test_a_change_between_steps_of_1_k_determines_the_temperature():
+    # Readings with steps of 1 K change from 20 to 21 degC when the temperature is 20.5 degC.
     thermometer = Thermometer(ThermometerSettings(0.01, 1.0))
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0)
     assert thermometer.var_temperature == pytest.approx(1.0 / 12.0, rel=0.2)
     thermometer.update(600 * SECOND_NS, 21.0)
     assert thermometer.temperature == pytest.approx(20.5, abs=0.03)
-    # The error of the temperature at a crossing is the noise plus the change within one second.
+    # The sd at the change is the noise plus the temperature change between two readings.
     assert 0.005 < math.sqrt(thermometer.var_temperature) < 0.03
 
 
-def test_equal_coarse_readings_keep_the_sd_of_their_quantum():
-    # Equal readings leave the sd of a uniform distribution, 1 / sqrt(12) of a quantum.
+def test_equal_coarse_readings_leave_the_sd_of_their_quantum():
+    # A temperature within one quantum is uniformly distributed: sd 1 / sqrt(12) quanta.
     thermometer = Thermometer(ThermometerSettings(0.001, 0.0625))
     for k in range(5000):
         thermometer.update(k * SECOND_NS, 20.0)
@@ -129,9 +129,9 @@ def test_equal_coarse_readings_keep_the_sd_of_their_quantum():
 
 
 @pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
-def test_equal_readings_each_minute_bound_the_estimate_after_a_ramp(quantum, lag_s):
-    # WHY: once the predicted temperature had left the cell of the reading, equal readings had no
-    # weight, and the claimed sd rose to 24 K within an hour of soak.
+def test_equal_readings_each_minute_keep_the_estimate_within_a_quantum(quantum, lag_s):
+    # WHY: when the predicted temperature was more than a quantum from the reading, equal readings
+    # had no weight, and the claimed sd rose to 24 K within an hour of soak.
     t = np.arange(-3600.0, 9000.0, 60.0)
     truth = 20.0 + lagged(t, [(0.0, 1.0), (1200.0, 0.0)], lag_s)
     thermometer = Thermometer(ThermometerSettings(0.01 * quantum, quantum, lag_s=lag_s))
@@ -139,12 +139,12 @@ def test_equal_readings_each_minute_bound_the_estimate_after_a_ramp(quantum, lag
     error, sd = out[:, 0] - truth, np.sqrt(out[:, 2])
     assert np.abs(error).max() < 1.5 * quantum
     assert sd[1:].max() < quantum
-    # Between two readings the estimate follows a ramp, here 1 K/min.
+    # In the ramp of 1 K/min the estimated rate is right although a reading comes once a minute.
     rows = np.flatnonzero((t > 2.0 * lag_s) & (t < 1200.0))
     assert np.abs(out[rows, 1] - 1.0 / 60.0).max(initial=0.0) < max(quantum, 0.3) / 60.0
 
 
-def test_a_constant_without_noise_is_exact():
+def test_the_estimate_of_a_constant_temperature_without_noise_is_exact():
     thermometer = Thermometer(ThermometerSettings())
     for k in range(100):
         assert thermometer.update(k * SECOND_NS, 20.25)
@@ -153,8 +153,8 @@ def test_a_constant_without_noise_is_exact():
     assert type(thermometer.temperature) is float
 
 
-def test_a_straight_line_without_noise_is_found():
-    # The prior sd of the rate, 3 K/min, is negligible after minutes of readings (noise 5 mK).
+def test_the_estimate_of_a_ramp_without_noise_is_exact():
+    # After minutes of readings the prior of the rate (sd 3 K/min) has no effect.
     thermometer = Thermometer(ThermometerSettings())
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)
@@ -163,7 +163,7 @@ def test_a_straight_line_without_noise_is_found():
     assert abs(thermometer.acceleration[0]) < 1e-7
 
 
-def test_prediction_is_that_of_matrices():
+def test_the_prediction_step_equals_matrix_algebra():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3))
     covariance = root @ root.T
@@ -183,7 +183,7 @@ def test_prediction_is_that_of_matrices():
     )
 
 
-def test_correction_is_that_of_matrices():
+def test_the_correction_step_equals_matrix_algebra():
     rng = np.random.default_rng(1)
     root = rng.normal(size=(3, 3))
     covariance = root @ root.T
@@ -197,7 +197,7 @@ def test_correction_is_that_of_matrices():
     assert spread == pytest.approx(covariance[0, 0] + 0.2)
 
 
-def test_a_blend_has_the_moments_of_the_mixture():
+def test_a_blend_has_mean_and_covariance_of_the_mixture():
     rng = np.random.default_rng(2)
     states, samples = [], []
     upper = np.triu_indices(3)
@@ -218,7 +218,7 @@ def test_a_blend_has_the_moments_of_the_mixture():
     ('stamp_s', 'reading'),
     [(700, math.nan), (700, math.inf), (700, -math.inf), (599, 20.0), (300, 20.0), (-5, 20.0)],
 )
-def test_readings_not_finite_or_not_newer_change_nothing(stamp_s, reading):
+def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp_s, reading):
     thermometer = settled()
     before = state(thermometer)
     assert not thermometer.update(stamp_s * SECOND_NS, reading)
@@ -226,8 +226,8 @@ def test_readings_not_finite_or_not_newer_change_nothing(stamp_s, reading):
     assert thermometer.n_in_row == 600
 
 
-def test_a_small_jump_counts_less_than_a_reading():
-    # A jump of 15 sigma is below five times the limit of 6 sigma: it counts like 6 sigma.
+def test_a_jump_of_15_sigma_has_the_effect_of_6_sigma():
+    # A jump of 6 to 30 sigma is limited to 6 sigma; a jump above 30 sigma is left out.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
@@ -241,7 +241,7 @@ def test_a_lasting_step_is_accepted_after_four_readings():
     assert (thermometer.n_in_row, thermometer.n_restarts) == (3, 1)
 
 
-def test_outliers_on_both_sides_are_no_step():
+def test_outliers_of_both_signs_are_not_accepted_as_a_step():
     thermometer = settled()
     for k in range(8):
         assert not thermometer.update((600 + k) * SECOND_NS, 60.0 if k % 2 else -20.0)
@@ -249,7 +249,7 @@ def test_outliers_on_both_sides_are_no_step():
     assert thermometer.temperature == pytest.approx(20.0, abs=0.002)
 
 
-def test_a_gap_widens_and_a_long_gap_starts_anew():
+def test_a_gap_increases_the_variance_and_a_long_gap_restarts_the_estimate():
     thermometer = settled()
     narrow = thermometer.var_temperature
     thermometer.update(900 * SECOND_NS, 20.0)
@@ -261,10 +261,10 @@ def test_a_gap_widens_and_a_long_gap_starts_anew():
     assert (thermometer.temperature, thermometer.rate) == (25.0, 0.0)
 
 
-def test_noise_declared_too_small_is_learnt():
-    # WHY: real die sensors scatter by 0.1 K; with 5 mK declared every reading was an outlier.
-    # WHAT: the noise ratio is estimated within 20 % (chi-square of some 400 readings: 4 %; the
-    # estimator takes a part of the noise for changes of the rate), and the variance is right.
+def test_the_noise_is_estimated_if_the_setting_is_too_small():
+    # WHY: sensors on a die have a noise of 0.1 K; with a setting of 5 mK each reading was taken
+    # for an outlier. WHAT: the ratio of noise to setting is estimated to 20 %, as some noise is
+    # taken for changes of the rate; the claimed variance is at least half of the squared error.
     thermometer = Thermometer(ThermometerSettings(0.005))
     rng = np.random.default_rng(3)
     out = run(thermometer, np.arange(4000.0), read(np.full(4000, 20.0), 0.125, 0.0, rng))
@@ -272,7 +272,7 @@ def test_noise_declared_too_small_is_learnt():
     assert np.mean((out[1000:, 0] - 20.0) ** 2 / out[1000:, 2]) < 2.0
 
 
-def test_a_frozen_sensor_is_known_by_the_time_of_its_last_change():
+def test_the_time_of_the_last_changed_reading_is_kept():
     thermometer = settled()
     for k in range(600, 700):
         thermometer.update(k * SECOND_NS, 20.0)
@@ -280,7 +280,7 @@ def test_a_frozen_sensor_is_known_by_the_time_of_its_last_change():
     assert thermometer.stamp_ns == 699 * SECOND_NS
 
 
-def test_extrapolation_is_linear_then_held():
+def test_the_extrapolation_is_linear_for_5_s_and_then_constant():
     thermometer = Thermometer(ThermometerSettings(0.001))
     for k in range(600):
         thermometer.update(k * SECOND_NS, 20.0 + 0.01 * k)
@@ -295,7 +295,7 @@ def test_extrapolation_is_linear_then_held():
         assert wider > variance
     held, _, wide = thermometer.at(last_ns + 60 * SECOND_NS)
     assert held == pytest.approx(temperature + 0.05, abs=1e-5)
-    # The extrapolation is held after 5 s; its sd is the change by 0.01 K/s in the other 55 s.
+    # After 5 s the extrapolation is constant; its sd is 0.01 K/s times the remaining 55 s.
     assert math.sqrt(wide) == pytest.approx(0.55, rel=0.05)
     assert thermometer.at(last_ns - SECOND_NS)[0] == pytest.approx(temperature - 0.01, abs=1e-5)
 
@@ -310,7 +310,7 @@ def test_one_reading_is_a_temperature_without_a_rate():
     assert not thermometer.is_ready
 
 
-def test_reset_forgets_the_readings():
+def test_reset_removes_the_effect_of_all_readings():
     thermometer = settled()
     thermometer.reset()
     assert thermometer.stamp_ns is None
@@ -327,7 +327,7 @@ def test_reset_forgets_the_readings():
         max_size=60,
     ),
 )
-def test_any_readings_leave_a_valid_estimate(quantum, rows):
+def test_estimates_after_any_readings_are_finite_with_a_valid_covariance(quantum, rows):
     thermometer = Thermometer(ThermometerSettings(0.01, quantum))
     stamp_ns = 0
     for step_ns, reading in rows:

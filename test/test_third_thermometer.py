@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A third thermometer is found in the bags, fitted, applied by replay, and improves the result.
+A third thermometer, on the lid, is found in the bags, fitted, used by replay, and reduces errors.
 
-Electronics under the lid, which warm board and case by 0.1 K only, are switched at random. Only
-the thermometer of the lid explains the effect of the lid on the axes.
+Electronics that are switched at random warm the lid by 5 K, but board and case by 0.1 K only, so
+only the thermometer on the lid shows when the lid changes the biases.
 """
 
 import math
@@ -62,7 +62,7 @@ def record(path, run):
 
 def fitted(bags):
     sources, _ = fit_sources(bags)
-    # The lid's effect has no lag: the groups needed are a sixth of the bank of columns.
+    # These groups, a sixth of all columns, suffice, because the effect of the lid has no lag.
     groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 
@@ -77,7 +77,7 @@ def runs():
 
 
 @pytest.mark.slow
-def test_a_third_thermometer_explains_what_board_and_case_do_not(runs, tmp_path):
+def test_a_third_thermometer_reduces_the_error_to_the_noise(runs, tmp_path):
     *bags, held_out = (record(tmp_path / f'{k}.mcap', run) for k, run in enumerate(runs))
     save_calibration(fitted(bags), tmp_path / 'unit.yaml')
     calibration = load_calibration(tmp_path / 'unit.yaml')
@@ -99,7 +99,7 @@ def test_a_third_thermometer_explains_what_board_and_case_do_not(runs, tmp_path)
         index = np.searchsorted(runs[-1].accel_stamp_ns, corrected.accel_stamp_ns)
         error = corrected.accel - truth.specific_force
         use = truth.cycle_s[index] > 600.0
-        # Compare the scatter of minute means, in which noise and constants do not matter.
+        # Compare the scatter of means over 60 s: constants do not matter, and noise is small.
         n = int(use.sum()) // 120 * 120
         means = error[use][:n].reshape(-1, 120, 3).mean(axis=1)
         errors[sees_lid] = float(np.sqrt(np.mean(np.var(means, axis=0)))) / MICRO_G
@@ -109,7 +109,7 @@ def test_a_third_thermometer_explains_what_board_and_case_do_not(runs, tmp_path)
     switched = float(np.sqrt(np.mean(np.square(LID_UG_K)))) * LOAD_K / 2.0
     assert errors[False] > 0.3 * switched
     assert errors[True] < 0.05 * switched
-    # With the temperature of the lid only the noise of a mean over 60 s remains.
+    # With the temperature of the lid, means over 60 s scatter by little more than their noise.
     noise = float(np.mean(calibration.noise_density_m_s2_sqrt_hz)) / math.sqrt(60.0) / MICRO_G
     assert spreads[False] > 2.0 * noise
     assert spreads[True] < 1.3 * noise

@@ -13,9 +13,9 @@ import thermo_comp as tc
 GRAVITY, MICRO_G = 9.80665, 9.80665e-6
 FACES = np.concatenate((np.eye(3), -np.eye(3)))
 NOISE = 2.5e-3
-#: Lag of the part of each axis behind the board [s].
+#: Lag of the part that determines the bias of each axis behind the board [s].
 LAGS_S = 180.0, 300.0, 120.0
-#: Time in one attitude, and time of a turn [s].
+#: Time from one turn to the next, and the part of it that a turn takes [s].
 DWELL_S, TURN_S = 400, 8
 
 
@@ -26,8 +26,8 @@ def bias_at(celsius):
 
 def turned(rng, corners, name):
     """
-    Record a MEMS triad at 1 Hz along a program, turned every `DWELL_S`; return also the true
-    specific force, the part of the bias that lags the board, and which samples are at rest.
+    Simulate a MEMS triad at 1 Hz that is turned every `DWELL_S`; return the bag, the true specific
+    force, the effect of the lags on the bias, and which samples are at rest.
     """
     time_s, before = np.arange(1.0, corners[-1][0]), np.arange(-3600.0, corners[-1][0])
     board = np.interp(before, *np.transpose(corners))
@@ -54,8 +54,8 @@ def rms(values):
 
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
-    # WHY: a fit with products and squares of a lag, but without the lag, had left-out errors as
-    # small as with the lag. At twice the ramp rates the fit without the lag erred by over 1.7 mg.
+    # WHY: a fit with products and squares of a lag, but without the lag itself, had small errors
+    # in left-out data, but an error of over 1.7 mg in ramps of twice the rate.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
@@ -70,27 +70,27 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     is_used = at_rest & np.isfinite(out.specific_force).all(axis=1)
     error = (out.specific_force - force)[is_used]
     error = error[: len(error) // 60 * 60].reshape(-1, 60, 3).mean(axis=1)
-    # The fit must correct at least three quarters of the effect of the lag; a fit with products of
-    # the lag, but without the lag, errs by more than this effect.
+    # The fit must correct three quarters of the effect of the lag; a fit with products of the lag,
+    # but without the lag itself, has a larger error than this effect.
     assert rms(of_lag) > 0.5e-3 * GRAVITY
     assert rms(error) < 0.25 * rms(of_lag)
 
 
-def test_a_single_turn_on_is_claimed_with_the_repeatability_of_its_grade():
-    # WHY: for one recording the sd of turn-ons had the prior of mountings, which is half as large:
-    # a MEMS whose turn-ons differ by 0.6 mg erred by 5 times its claimed sd at the next turn-on.
+def test_the_claimed_sd_of_a_single_turn_on_is_that_of_its_grade():
+    # WHY: one recording does not show how much the bias changes at a turn-on. The claimed sd was
+    # too small: a MEMS that changes by 0.6 mg erred by 5 times its claimed sd after a turn-on.
     rng = np.random.default_rng(3)
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
-    # The noise of 0.25 mg in 1 Hz is that of a MEMS, whose turn-ons repeat within 0.1 to 1 mg: the
-    # claimed sd must be at least 0.3 mg, the geometric mean of 0.1 and 1 mg, and at most 1.5 mg.
+    # The bias of a MEMS of this noise changes by 0.1 to 1 mg at a turn-on. The claimed sd must be
+    # at least the geometric mean of both, 0.3 mg, and at most 1.5 mg.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
 
 
 @pytest.mark.slow
 def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
-    # WHY: an update took the difference of the turn-ons for ageing of the bias, and forgot the
-    # turn-on of the prior: the error after a third turn-on was larger than without the update.
+    # WHY: an update took the difference of the turn-ons for ageing, and replaced the bias by that
+    # of the latest turn-on: the error after a third turn-on was larger than without the update.
     rng = np.random.default_rng(5)
     change = 1e-3 * GRAVITY * np.array([1.0, -0.8, 0.6])
     bags = [turned(rng, ((0.0, 20.0), (5400.0, 20.0)), name)[0] for name in ('one', 'two')]
@@ -99,7 +99,7 @@ def test_an_update_after_a_new_turn_on_gives_the_mean_of_both_turn_ons():
     first = tc.fit(bags[:1], **options)
     for both in (tc.fit(bags[1:], prior=first, **options), tc.fit(bags, **options)):
         share = (bias_of(both) - bias_of(first)) / change
-        # The noise of 13 rests of 400 s in each recording is 2 % of the change of the turn-on.
+        # By noise (13 rests of 400 s per recording) the share has an sd of 2 %.
         assert np.abs(share - 0.5).max() < 0.05
 
 

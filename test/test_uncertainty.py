@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The covariance covers a start in a ramp, a lost thermometer, and forces beyond 1 g."""
+"""The claimed covariance covers a start in a ramp, a lost thermometer, and forces beyond 1 g."""
 
 import math
 from dataclasses import replace
@@ -17,11 +17,10 @@ from thermo_comp.unit.prediction import ramp_states, sd_of_states
 UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
-def test_a_start_in_a_ramp_is_claimed():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error. In a ramp a part lags
-    # the board by rate times time constant, 1 K in this test; after a start at rest the lag has an
-    # sd of 0.4 K. A ramp that ends soon after the start leaves the same error as a ramp that goes
-    # on.
+def test_the_claimed_sd_covers_a_start_in_a_ramp():
+    # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start the node
+    # does not know how far a part lags the board: 1 K (rate times time constant) in this ramp, an
+    # sd of 0.4 K at rest. The error is the same if the ramp ends soon after the start.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
@@ -34,29 +33,30 @@ def test_a_start_in_a_ramp_is_claimed():
             compensator.push('case', stamp, 10.0 + risen - flicker)
             row = compensator.process(stamp, 0.0, 0.0, 1.0)
         sd[rate, end] = math.sqrt(row[3] - compensator.thermal.correction.noise[0])
-    # A bias error of 30 counts, at 300 counts per m/s^2, has decayed for one time constant.
+    # Sensitivity 30 counts per K of the lag, scale factor 300 counts per m/s^2; after 60 s, one
+    # time constant, a lag error has decayed to 1 / e.
     left = 30.0 / 300.0 / math.e
     assert sd.pop((0.0, 60)) == pytest.approx(0.387 * left, rel=0.2)
     assert [*sd.values()] == pytest.approx([math.hypot(1.0, 0.387) * left] * 2, rel=0.2)
 
 
-def test_the_gradient_of_a_lost_sensor_is_the_last_one_at_rest():
-    # WHY: a unit heats itself by 1 K above the case; a lost case was taken as 0 K of gradient.
+def test_without_a_lost_sensor_the_gradient_is_the_last_one_at_rest():
+    # WHY: the board is 1 K warmer than the case, but without the case sensor 0 K was assumed.
     unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
     compensator = Compensator(unit, UNCHECKED)
     corrected = []
     for second in range(2000):
         stamp = 10**12 + second * SECOND_NS
-        # Readings scatter by a few mK: constant readings are those of a faulty thermometer.
+        # The readings change by some mK, as a thermometer with constant readings counts as faulty.
         compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
         if second < 1500:
             compensator.push('case', stamp, 19.0 + 2e-3 * (second % 5))
         corrected.append(compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2))
-    # The gradient has an sd of 0.1 K, which is 3 counts, at 300 counts per m/s^2.
+    # An sd of the gradient of 0.1 K is 3 counts, or 0.01 m/s^2 at 300 counts per m/s^2.
     assert corrected[-1][0] == pytest.approx(corrected[1499][0], abs=0.01)
 
 
-def test_without_its_sensor_from_the_start_the_gradient_is_that_of_the_fit():
+def test_if_a_sensor_is_missing_from_the_start_the_gradient_is_that_of_the_fit():
     of_gradient = (term('gradient', (30.0, 0.0, 0.0)),)
     unit = calibration(response=of_gradient, rest_gradient_range_k=(-1.1, -0.9))
     compensator = Compensator(unit, UNCHECKED)
@@ -64,13 +64,14 @@ def test_without_its_sensor_from_the_start_the_gradient_is_that_of_the_fit():
         stamp = 10**12 + second * SECOND_NS
         compensator.push('board', stamp, 20.0 + 2e-3 * (second % 3))
         row = compensator.process(stamp, 300.0, 300.0, 2943.0 + second % 2)
-    # A gradient of -1 K changes the counts by -30, at 300 counts per m/s^2.
+    # A gradient of -1 K changes the raw value by -30 counts, or 0.1 m/s^2.
     assert row[0] == pytest.approx(1.1, abs=0.01)
     assert not compensator.thermal.tracker.loose_k(-1.0)
 
 
-def test_beyond_1_g_the_covariance_has_an_unknown_square():
-    # The K2 of a unit that was fitted at rest is unknown: its sd is 100 ug/g^2 from 1.01 g on.
+def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
+    # Rests do not determine K2, the error proportional to the square of the force. Its assumed sd
+    # is 100 ug/g^2, for forces above 1.01 g.
     compensator = Compensator(calibration(), UNCHECKED)
     for name in ('board', 'case'):
         compensator.push(name, 10**12, 20.0)
@@ -84,10 +85,9 @@ def test_beyond_1_g_the_covariance_has_an_unknown_square():
 
 
 @pytest.mark.parametrize('fault', ['both stand still', 'swapped topics'])
-def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fault):
-    # WHY: the bias follows a part that lags the board by 10 min, so a lasting error of the board
-    # temperature changes the bias, but a sudden error does not. The claimed sd lacked the effect
-    # of lasting errors of the board temperature.
+def test_the_claimed_sd_covers_thermometer_errors_for_parts_that_lag_the_board(fault):
+    # WHY: the claimed sd lacked the effect of lasting errors of the board temperature. The bias
+    # depends on a part that lags the board by 10 min, so a short error hardly changes the output.
     per_kelvin, axis = 30.0, axis_set((0.0, 30.0))
     part = term('board', (-per_kelvin, 0.0, 0.0), tau_s=600.0)
     parts = regime_set(x=axis, rate_range_k_min=(-5.0, 5.0))
@@ -120,9 +120,9 @@ def test_an_error_of_the_thermometers_is_claimed_for_parts_that_lag_the_board(fa
     assert ratio.max() > 0.1
 
 
-def test_the_lack_of_fit_may_be_one_of_the_bias_or_of_the_scale():
-    # WHY: the certificate stated the scale factor to 11 ppm at temperatures at which no position
-    # had gravity along the axis, and attributed the whole unknown error to the bias.
+def test_the_lack_of_fit_is_divided_between_bias_and_scale():
+    # WHY: the certificate stated an sd of 11 ppm for a scale factor at temperatures at which no
+    # position had gravity along the axis, and added the whole unknown error to the bias.
     lacks = LackOfFit(0.0, (0.0, 3e-3, 4e-3)), LackOfFit(20.0, (0.0, 0.0, 0.0))
     plain = calibration()
     lacking = replace(plain, static=replace(plain.static, lack_of_fit=lacks))

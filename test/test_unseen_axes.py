@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The claimed sd covers axes that no position had along gravity at some temperatures."""
+"""The claimed sd is larger for axes that no position had along gravity at a temperature."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ KINK = np.array([0.0, 1e-5, -1e-5])
 
 
 def fit_of(temperature, up, position, slope=1e-5, gravity=10.0):
-    """Return what the functions read of a fit: one column of a curve, the scale's slope."""
+    """Return the parts of a fit that the functions read; the scale has a curve of one slope."""
     windows = SimpleNamespace(
         temperature=np.asarray(temperature, dtype=float),
         data=SimpleNamespace(
@@ -45,15 +45,15 @@ def prior_of(lower, upper, *lacks):
     return SimpleNamespace(regime_sets=lambda: (regime, regime))
 
 
-def test_only_axes_along_gravity_are_known_at_new_temperatures():
-    # Six faces from 0 to 40 degC, and x up from -40 to 0 degC.
+def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
+    # Six positions, one per face, cover 0 to 40 degC; one position with x up covers -40 to 0 degC.
     faces = [*np.eye(3), *-np.eye(3), np.eye(3)[0]]
     fit = fit_of([0, 40] * 6 + [-40, 0], faces, np.repeat(np.arange(7), 2))
     (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), None)
     assert [point.temperature_c for point in lack] == pytest.approx([-40, -31, -22, -13, -4])
     for point in lack:
-        # The scale curve continues without error by a tenth of 40 K; beyond, the slope has an sd
-        # of half of 10 ppm/K.
+        # The curve of a scale holds for another tenth of its range of 40 K; beyond, its slope is
+        # assumed to have an sd of half its value of 10 ppm/K.
         sd = 0.5e-5 * 10.0 * (-4.0 - point.temperature_c)
         assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
     (finding,) = unseen_axes.judge_unseen_axes(fit, None)
@@ -63,17 +63,17 @@ def test_only_axes_along_gravity_are_known_at_new_temperatures():
 @pytest.mark.parametrize(
     'up', [[[0.58, 0.58, 0.58], [-0.6, 0.6, 0.53]], [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]]
 )
-def test_nothing_is_added_where_all_positions_show_the_same_axes(up):
+def test_no_sd_is_added_if_the_same_axes_are_along_gravity_at_all_temperatures(up):
     fit = fit_of([0, 40, -40, 0], [up[0], up[1]], [0, 0, 1, 1])
     only_x = np.allclose(up, [1.0, 0.0, 0.0])
     assert unseen_axes.with_unseen_axes(fit, ((), ()), None) == [(), ()]
     assert unseen_axes.judge_unseen_axes(fit, None) == []
-    # A prior determines all axes within its temperature range, also axes that no position shows.
+    # A prior determines all axes within its temperature range, from 0 to 40 degC.
     (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), prior_of(0.0, 40.0))
     assert bool(lack) == only_x
 
 
-def test_the_lack_of_fit_of_a_prior_holds_for_axes_that_are_not_seen_again():
+def test_an_update_keeps_the_lack_of_fit_of_axes_that_it_does_not_observe():
     lacks = LackOfFit(0.0, (1e-3, 1e-3, 1e-3)), LackOfFit(40.0, (1e-3, 1e-3, 1e-3))
     fit = fit_of([10, 30], [[1.0, 0.0, 0.0]], [0, 0])
     new = (LackOfFit(20.0, (2e-4, 2e-4, 2e-3)),)
@@ -93,8 +93,8 @@ def kinked(bag, unit):
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [1, 2])
 @pytest.mark.parametrize('is_prior', [False, True])
-def test_one_cold_bag_does_not_claim_the_scale_factors_of_all_axes(number, is_prior):
-    # WHY: the error was 138 ug at a claimed sd of 14 ug.
+def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(number, is_prior):
+    # WHY: after a cold bag of one position the error was 138 ug with a claimed sd of 14 ug.
     rng = rng_of('unseen axes', number)
     unit = navigation(rng)
     warm = positions(unit, WARM, spread(12, rng), rng)

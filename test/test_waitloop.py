@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Undocumented parts of rclpy, which waitloop.py uses, have not changed."""
+"""The loop of waitloop.py works with this rclpy, of which it uses undocumented parts."""
 
 import threading
 import time
@@ -59,7 +59,7 @@ class Running:
         assert not self.thread.is_alive()
 
 
-def test_rclpy_still_has_its_undocumented_attributes_in_use():
+def test_rclpy_has_the_undocumented_attributes_in_use():
     methods = {
         'WaitSet': (
             *('clear_entities', 'add_subscription', 'add_guard_condition', 'add_service'),
@@ -76,12 +76,12 @@ def test_rclpy_still_has_its_undocumented_attributes_in_use():
     assert issubclass(RCLError, Exception)
 
 
-def test_parameters_set_by_the_user_are_known_by_name(node):
+def test_names_of_parameters_that_the_user_set_are_returned(node):
     node.declare_parameter('known', 1)
     assert overrides(node) == {'mispelt': 1, 'known': 2}
 
 
-def test_messages_come_serialized_in_order_with_their_time(node, peer):
+def test_messages_arrive_serialized_in_order_with_their_reception_time(node, peer):
     with Running(node) as running:
         publisher = peer.publisher(Vector3Stamped, 'samples')
         for k in range(500):
@@ -91,7 +91,7 @@ def test_messages_come_serialized_in_order_with_their_time(node, peer):
         running.wait_for(lambda: len(running.messages) == 500)
     values = [deserialize_message(data, Vector3Stamped).vector.x for data in running.messages]
     assert values == [float(k) for k in range(500)]
-    # The node orders messages of several topics by their reception times, which must rise.
+    # The node sorts messages of several topics by reception time, so these times must rise.
     assert running.received_ns == sorted(running.received_ns)
     assert running.received_ns[0] > 0
 
@@ -135,7 +135,7 @@ def test_services_and_timers_are_served_while_samples_flow(node, peer):
         flooding = threading.Thread(target=flood, daemon=True)
         flooding.start()
         try:
-            # Wait until samples flow: only then services and timers compete with samples.
+            # Begin when samples arrive, so that services and timers compete with samples.
             running.wait_for(lambda: len(running.messages) > 100)
             n_ticks = len(ticks)
             ordinary.publish(Bool(data=True))
@@ -144,11 +144,11 @@ def test_services_and_timers_are_served_while_samples_flow(node, peer):
         finally:
             stop.set()
             flooding.join(TIMEOUT)
-    # Polling of services every 20 ms leaves time for a reload within 100 ms, client included.
+    # If services are polled every 20 ms, a client gets the answer to a reload within 100 ms.
     assert OTHERS_PERIOD_NS <= 20_000_000
 
 
-def test_a_periodic_call_goes_on_with_and_without_samples(node, peer):
+def test_a_periodic_function_is_called_with_and_without_samples(node, peer):
     called = []
     running = Running(node)
 
@@ -168,7 +168,7 @@ def test_a_periodic_call_goes_on_with_and_without_samples(node, peer):
             publisher.publish(Vector3Stamped())
             running.wait_for(lambda n=n_sent: len(running.messages) == n)
         running.wait_for(lambda: len(called) > n_before and called[-1] == 50)
-        # A second periodic function replaces the first, and is called when due, not earlier.
+        # A second periodic function replaces the first, and is called after its interval.
         again = []
         start = time.monotonic()
 
@@ -192,7 +192,7 @@ def test_the_loop_stops_when_the_context_is_shut_down(node):
         assert not running.thread.is_alive()
 
 
-def test_a_subscription_can_go_while_the_loop_runs(node, peer):
+def test_a_subscription_can_be_removed_while_the_loop_runs(node, peer):
     running = Running(node)
     other = running.loop.subscribe(Vector3Stamped, 'others', DEEP)
 
@@ -210,13 +210,13 @@ def test_a_subscription_can_go_while_the_loop_runs(node, peer):
     assert all(subscription.topic != 'others' for subscription in node.subscriptions)
 
 
-def test_quality_of_service_is_open_to_overrides(node):
+def test_qos_of_a_subscription_can_be_overridden(node):
     loop = WaitLoop(node)
     node.declare_parameter('qos_overrides./others.subscription.depth', 3)
     qos = QoSProfile(depth=7)
     loop.subscribe(Vector3Stamped, 'samples', qos)
     loop.subscribe(Vector3Stamped, 'others', qos)
-    # rclpy writes QoS overrides into the profile it gets, so each subscription needs a copy.
+    # rclpy writes overrides into the given QoS profile, so each subscription needs a copy.
     assert qos.depth == 7
     depth = node.get_parameter('qos_overrides./samples.subscription.depth')
     assert depth.value == 7
@@ -234,7 +234,7 @@ def test_quality_of_service_is_open_to_overrides(node):
         pytest.param(RELIABLE, None, False, id='reliable'),
     ],
 )
-def test_only_best_effort_messages_that_crowd_gather(
+def test_the_loop_pauses_only_for_frequent_best_effort_messages(
     node, peer, monkeypatch, qos, interval_s, is_resting
 ):
     rest_s = 1000.0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Closed-form temperatures behind thermal lags, and sensors that read them."""
+"""Closed forms of temperatures with thermal lags, and thermometers that read them."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ BOARD_LAG_S = 600.0
 
 
 def lagged(t, corners, lag):
-    """Return a first-order lag behind a chamber whose rate [K/min] changes at corners [s]."""
+    """Return a temperature that lags a chamber, whose rate [K/min] changes at `corners` [s]."""
     out = np.zeros(len(t))
     before = 0.0
     for at, rate in corners:

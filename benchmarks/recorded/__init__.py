@@ -3,8 +3,8 @@
 """
 Owns the access to recordings that other people made, for `test/test_real_data.py`.
 
-The recordings are not part of the project: they are read from a folder beside the project, and
-converted to bags in a temporary directory.
+The recordings are not part of the project: they are read from the folder THERMO_COMP_DATA, or else
+from a folder beside the project, and converted to bags in a temporary directory.
 """
 
 from __future__ import annotations

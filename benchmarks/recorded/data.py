@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the conversion of recordings that other people made to bags."""
+"""Owns the conversion to bags of recordings that other people made."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FACES_RATE_HZ = 204.8
 
 
 def freezer_bag(folder: Path, work: Path) -> Path:
-    """Convert the freezer run with the column map that ships with the project."""
+    """Convert the recording of an MPU-6050 in a freezer with the project's column map."""
     bag = work / 'freezer.mcap'
     columns = load_column_map(ROOT / 'config' / 'columns' / 'freezer.yaml')
     write_log(table_log(folder / FREEZER, columns), bag, force=True)
@@ -30,7 +30,7 @@ def freezer_bag(folder: Path, work: Path) -> Path:
 
 
 def handheld_bag(folder: Path, work: Path, unit: int) -> Path:
-    """Convert a handheld unit with the column map that ships with the project."""
+    """Convert the recording of handheld MPU-9150 number `unit` with the project's column map."""
     bag = work / f'handheld{unit}.mcap'
     columns = load_column_map(ROOT / 'config' / 'columns' / 'handheld.yaml')
     columns = replace(columns, serial=f'mpu9150-{unit}')
@@ -39,7 +39,7 @@ def handheld_bag(folder: Path, work: Path, unit: int) -> Path:
 
 
 def faces_bag(folder: Path, work: Path) -> Path:
-    """Convert the counts of the Ferraris session; the annotations are not read."""
+    """Convert the counts of the Ferraris session (rests on six faces); ignore its annotations."""
     bag = work / 'faces.mcap'
     columns = ColumnMap(
         serial='ferraris',
