@@ -44,7 +44,7 @@ from field_units import (
 )
 
 from thermo_comp.field.rest import Rest, encode
-from thermo_comp.field.series import Series, series_of
+from thermo_comp.field.series import RestSeries, series_of
 from thermo_comp.field.update import update
 from thermo_comp.unit.calibration import Calibration
 
@@ -71,7 +71,7 @@ def probes(kind: str, state: Floats, seed: int) -> tuple[list, Floats, Floats, F
     return rests, counts, warmth, force
 
 
-def errors_of(series: Series, calibrated: Calibration, force: Floats) -> Floats:
+def errors_of(series: RestSeries, calibrated: Calibration, force: Floats) -> Floats:
     """Return the errors of |f| and of the axes x, y, z after correction [m/s^2], shape (n, 4)."""
     f = series.force @ np.array(calibrated.misalignment).T
     return np.column_stack((series.residual, f - force))

@@ -27,7 +27,7 @@ from thermo_comp.field.update import update
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.recording.topics import Part, Topics
+from thermo_comp.recording.topics import BagPart, Topics
 from thermo_comp.unit.calibration import Calibration
 
 
@@ -96,7 +96,7 @@ def judge_recordings(folder: Path) -> None:
     with tempfile.TemporaryDirectory() as work:
         for name, bag, edges, window in cases(folder, Path(work)):
             gather.SECONDS = int(window)
-            first = Topics(part=Part(edges[0], edges[1]))
+            first = Topics(part=BagPart(edges[0], edges[1]))
             options = FitOptions(gravity=GRAVITY, input='m/s^2')
             calibration = fit(fit_sources([bag], first)[0], options).calibration
             whole = tc.read(bag)

@@ -24,7 +24,7 @@ import numpy as np
 from field import probes, root_mean
 from field_units import DAY_ZERO, KINDS, UG, Floats, G, Process, calibration, live
 
-from thermo_comp.field.series import Series, series_of
+from thermo_comp.field.series import RestSeries, series_of
 from thermo_comp.field.update import update
 from thermo_comp.field.watch import LIMIT, watch
 
@@ -33,7 +33,7 @@ CLASSES = (0.0, 0.6, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 9.0)
 LABORATORY, TOLERANCE, N_FUTURES = calibration(), 200.0 * UG, 200
 
 
-def leaves(probe: Series, process: Process, bound: float, rng: np.random.Generator) -> Floats:
+def leaves(probe: RestSeries, process: Process, bound: float, rng: np.random.Generator) -> Floats:
     """Draw 200 times [days] after which the RMS of |f| - g exceeds a bound, in steps of 8 h."""
     size = np.repeat([process.bias, process.scale * G], 3) / np.sqrt(3.0)
     error, levels = np.full(N_FUTURES, np.inf), np.zeros((N_FUTURES, 6))

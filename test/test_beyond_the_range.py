@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from builders import axis_set, calibration, drawn, regime_set, rich_calibration, term
 
-from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Layout
+from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, StateLayout
 from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, parameter_layout
 from thermo_comp.unit.correction import VARIANCES, Correction
 from thermo_comp.unit.covariance import N_ROWS
@@ -36,7 +36,7 @@ def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
 def sd_at(unit, board, behind=0.0, force=0.0):
     """Return the claimed sd of x in a soak, without noise; `behind`: lag of parts [K]."""
     correction = Correction(unit)
-    layout = Layout(correction.memory)
+    layout = StateLayout(correction.memory)
     state = [0.0] * layout.width
     state[BOARD] = board
     for lag in layout.lags:
@@ -128,7 +128,7 @@ def test_the_sd_beyond_the_range_includes_every_parameter_of_the_tangents(rng):
     layout = parameter_layout(unit)
     change = 1e-3 * rng.standard_normal(layout.n_parameters)
     change[[level for block in layout.scale for level in (block.static, block.dynamic)]] = 0.0
-    states = np.zeros((Layout(Correction(unit).memory).width, 9))
+    states = np.zeros((StateLayout(Correction(unit).memory).width, 9))
     states[BOARD] = -40.0, -5.0, 3.0, 20.0, 33.0, 36.0, 42.0, 43.0, 90.0
     states[WEIGHT] = 0.0, 1.0, 0.3, 0.5, 1.0, 0.3, 0.0, 0.7, 1.0
     moved, nominal = (
@@ -154,7 +154,7 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
     for sign in (1.0, -1.0):
         variances = []
         for beyond in (0.0, 0.1, 1.0, 3.0, 7.4, 7.6, 15.0, 40.0):
-            state = np.zeros((Layout(correction.memory).width, 1))
+            state = np.zeros((StateLayout(correction.memory).width, 1))
             state[BOARD] = 20.0 + sign * (15.0 + beyond)
             line = correction.line(state, state, slow.at(state, nobody), 0.0)
             variances.append(line[list(VARIANCES), 0])
@@ -172,7 +172,7 @@ def test_with_lags_the_sd_in_a_ramp_does_not_grow_with_the_distance_from_the_rat
     sds = []
     for response in ((), (term('board', tau_s=600.0),)):
         correction = Correction(calibration(static=soaks, dynamic=soaks, response=response))
-        state = np.zeros(Layout(correction.memory).width)
+        state = np.zeros(StateLayout(correction.memory).width)
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
@@ -185,7 +185,7 @@ def test_the_distance_of_a_squared_column_from_its_range_is_that_of_its_quantity
     # The claimed sd was that of 10000 ranges, 0.1 g.
     unit = calibration(response=(term('square', (1.0, 0.0, 0.0), tau_s=600.0, range=(0.0, 0.01)),))
     correction = Correction(unit)
-    state = np.zeros(Layout(correction.memory).width)
+    state = np.zeros(StateLayout(correction.memory).width)
     state[BOARD], state[correction.layout.places[unit.response[0].source]] = 20.0, 10.0
     excess = correction.excess(state, is_dynamic=False)
     assert 99.0 < excess.relative < 150.0

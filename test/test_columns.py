@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from thermo_comp.thermal.lags import Lag, MemorySpec
 from thermo_comp.thermal.settings import DetectorSettings
-from thermo_comp.thermal.state import BOARD, GRADIENT, Layout, Rate
+from thermo_comp.thermal.state import BOARD, GRADIENT, Rate, StateLayout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.columns import (
     BANK_TAUS,
@@ -64,7 +64,7 @@ def test_gradient_even_about_rest_is_an_even_function_of_gradient_less_rest():
     assert by_group(warm)['gradient_even_about_rest'] == 21
     assert {(column.sensor, column.rest_k) for column in change} == {('case', -0.5)}
     table = ColumnTable(change, MemorySpec(('case', 'tip')), 20.0)
-    states = np.zeros((Layout(MemorySpec(('case', 'tip'))).width, 3))
+    states = np.zeros((StateLayout(MemorySpec(('case', 'tip'))).width, 3))
     # Gradients of three states: -0.5 K, the gradient at rest, and 1.5 K above and below it.
     states[GRADIENT] = -0.5, 1.0, -2.0
     values = table.raw(states)
@@ -109,7 +109,7 @@ def test_the_value_of_each_kind_of_column_agrees_with_hand_numbers():
         Column('bend', 'bend', tau_s=60.0, knee_k=2.6, **WIDE),
     ]
     spec = memory_of(columns, ('case', 'tip'))
-    layout = Layout(spec)
+    layout = StateLayout(spec)
     # State: board, variance, rate, weight, unknown regime; case and tip gradients; 2 lags; a play.
     state = np.array(
         [[23.0, 0.0, 0.01, 0.25, 0.0, 1.2, 0.0, -0.7, 0.0, 0.5, 0.0, -0.3, 0.0, 0.1]]
@@ -131,8 +131,8 @@ def test_a_bend_has_slopes_over_board_temperature_and_lag():
     columns = [Column('bend', 'bend', tau_s=tau, knee_k=2.0, **WIDE) for tau in (0.0, 60.0)]
     spec = memory_of(columns)
     table = ColumnTable(columns, spec, 20.0)
-    state = np.zeros((Layout(spec).width, 1))
-    lag = Layout(spec).places[Lag('board', 60.0)]
+    state = np.zeros((StateLayout(spec).width, 1))
+    lag = StateLayout(spec).places[Lag('board', 60.0)]
     state[BOARD], state[lag] = 24.0, 0.5
     # Slopes over the quantity of each column (t, lag), then over the board temperature.
     assert np.ravel(table.slopes(state)).tolist() == [1.0, -1.0, 1.0, 1.0]
@@ -158,7 +158,7 @@ def test_a_new_kind_of_column_needs_one_class_only(monkeypatch):
         tracker.read('board', second * SECOND_NS, 20.0)
         tracker.read('case', second * SECOND_NS, 20.0 + 0.01 * second)
     state = tracker.sample(599 * SECOND_NS)
-    place = Layout(correction.memory).places[Rate('case')]
+    place = StateLayout(correction.memory).places[Rate('case')]
     rate, variance = state[place : place + 2]
     line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
     assert line[8] == pytest.approx(3e6 * rate**2) == pytest.approx(300.0, rel=0.02)

@@ -25,7 +25,7 @@ from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
 from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.thermal.lags import start_covariance
-from thermo_comp.thermal.state import RATE, Layout
+from thermo_comp.thermal.state import RATE, StateLayout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.calibration import ResponseTerm, parameter_layout
 from thermo_comp.unit.columns import bank
@@ -199,7 +199,7 @@ def test_corrections_with_random_initial_lag_states_scatter_by_the_claimed_sd(rn
     state = (*state[:RATE], 0.0, *state[RATE + 1 :])
     column, of_start = np.array([state]).T, np.array([shares]).T
     slow = SlowUncertainty(unit, correction).at(column, of_start)
-    layout = Layout(correction.memory)
+    layout = StateLayout(correction.memory)
     places = [layout.places[lag] for lag in layout.lags]
     draws = rng.multivariate_normal(np.zeros(len(lags)), start_covariance(lags), size=4000)
     state = np.array(state)

@@ -21,7 +21,7 @@ from thermo_comp.field.series import read_rests, series_of
 from thermo_comp.field.update import change_texts, refuse_another_unit, update
 from thermo_comp.fitting.assembly import parameters_of, with_parameters
 from thermo_comp.thermal.lags import Lag, start_root
-from thermo_comp.thermal.state import Layout
+from thermo_comp.thermal.state import StateLayout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 from thermo_comp.unit.correction import Correction
@@ -418,7 +418,7 @@ def test_derivatives_of_a_rest_by_initial_lag_states_agree_with_finite_differenc
     # At a turn-on the states of lags are unknown; expected derivatives are differences of |f|.
     unit, share, step = rich_calibration(), 0.6, 1e-4
     logged = with_shares(rests(unit, in_any_attitude, no_error, days=4, rate=0.5 / 60.0), share)
-    series, layout = series_of(logged, unit), Layout(Correction(unit).memory)
+    series, layout = series_of(logged, unit), StateLayout(Correction(unit).memory)
     lags = [lag for lag in layout.places if isinstance(lag, Lag)]
     root = start_root(tuple(lags))
     for k, column in enumerate(root.T):

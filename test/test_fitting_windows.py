@@ -20,7 +20,7 @@ from thermo_comp.simulation.run import arrays
 from thermo_comp.thermal.lags import Lag, MemorySpec, Play
 from thermo_comp.thermal.memory import ThermalMemory, memory_on_grid
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
-from thermo_comp.thermal.state import Gradient, Layout
+from thermo_comp.thermal.state import Gradient, StateLayout
 from thermo_comp.thermal.tracker import ThermalTracker
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.columns import ColumnTable, bank, memory_of
@@ -167,7 +167,7 @@ def test_the_derivative_of_a_column_by_its_lag_agrees_with_differences():
     # The expected derivatives are differences of columns with lags shifted by a microkelvin.
     columns = bank(span_k=(-4.0, 12.0))
     spec = memory_of(columns)
-    layout, table = Layout(spec), ColumnTable(columns, spec, 20.0)
+    layout, table = StateLayout(spec), ColumnTable(columns, spec, 20.0)
     state = np.zeros((layout.width, 1))
     state[0], state[layout.places[Gradient('case')]] = 27.0, 0.4
     for lag in layout.lags:
@@ -233,7 +233,7 @@ def fitted(request, all_bags):
 def states_of(windows, calibration):
     columns = calibration.response
     spec = memory_of(columns)
-    layout = Layout(spec)
+    layout = StateLayout(spec)
     states = np.zeros((len(windows.temperature), layout.width))
     states[:, 0], states[:, 3] = windows.temperature, windows.weight
     raw = dict(zip(windows.model.columns, windows.raw.T, strict=True))

@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline as ReferenceSpline
 from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.thermal.lags import Lag, Play
 from thermo_comp.thermal.memory import memory_on_grid
-from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout
+from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, Gradient, StateLayout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.correction import Correction
 from thermo_comp.unit.functions import (
@@ -203,12 +203,12 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
     # Expected: state of the memory of the fit after readings of a soak and a ramp.
     unit = replace(rich_calibration(), board_lag_s=100.0)
     spec = Correction(unit).memory
-    first = Layout(spec).width - 2 * len(spec.lags) - len(spec.plays)
+    first = StateLayout(spec).width - 2 * len(spec.lags) - len(spec.plays)
     gradient = np.append(0.0, np.full(900, 100.0 * rate))
     board = 25.0 + rate * np.arange(-900.0, 1.0)
     lived = memory_on_grid(spec, 1.0, board, [gradient] * len(spec.sensors))[-1]
     (state,) = ramp_states(unit, board[-1:], rate, 900.0)
-    layout = Layout(spec)
+    layout = StateLayout(spec)
     assert state[[BOARD, RATE, WEIGHT]].tolist() == [25.0, rate, 1.0]
     for quantity, place in layout.places.items():
         if isinstance(quantity, Gradient):

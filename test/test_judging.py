@@ -14,7 +14,7 @@ from thermo_comp.fitting.sources import digest
 from thermo_comp.judging.evaluation import evaluate
 from thermo_comp.judging.judgement import AxisShift, change_texts, judge
 from thermo_comp.judging.verdicts import Verdict
-from thermo_comp.judging.windows import Windows, columns_of
+from thermo_comp.judging.windows import JudgedWindows, columns_of
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import CONTINUED, SWAPPED, Compensator
 from thermo_comp.recording.reader import open_recording
@@ -88,7 +88,7 @@ def made(residual, raw, claimed, n=40, dynamic=10, outside=0):
     force[:, 2] = GRAVITY + residual * MICRO_G
     constant[:, 2] = GRAVITY + raw * MICRO_G
     rows = np.arange(n)
-    return Windows(
+    return JudgedWindows(
         window_s=60.0, gravity=GRAVITY, bag=np.zeros(n, np.int64), position=np.zeros(n, np.int64),
         start_ns=START_NS + rows * 60 * 10**9, time=rows * 60.0 + 30.0, count=np.full(n, 600),
         mean=constant * K, board=np.full(n, 20.0), rate=np.zeros(n), is_dynamic=rows < dynamic,

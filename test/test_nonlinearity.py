@@ -15,7 +15,7 @@ from thermo_comp.field.series import series_of
 from thermo_comp.fitting.assembly import parameters_of, with_parameters
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.thermal.state import BOARD, Layout
+from thermo_comp.thermal.state import BOARD, StateLayout
 from thermo_comp.unit.calibration import parameter_layout
 from thermo_comp.unit.calibration_file import dump_calibration, parse_calibration
 from thermo_comp.unit.correction import Correction
@@ -107,7 +107,7 @@ def test_the_variance_of_a_nonlinear_axis_includes_all_parameters(rng):
     unit = with_covariance(unit, rng)
     layout, correction = parameter_layout(unit), Correction(unit)
     whole, t = unit.posterior.covariance(), 7.0
-    state = np.zeros(Layout(correction.memory).width)
+    state = np.zeros(StateLayout(correction.memory).width)
     state[BOARD] = 20.0 + t
     slow = SlowUncertainty(unit, correction).at(state[:, np.newaxis], np.zeros((0, 1)))[:, 0]
     linear, beyond = np.reshape(slow[:9], (3, 3)), np.reshape(slow[N_ROWS:], (3, 5))

@@ -13,7 +13,7 @@ from thermo_comp.errors import FitError, RecordingError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.recording.reader import open_recording, read_recording
-from thermo_comp.recording.topics import Part, Topics
+from thermo_comp.recording.topics import BagPart, Topics
 from thermo_comp.recording.writer import BagWriter
 
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
@@ -34,7 +34,7 @@ def bag(rng, tmp_path):
 
 
 def part_of(path, begin=None, end=None, **options):
-    topics = Topics(part=Part(begin, end))
+    topics = Topics(part=BagPart(begin, end))
     with open_recording(path, topics, require=('accel',)) as reader:
         return list(reader.blocks(**options)), reader.since_s
 
@@ -93,7 +93,7 @@ def test_a_part_without_samples_is_refused(bag):
 )
 def test_impossible_bounds_of_a_part_are_refused(begin, end, reason):
     with pytest.raises(ValueError, match=reason):
-        Part(begin, end)
+        BagPart(begin, end)
 
 
 def test_the_part_before_a_jump_is_fitted(rng, tmp_path):
@@ -101,10 +101,10 @@ def test_the_part_before_a_jump_is_fitted(rng, tmp_path):
     rest.add((0.0, 0.0, 20.0 * MG), from_s=300.0)
     bag = bag_of(tmp_path / 'bag.mcap', rest)
     for begin in (None, 100.0):
-        sources, kind = fit_sources([bag], Topics(part=Part(begin)))
+        sources, kind = fit_sources([bag], Topics(part=BagPart(begin)))
         with pytest.raises(FitError, match=r'at 300\.0 s the sensor jumped'):
             fit(sources, OPTIONS)
-    sources, kind = fit_sources([bag], Topics(part=Part(100.0, 299.0)))
+    sources, kind = fit_sources([bag], Topics(part=BagPart(100.0, 299.0)))
     assert kind == 'imu'
     result = fit(sources, replace(OPTIONS))
     assert result.bags[0].n_samples == 199 * 25
@@ -118,7 +118,7 @@ def test_a_jump_of_the_clock_does_not_change_a_part(rng, tmp_path):
     with BagWriter(tmp_path / 'set.mcap') as writer:
         set_ns = block.accel_stamp_ns + np.where(rest.time >= 60.0, 10**17, 0)
         writer.write_imu('/imu/uncompensated', set_ns, block.accel, np.zeros((len(set_ns), 9)))
-    topics = Topics(part=Part(30.0))
+    topics = Topics(part=BagPart(30.0))
     with open_recording(tmp_path / 'set.mcap', topics, require=('accel',)) as reader:
         blocks = list(reader.blocks_on_one_clock())
     assert sum(map(len, blocks)) == 90 * 25

@@ -16,7 +16,7 @@ from thermo_comp.errors import FitError, RecordingError
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.fitting.sources import fit_sources
 from thermo_comp.judging.evaluation import evaluate
-from thermo_comp.recording.topics import Part, Topics
+from thermo_comp.recording.topics import BagPart, Topics
 
 MG = GRAVITY * 1e-3
 OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
@@ -98,7 +98,7 @@ def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
 
 
 def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_plot(real_data, work):
-    topics = Topics(part=Part(47.5, 358.5))
+    topics = Topics(part=BagPart(47.5, 358.5))
     result = fit(fit_sources([freezer_bag(real_data, work)], topics)[0], OPTIONS)
     z = result.calibration.static.z
     # The slope of |a| in the plot is 1.61 mg/K from 36 to 15 degC.
@@ -118,7 +118,7 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
     # The 1420 s after the last jump are cut into parts; each is corrected by a fit to other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
-    parts = [Part(start, start + length) for start in starts]
+    parts = [BagPart(start, start + length) for start in starts]
     raw, left = [], []
     for first in sets:
         held_out = parts[first::n_sets]
@@ -145,10 +145,10 @@ def test_the_error_of_the_freezer_run_on_held_out_minutes(
 def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, work):
     bag = freezer_bag(real_data, work)
     # Leave out the knocks of the freezer near 860 and 1134 s, and the time before the last jump.
-    parts = [Part(518.5, 638.5), Part(860.5, 1130.5), Part(1134.5, 1938.5)]
+    parts = [BagPart(518.5, 638.5), BagPart(860.5, 1130.5), BagPart(1134.5, 1938.5)]
     seen = [fit_sources([bag], Topics(part=part))[0][0] for part in parts]
     calibration = fit(seen, OPTIONS).calibration
-    held_out = Topics(part=Part(638.5, 853.5))
+    held_out = Topics(part=BagPart(638.5, 853.5))
     judged = evaluate([bag], [('unit', calibration)], topics=held_out).judgements['unit'].rate
     section = judged.sections['all']
     density = np.mean(calibration.gyroscope.noise_density_rad_s_sqrt_hz)

@@ -11,7 +11,7 @@ from builders import SECOND_NS
 from thermo_comp.thermal.lags import Lag, MemorySpec
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings, ThermalConfig
-from thermo_comp.thermal.state import GRADIENT, MEMORY_SETTLED_SD, VAR_GRADIENT, Layout, Rate
+from thermo_comp.thermal.state import GRADIENT, MEMORY_SETTLED_SD, VAR_GRADIENT, Rate, StateLayout
 from thermo_comp.thermal.tracker import LOST_GRADIENT_RELATIVE_SD, ThermalTracker
 
 TAU_S = 900.0
@@ -36,7 +36,7 @@ def test_the_lag_in_a_ramp_agrees_with_the_closed_form(step_s):
     end_ns = int(t[-1]) * SECOND_NS
     expected = rate * TAU_S * (1.0 - math.exp(-ramp_s / TAU_S))
     # The delay of the thermometer changes the result by about 10 mK of 6.5 K.
-    lag = Layout(LAG).places[Lag('board', TAU_S)]
+    lag = StateLayout(LAG).places[Lag('board', TAU_S)]
     assert tracker.sample(end_ns)[lag] == pytest.approx(expected, abs=0.05)
     assert tracker.is_settled(end_ns)
 
@@ -125,7 +125,7 @@ def test_rate_of_a_sensor_is_the_slope_of_its_readings_or_that_of_the_board():
     tracker = ThermalTracker(DetectorSettings(), spec, ThermalConfig(case_timeout_s=10.0))
     t = np.arange(0, 1000)
     feed(tracker, 20.0 + 0.01 * t, 20.0 + 0.02 * t)
-    place = Layout(spec).places[Rate('case')]
+    place = StateLayout(spec).places[Rate('case')]
     rate, variance = tracker.sample(999 * SECOND_NS)[place : place + 2]
     assert rate == pytest.approx(0.02, rel=0.01)
     assert 0.0 < variance < 0.001**2

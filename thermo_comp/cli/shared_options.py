@@ -184,10 +184,10 @@ def _reading(
         'End of the part to read: seconds or a stamp, as for --from.', None, '--to', metavar='S'
     ),
 ) -> Any:
-    from ..recording.topics import Part, Topics
+    from ..recording.topics import BagPart, Topics
 
     with usage_of('--from, --to: '):
-        part = Part(begin, end)
+        part = BagPart(begin, end)
     with usage_of('--topic, --topics: '):
         return Topics.named(names, part=part, input=input_)
 

@@ -28,7 +28,7 @@ from scipy.optimize import minimize
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
-from .series import Series
+from .series import RestSeries
 
 #: Centre of the prior of an sd, relative to that of the turn-on offset's sd: for the random walks
 #: of bias and of scale times g, per root day, and for the scatter of a rest. Prior sd of the
@@ -105,7 +105,7 @@ class Rows:
     Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
     combinations of the rests of a start, with all their information about the six levels.
 
-    y: combination of the values ``|f| - g`` of the rests [m/s^2]; `by_...`, lack: see `Series`
+    y: combination of the values ``|f| - g`` of the rests [m/s^2]; `by_...`, lack: see `RestSeries`
     noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row
     rank: number of the row within its start
     warmth: mean board temperature at the rests of a start less the reference temperature [K]
@@ -134,7 +134,7 @@ class Rows:
         return Rows(**{name: value[chosen] for name, value in vars(self).items()})
 
 
-def rows_of(series: Series, scatter: float) -> Rows:
+def rows_of(series: RestSeries, scatter: float) -> Rows:
     """Return the equations of rests, weighted by noise and an assumed sd `scatter` [m/s^2]."""
     parts: list[tuple[Floats, ...]] = []
     variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
@@ -272,8 +272,8 @@ def usual(calibration: Calibration) -> Ageing:
 
 
 def learn(
-    series: Series, calibration: Calibration, since: float, *, is_gravity_certain: bool = False
-) -> tuple[Ageing, Model, Series]:
+    series: RestSeries, calibration: Calibration, since: float, *, is_gravity_certain: bool = False
+) -> tuple[Ageing, Model, RestSeries]:
     """
     Estimate the ageing model by evidence, without starts that contradict all other starts.
 

@@ -16,7 +16,7 @@ from dataclasses import astuple, dataclass
 from typing import Any
 
 from ..thermal.lags import Lag, MemorySpec, Play
-from ..thermal.state import Layout
+from ..thermal.state import StateLayout
 
 #: Suffix of the files of a rest log; the name of a file is the day, as in 2026-11-25.rests.
 SUFFIX = '.rests'
@@ -126,7 +126,7 @@ def _rest(data: list[Any], memory: MemorySpec) -> Rest:
     stamp_ns, n, *parts = data
     mean, sd, state, shares, rate = (tuple(map(_number, part)) for part in parts)
     lengths = (len(mean), len(sd), len(state), len(shares), len(rate) % 3)
-    if lengths != (3, 3, Layout(memory).width, len(memory.lags), 0) or min(sd) < 0.0:
+    if lengths != (3, 3, StateLayout(memory).width, len(memory.lags), 0) or min(sd) < 0.0:
         raise ValueError(lengths)
     return Rest(_whole(stamp_ns), _whole(n), mean, sd, state, shares, rate)
 

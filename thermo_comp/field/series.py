@@ -25,7 +25,7 @@ from ..errors import RecordingError
 from ..files import read_bounded
 from ..text import counted
 from ..thermal.lags import MemorySpec
-from ..thermal.state import BOARD, RATE, UNKNOWN, WEIGHT, Layout
+from ..thermal.state import BOARD, RATE, UNKNOWN, WEIGHT, StateLayout
 from ..typing import Bools, Floats, Ints
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.correction import Correction
@@ -43,7 +43,7 @@ _UNTIL, _AGED = 'rests until ', ', claim aged '
 
 
 @dataclass(frozen=True)
-class Series:
+class RestSeries:
     """
     n rests in the order of the node's starts; accelerations and their sd in m/s^2.
 
@@ -82,7 +82,7 @@ class Series:
         _, first = np.unique(self.start, return_index=True)
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
-    def at(self, chosen: Bools | slice) -> Series:
+    def at(self, chosen: Bools | slice) -> RestSeries:
         """Return the selected rests, with their starts numbered from 0 again."""
         parts: dict[str, Any] = {
             name: value[chosen]
@@ -210,13 +210,13 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
 
 def series_of(
     rests: Sequence[tuple[Start, Rest]], calibration: Calibration, gravity: float | None = None
-) -> Series:
+) -> RestSeries:
     """
     Compute ``|f| - g`` and its derivatives at rests, with the logged g or with `gravity`. Raises
     RecordingError if the log does not have the lags of the calibration.
     """
     correction = Correction(calibration)
-    layout, K = Layout(correction.memory), correction.K[:, 0]
+    layout, K = StateLayout(correction.memory), correction.K[:, 0]
     places = {spec: _places(spec, correction.memory) for spec in {s.memory for s, _ in rests}}
     n_lags = len(correction.memory.lags)
     states = np.array([np.array(r.state)[places[s.memory][0]] for s, r in rests])
@@ -250,7 +250,7 @@ def series_of(
     )
     of_start = np.moveaxis(of_start, 2, 0)
     of_start = of_start[:, :, :3] / K + of_start[:, :, 3:] * x[:, np.newaxis]
-    return Series(
+    return RestSeries(
         time=averaged(stamps / _DAY_NS),
         start=_numbered(beginnings[first]),
         temperature=states[:, BOARD],
@@ -273,7 +273,7 @@ def series_of(
 def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
     """Return the indices, in `memory`, of the state elements and of the lags of `wanted`."""
     try:
-        logged, target = Layout(memory).numbers, Layout(wanted).numbers
+        logged, target = StateLayout(memory).numbers, StateLayout(wanted).numbers
         places = np.array([logged.index(number) for number in target], np.int64)
         return places, np.array([memory.lags.index(lag) for lag in wanted.lags], np.int64)
     except ValueError as error:

@@ -25,7 +25,7 @@ from ..unit.gravity import ug_text
 from ..unit.metrics import means_by
 from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
-from .series import Series, last_rest, valid_since
+from .series import RestSeries, last_rest, valid_since
 
 #: Names of conclusions that a user can override: another gravity than stated, another unit.
 OVERRIDES = ('gravity', 'unit')
@@ -108,14 +108,14 @@ class Update:
     ageing: Ageing
     changes: tuple[Change, ...]
     judged: Judged
-    series: Series
+    series: RestSeries
     n_outliers: int
     model: Model
     solution: Solution
 
 
 def update(
-    series: Series,
+    series: RestSeries,
     calibration: Calibration,
     source: Source | None = None,
     created: str = '',
@@ -169,7 +169,7 @@ def update(
     return Update(new, by_axis, ageing, model.changes, judged, used, n_outliers, model, solution)
 
 
-def _with_update(provenance: Provenance, series: Series, judged: Judged) -> Provenance:
+def _with_update(provenance: Provenance, series: RestSeries, judged: Judged) -> Provenance:
     """Add the residuals on left-out rests, and a note on the update, to a provenance."""
     largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time.max()), 'D')
     residuals = ResidualSummary(
@@ -213,7 +213,7 @@ def _slopes(calibration: Calibration) -> Floats:
 
 
 def _axis_changes(
-    series: Series, calibration: Calibration, model: Model, solution: Solution, ageing: Ageing
+    series: RestSeries, calibration: Calibration, model: Model, solution: Solution, ageing: Ageing
 ) -> tuple[Bools, tuple[AxisChange, ...]]:
     """Find the parameters that the rests determine, and list the changes of each axis."""
     layout, correction = parameter_layout(calibration), Correction(calibration)
@@ -252,7 +252,7 @@ def _axis_changes(
     return determined, tuple(shifts)
 
 
-def _judged(series: Series, model: Model, solution: Solution, determined: Bools) -> Judged:
+def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
     """Score updates by the rests before each day or, with fewer than five days, each start."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
@@ -281,7 +281,7 @@ def _judged(series: Series, model: Model, solution: Solution, determined: Bools)
     )
 
 
-def _gravity_part(series: Series, solution: Solution) -> Floats:
+def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
     """Return the sum of the estimated jumps of gravity before each rest [m/s^2], (n,)."""
     time = means_by(series.start, series.time)[series.start]
     result = np.zeros(len(series))

@@ -19,7 +19,7 @@ from ..text import counted
 from ..typing import Floats, Ints
 from ..unit.calibration import Calibration
 from .ageing import Ageing
-from .series import Series
+from .series import RestSeries
 from .update import Update, update
 
 #: Largest RMS error that agrees with the claim, in claimed standard deviations.
@@ -122,7 +122,7 @@ class Watch:
         return f'{front}{np.datetime64(self.last, "D") + np.timedelta64(int(days), "D")}'
 
 
-def watch(series: Series, calibration: Calibration, tolerance: float | None = None) -> Watch:
+def watch(series: RestSeries, calibration: Calibration, tolerance: float | None = None) -> Watch:
     """
     Compare rests with the claimed sd, or with a tolerance of ``|f| - g`` [m/s^2], and forecast the
     time until the error of the unit exceeds the limit.
@@ -229,7 +229,7 @@ def _forecasts(
 
 
 def _rows(
-    series: Series, labels: Floats, ordered: Sequence[str], tolerance: float | None
+    series: RestSeries, labels: Floats, ordered: Sequence[str], tolerance: float | None
 ) -> tuple[Row, ...]:
     rows = []
     for name in ordered:

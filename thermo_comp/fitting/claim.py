@@ -31,7 +31,7 @@ from .hyperparameters import CLEAR_GAIN, log_density, log_student
 from .initial_triad import within_positions
 from .jackknife import jackknife_covariance
 from .layout import Layout
-from .regression import Posterior, Regression
+from .regression import PosteriorMode, Regression
 from .unknowns import InformativePrior, Prior, State
 from .windows import CURVE, LAGS, PART
 
@@ -60,7 +60,7 @@ class Claim:
 
 def claim_of(
     regression: Regression,
-    chosen: Posterior,
+    chosen: PosteriorMode,
     candidates: Floats | None = None,
     gravity_sd: float = 0.0,
     known_offset_sd: float = 0.0,
@@ -110,7 +110,7 @@ def claim_of(
 
 
 def _over_offsets(
-    regression: Regression, posterior: Posterior, offset_sd: float, known_sd: float
+    regression: Regression, posterior: PosteriorMode, offset_sd: float, known_sd: float
 ) -> tuple[Floats, float, float]:
     """
     Return the covariance of the unit's unknowns by the mixtures over the sd of the offsets of
@@ -175,7 +175,7 @@ def _places(layout: Layout, widened: Layout) -> Ints:
 
 
 def _widened(
-    regression: Regression, posterior: Posterior, candidates: Floats, of_means: State | None
+    regression: Regression, posterior: PosteriorMode, candidates: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
     """
     Return layout and covariance, with the columns that the data do not determine.
@@ -210,7 +210,7 @@ def _with_curve(regression: Regression, state: State, of_means: State) -> State:
     return replace(of_means, weights=np.where(is_of_means, of_means.weights, state.weights))
 
 
-def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) -> Prior:
+def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floats) -> Prior:
     """
     Add columns that the data do not determine to the prior, so that their variance is not 0.
 
@@ -261,7 +261,7 @@ def _with_unseen(regression: Regression, posterior: Posterior, typical: Floats) 
 
 
 def _over_mountings(
-    regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
+    regression: Regression, posterior: PosteriorMode, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
     """
     Return the covariance of the unit's unknowns, and the RMS of the offset sd [m/s^2], by a
@@ -270,7 +270,7 @@ def _over_mountings(
     prior, mounting = posterior.prior, regression.windows.mounting
     n_rests = len(mounting) / (mounting[-1] + 1)
 
-    def solved(offset_sd: Floats) -> list[Posterior]:
+    def solved(offset_sd: Floats) -> list[PosteriorMode]:
         return [
             regression.solve(posterior.state, replace(prior, offset_sd=float(sd)), n_steps=1)
             for sd in offset_sd
@@ -292,7 +292,7 @@ def _over_mountings(
 
 
 def _over_turn_ons(
-    regression: Regression, posterior: Posterior, tried: Floats, log_density: Floats
+    regression: Regression, posterior: PosteriorMode, tried: Floats, log_density: Floats
 ) -> tuple[Floats, float]:
     """
     Return the covariance of the mixture of fits over the sd of turn-on offsets, and the mean
@@ -310,7 +310,7 @@ def _over_turn_ons(
 
 
 def _mixture(
-    posterior: Posterior, fits: Sequence[Posterior], log_weight: Floats
+    posterior: PosteriorMode, fits: Sequence[PosteriorMode], log_weight: Floats
 ) -> tuple[Floats, Floats]:
     """
     Return the covariance of the unit's unknowns by a mixture of fits, about the mode of the
@@ -328,7 +328,7 @@ def _mixture(
 
 
 def _excess_over_priors(
-    regression: Regression, posterior: Posterior, informative: Sequence[InformativePrior]
+    regression: Regression, posterior: PosteriorMode, informative: Sequence[InformativePrior]
 ) -> Floats:
     """
     Return the excess of the covariance of a mixture of fits over that of the most probable fit.
@@ -354,7 +354,7 @@ def _excess(covariance: Floats, other: Floats) -> Floats:
     return np.asarray(root @ root.T)
 
 
-def _of_turn_on(regression: Regression, posterior: Posterior) -> Floats:
+def _of_turn_on(regression: Regression, posterior: PosteriorMode) -> Floats:
     """
     Return the covariance of the unit's unknowns due to a bias offset of unit variance on each axis
     that all positions share, shape (n_unit, n_unit).
@@ -365,7 +365,7 @@ def _of_turn_on(regression: Regression, posterior: Posterior) -> Floats:
 
 
 def _norm_evidence(
-    regression: Regression, posterior: Posterior, offset_sd: Floats, by_drifts: Floats
+    regression: Regression, posterior: PosteriorMode, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
     Return the log evidence of the mountings' mean norms for k sds of mounting offsets, shape (k,).

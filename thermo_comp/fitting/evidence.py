@@ -23,7 +23,7 @@ from ..unit.provenance import GroupEvidence
 from .equations import as_vector
 from .gains import log_bayes_factors
 from .left_out import Score
-from .regression import Posterior, Regression
+from .regression import PosteriorMode, Regression
 from .selection import Fit
 from .unknowns import Noise, State
 from .windows import CURVE, SET
@@ -115,7 +115,7 @@ def left_out_error(score: Score, gravity: float | Floats) -> Floats:
     return np.asarray(np.where(np.isfinite(norm), norm, drift))
 
 
-def _with_only(regression: Regression, chosen: Posterior, groups: tuple[str, ...]) -> State:
+def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str, ...]) -> State:
     """Repeat the fit with the given groups only, under an almost flat prior of their weights."""
     only = np.isin(regression.windows.groups, groups)
     # The residuals of a model with few groups are mostly model error, which slow noise or mounting
@@ -151,7 +151,7 @@ def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[Posi
     return tuple(result)
 
 
-def group_evidence(regression: Regression, posterior: Posterior) -> tuple[GroupEvidence, ...]:
+def group_evidence(regression: Regression, posterior: PosteriorMode) -> tuple[GroupEvidence, ...]:
     """
     Return RMS contribution, effective parameters and log Bayes factor of each active group.
 

@@ -31,7 +31,7 @@ from ..typing import Bools, Floats, Ints
 from .equations import as_vector
 from .gains import log_bayes_factors
 from .initial_triad import white_noise_of
-from .regression import Posterior, Regression
+from .regression import PosteriorMode, Regression
 from .unknowns import POSE_SD, Noise, Prior, State, Windows
 from .windows import LAGS, PRODUCTS
 
@@ -65,7 +65,7 @@ class Candidates:
 
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
-) -> Posterior:
+) -> PosteriorMode:
     """Iterate all prior sd and noises until the logarithm of each changes by less than 0.05."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
@@ -77,7 +77,7 @@ def settle(
 
 
 def _updated(
-    regression: Regression, posterior: Posterior, candidates: Candidates
+    regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
     """Move all prior sd and noises towards their modes; return also the largest log ratio."""
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
@@ -137,7 +137,7 @@ def _updated(
     ), max(changes)
 
 
-def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
+def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> tuple[float, float]:
     """
     Move the sd of the supports' tilts towards the mode; return also a third of the change of its
     logarithm. `kelvins`: RMS of the board temperature about the reference [K]
@@ -155,7 +155,7 @@ def _tilt_sd(posterior: Posterior, kelvins: float) -> tuple[float, float]:
     return float(sd * np.exp(step)), float(np.abs(step)) / 3.0
 
 
-def _pose_sd(posterior: Posterior) -> tuple[float, float]:
+def _pose_sd(posterior: PosteriorMode) -> tuple[float, float]:
     """
     Move the sd of the attitudes about their poses towards the mode; return also the change of the
     logarithm of the sd.
@@ -184,7 +184,7 @@ def _toward(
     return np.asarray(np.clip(gradient / curvature, -2.0, 2.0))
 
 
-def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, float]:
+def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> tuple[float, float]:
     """
     Move the sd of the offsets of mountings or turn-ons, the unknowns at `places`, towards the mode
     under a half-Student prior; return also the change of log sd, or 0 if the data do not determine
@@ -204,7 +204,7 @@ def _offset_sd(posterior: Posterior, sd: float, places: Ints) -> tuple[float, fl
     return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
 
 
-def log_density(posterior: Posterior) -> float:
+def log_density(posterior: PosteriorMode) -> float:
     """
     Return the log evidence plus the log prior density of the sd of mountings, turn-ons and poses,
     and of the ageing since a prior calibration.
@@ -225,7 +225,7 @@ def log_student(x: Floats) -> Floats:
     return np.asarray(-0.5 * (STUDENT_NU + 1.0) * np.log1p(x**2 / STUDENT_NU))
 
 
-def white_noise(regression: Regression, posterior: Posterior) -> Floats:
+def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
     """Return the white noise of each axis from residuals and effective parameters, (3,)."""
     n = len(regression.weight)
     determined, layout = posterior.determined, posterior.layout
@@ -247,8 +247,8 @@ def white_noise(regression: Regression, posterior: Posterior) -> Floats:
 
 
 def with_slow_noise(
-    regression: Regression, posterior: Posterior, candidates: Candidates
-) -> Posterior:
+    regression: Regression, posterior: PosteriorMode, candidates: Candidates
+) -> PosteriorMode:
     """Estimate slow noise from the residuals, then by log evidence; repeat the fit with it."""
     prior = posterior.prior
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
@@ -256,7 +256,7 @@ def with_slow_noise(
     if estimated == prior.noise:
         return posterior
 
-    def with_noise(noise: Noise) -> Posterior:
+    def with_noise(noise: Noise) -> PosteriorMode:
         trial = replace(prior, noise=noise)
         for _ in range(2):
             fitted = regression.solve(posterior.state, trial, n_steps=1)
@@ -274,8 +274,8 @@ def with_slow_noise(
 
 
 def _likeliest(
-    with_noise: Callable[[Noise], Posterior], shows: Callable[[float], bool], noise: Noise
-) -> Posterior:
+    with_noise: Callable[[Noise], PosteriorMode], shows: Callable[[float], bool], noise: Noise
+) -> PosteriorMode:
     """
     Search the variance ratio and the correlation time of the largest log evidence, beginning at
     `noise`, in steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
@@ -298,8 +298,8 @@ def _likeliest(
 
 
 def pruned_fit(
-    regression: Regression, posterior: Posterior, candidates: Candidates, rounds: int = 25
-) -> Posterior:
+    regression: Regression, posterior: PosteriorMode, candidates: Candidates, rounds: int = 25
+) -> PosteriorMode:
     """Drop columns as long as each removal lowers the log evidence by less than `LEAST_GAIN`."""
     while True:
         prior = _pruned(regression, posterior, candidates)
@@ -311,7 +311,7 @@ def pruned_fit(
         posterior = smaller
 
 
-def _pruned(regression: Regression, posterior: Posterior, candidates: Candidates) -> Prior:
+def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candidates) -> Prior:
     """
     Drop columns with a log Bayes factor below `LEAST_GAIN`, one at a time, the smallest first;
     after each removal the Bayes factors of the other columns are calculated again.
@@ -354,7 +354,7 @@ def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
     return np.asarray(is_lag & is_single[:, np.newaxis])
 
 
-def downweigh(regression: Regression, posterior: Posterior) -> None:
+def downweigh(regression: Regression, posterior: PosteriorMode) -> None:
     """
     Reduce the weight of windows whose residual is more than 3 sd from the local median, so that
     the weighted distance becomes 3 sd.

@@ -18,10 +18,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..typing import Floats
-from .regression import Posterior, Regression
+from .regression import PosteriorMode, Regression
 
 
-def jackknife_covariance(regression: Regression, posterior: Posterior) -> Floats:
+def jackknife_covariance(regression: Regression, posterior: PosteriorMode) -> Floats:
     """
     Return the covariance of the unit's unknowns by the jackknife over the sections of the program,
     shape (n_unit, n_unit), or 0 if noise explains how the unknowns change without each section.

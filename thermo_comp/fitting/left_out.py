@@ -34,7 +34,7 @@ import numpy as np
 from ..typing import Floats, Ints
 from .elimination import inverse_root
 from .initial_triad import thermometer_error_of, white_noise_of
-from .regression import Point, Posterior, Regression
+from .regression import Point, PosteriorMode, Regression
 from .settled_bias import settled_error
 from .unknowns import State
 
@@ -245,7 +245,7 @@ def _gains(before: Score, after: Score) -> list[tuple[float, float] | None]:
     return [b.gain_of(a) for b, a in zip(before.kinds, after.kinds, strict=True)]
 
 
-def score_of(regression: Regression, posterior: Posterior) -> Score:
+def score_of(regression: Regression, posterior: PosteriorMode) -> Score:
     """Score a model on left-out positions, sections and halves of the program."""
     regression.whiten(posterior.prior.noise)
     last = int(regression.windows.section.max())
@@ -267,7 +267,7 @@ def score_of(regression: Regression, posterior: Posterior) -> Score:
 
 
 def _by_positions(
-    regression: Regression, posterior: Posterior
+    regression: Regression, posterior: PosteriorMode
 ) -> tuple[Folds, Folds, Floats, Floats]:
     """Leave out each mounting; return folds of drift and norm, corrected force, and drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
@@ -304,7 +304,7 @@ def _mean(values: Floats, weights: Floats) -> Floats:
 def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     """
     Return the state after a Gauss-Newton step of the unit's unknowns with the normal equations
-    `matrix` instead of those of `point`, and the root of the unit's covariance, see `Posterior`.
+    `matrix` instead of those of `point`, and `PosteriorMode.root`, the root of the covariance.
     """
     step, factor = point.unit_step(matrix)
     step = np.pad(step, (0, point.layout.n - point.layout.n_unit))
@@ -319,8 +319,13 @@ def _is_determined(by_others: float, by_all: float) -> bool:
     return by_others < 10.0 * by_all
 
 
-def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows: slice) -> bool:
-    """Whether a fit without a position determines its drift in `rows`; `root`: see `Posterior`."""
+def _is_drift_determined(
+    point: Point, posterior: PosteriorMode, root: Floats, rows: slice
+) -> bool:
+    """
+    Whether a fit without a position, with the covariance ``root @ root.T`` of the unit, determines
+    the drift of the position, whose windows are `rows`.
+    """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True
@@ -337,8 +342,11 @@ def _is_drift_determined(point: Point, posterior: Posterior, root: Floats, rows:
     return _is_determined(by_others, by_all + noise)
 
 
-def _is_norm_determined(point: Point, posterior: Posterior, root: Floats, p: int) -> bool:
-    """Whether a fit without position `p` determines the norm of `p`; `root`: see `Posterior`."""
+def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
+    """
+    Whether a fit without position `p`, with the covariance ``root @ root.T`` of the unit,
+    determines the norm of `p`.
+    """
     if not point.regression.gravity:
         return False
     along = point.norms_by_unit[p]
@@ -350,7 +358,7 @@ def _is_norm_determined(point: Point, posterior: Posterior, root: Floats, p: int
 
 def _by_sections(
     regression: Regression,
-    posterior: Posterior,
+    posterior: PosteriorMode,
     folds: Sequence[Ints] | Ints,
     *,
     n_steps: int = 1,

@@ -20,13 +20,13 @@ from ..errors import FitError
 from ..typing import Floats
 from ..unit.calibration import Calibration, parameter_layout
 from ..unit.nonlinearity import POWERS, Kind, Nonlinearity, NonlinearTerm, linearised, unit_of
-from ..unit.posterior import Posterior as FilePosterior
+from ..unit.posterior import Posterior
 from .data_checks import Finding, advice
 from .hyperparameters import CLEAR_GAIN, LEAST_GAIN
 from .left_out import Score, score_of
 from .options import FitOptions
 from .reduction import ReducedBag
-from .regression import Posterior, Regression
+from .regression import PosteriorMode, Regression
 from .selection import Selected
 from .unknowns import State
 from .windows import ThermalWindows
@@ -168,7 +168,7 @@ class _TermFits:
         self._n_kinds = len(sd) // 2
         self.posterior, self.score = cache(self._posterior), cache(self._score)
 
-    def _posterior(self, used: _Active) -> Posterior:
+    def _posterior(self, used: _Active) -> PosteriorMode:
         is_used = np.isin(np.arange(len(self._sd)), list(used))
         prior = replace(self._begin.prior, nonlinear_sd=self._sd * is_used)
         return self._regression.solve(self._begin.state, prior)
@@ -293,7 +293,7 @@ def with_blank(calibration: Calibration, options: FitOptions) -> Calibration:
     return replace(
         calibration,
         nonlinearity=Nonlinearity(near, options.nonlinear_sd('square'), terms),
-        posterior=FilePosterior.of(factor, variances),
+        posterior=Posterior.of(factor, variances),
     )
 
 
@@ -303,7 +303,7 @@ def without_terms(calibration: Calibration) -> Calibration:
     if posterior is not None:
         rows = np.arange(layout.nonlinear, layout.misalignment)
         kept = np.delete(posterior.matrix, rows, axis=0), np.delete(posterior.variances, rows)
-        posterior = FilePosterior.of(*kept)
+        posterior = Posterior.of(*kept)
     return replace(calibration, nonlinearity=None, posterior=posterior)
 
 

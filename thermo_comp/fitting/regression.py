@@ -32,7 +32,7 @@ from .unknowns import Prior, State
 
 
 @dataclass(frozen=True)
-class Posterior:
+class PosteriorMode:
     """
     The Gaussian approximation of the posterior at its mode.
 
@@ -259,7 +259,7 @@ class Point:
                 break
         return result
 
-    def posterior(self, end: Point) -> Posterior:
+    def posterior(self, end: Point) -> PosteriorMode:
         """Return the posterior at the mode `end`, with the covariance of the point `self`."""
         layout, prior, precision, reduced = self.layout, self.prior, self.precision, self.reduced
         _, factor = self.solution
@@ -279,7 +279,7 @@ class Point:
             of_prior += layout.start.shape[1] * float(np.log(prior.start_variance_ratio))
         log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
         evidence = -0.5 * (end.misfit + end.prior_misfit + log_hessian - of_prior)
-        return Posterior(
+        return PosteriorMode(
             *(prior, end.state, layout, determined, unit_root, variance, end.square, evidence)
         )
 
@@ -303,7 +303,7 @@ class Regression(Equations):
         tangent = self.tangent(state, layout, base)
         return tangent, tangent.normal(self.products_at(grams, state, base))
 
-    def solve(self, state: State, prior: Prior, n_steps: int = 6) -> Posterior:
+    def solve(self, state: State, prior: Prior, n_steps: int = 6) -> PosteriorMode:
         """Return the posterior after at most `n_steps` steps to the mode, or at `state` with 0."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
@@ -316,14 +316,14 @@ class Regression(Equations):
             point = end
         return point.posterior(point)
 
-    def step(self, state: State, prior: Prior) -> Posterior:
+    def step(self, state: State, prior: Prior) -> PosteriorMode:
         """Take one step towards the mode; the covariance is that of the equations before it."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
         end = point.stepped()
         return point.posterior(end if end.energy <= point.energy else point)
 
-    def inactive(self, posterior: Posterior, wanted: Bools) -> Inactive:
+    def inactive(self, posterior: PosteriorMode, wanted: Bools) -> Inactive:
         """Return the sparsity and quality factors of the inactive columns in the mask `wanted`."""
         point = self.at(posterior.state, posterior.prior)
         state, layout, sigma, n = point.state, point.layout, point.prior.sigma, point.layout.n_unit

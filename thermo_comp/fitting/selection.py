@@ -26,7 +26,7 @@ from .hyperparameters import (
     with_slow_noise,
 )
 from .left_out import Score, gain, is_better, is_near, is_undecided, is_worse_by_norms, score_of
-from .regression import Posterior, Regression
+from .regression import PosteriorMode, Regression
 from .unknowns import POSE_SD, InformativePrior, Prior, State
 from .windows import BEND, CURVE, LAGS, PART, PART_SUMS, PRODUCTS, SET, ThermalWindows
 
@@ -49,7 +49,7 @@ class Trial:
 
     groups: tuple[str, ...]
     score: Score
-    posterior: Posterior
+    posterior: PosteriorMode
     typical: Floats
     is_chosen: bool = False
     is_near: bool = False
@@ -68,7 +68,7 @@ class Selected:
     `informative`: the priors made of one calibration for several amounts of ageing.
     """
 
-    posterior: Posterior
+    posterior: PosteriorMode
     score: Score
     trials: tuple[Trial, ...]
     informative: tuple[InformativePrior, ...] = ()
@@ -98,7 +98,7 @@ class Fit(NamedTuple):
     of_means: State | None = None
 
     @property
-    def posterior(self) -> Posterior:
+    def posterior(self) -> PosteriorMode:
         """The fit of the chosen model."""
         return self.selected.posterior
 
@@ -382,7 +382,7 @@ def fit_all(
 
 def finish(
     regression: Regression, chosen: Trial, candidates: Candidates
-) -> tuple[Posterior, Score]:
+) -> tuple[PosteriorMode, Score]:
     """
     Complete the chosen model: reduce the weights of outliers, drop columns of little evidence, try
     a large sd of mounting offsets, and try slow noise.

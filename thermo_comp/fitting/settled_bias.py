@@ -12,14 +12,14 @@ from __future__ import annotations
 import numpy as np
 
 from ..typing import Floats
-from .regression import Posterior, Regression
+from .regression import PosteriorMode, Regression
 
 # Number of windows that are sufficient to compute the RMS, over the windows, of the bias sd.
 _N_WINDOWS = 500
 
 
 def settled_error(
-    regression: Regression, posterior: Posterior, excess: float, settled: Floats
+    regression: Regression, posterior: PosteriorMode, excess: float, settled: Floats
 ) -> float:
     """
     Return the expected error of the settled bias [m/s^2]; infinite for a model without a curve.
@@ -40,7 +40,7 @@ def settled_error(
     return float(np.hypot(sd, excess * growth))
 
 
-def _sd_of_changes(posterior: Posterior, columns: Floats) -> float:
+def _sd_of_changes(posterior: PosteriorMode, columns: Floats) -> float:
     """Return the RMS, over axes and rows of columns (k, m), of the sd of the bias [m/s^2]."""
     parts = posterior.layout.by_weights(columns, np.zeros(3))
     square = sum(float(np.sum((part @ posterior.root[at]) ** 2)) for part, at in parts)

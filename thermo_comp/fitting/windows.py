@@ -20,7 +20,7 @@ from ..errors import FitError
 from ..thermal.lags import Lag, MemorySpec, start_covariance
 from ..thermal.memory import memory_on_grid
 from ..thermal.settings import DetectorSettings, ThermalConfig
-from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Gradient, Layout
+from ..thermal.state import BOARD, GRADIENT, RATE, VAR_BOARD, WEIGHT, Gradient, StateLayout
 from ..thermal.tracker import ThermalTracker
 from ..typing import Bools, Floats, Ints
 from ..unit.columns import Column, ColumnTable, Part, memory_of
@@ -308,7 +308,7 @@ def _windows(
             np.eye(3, dtype=bool)[curves.axis],
         )
         acts_on = np.vstack((of_sets, acts_on, of_parts))
-    n_curves, lags = len(groups), Layout(spec).lags
+    n_curves, lags = len(groups), StateLayout(spec).lags
     t, gradient = rows.thermal[:, 0] - model.reference_temperature, rows.thermal[:, 4]
     # A support tilts linearly with the board and case temperatures, and with the square of the
     # case temperature.
@@ -355,7 +355,7 @@ def _settled(model: Model, spec: MemorySpec, rows: _Rows, table: ColumnTable) ->
     """
     board, is_static = rows.thermal[:, 0], rows.thermal[:, 3] <= 0.5
     some = is_static if is_static.any() else np.ones_like(is_static)
-    states = np.zeros((Layout(spec).width, _N_SETTLED))
+    states = np.zeros((StateLayout(spec).width, _N_SETTLED))
     states[BOARD] = np.linspace(board.min(), board.max(), _N_SETTLED)
     states[GRADIENT] = np.median(rows.thermal[some, 4])
     weight = np.zeros(_N_SETTLED)
@@ -397,7 +397,7 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
         # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.
-        still = np.zeros((2, Layout(spec).width))
+        still = np.zeros((2, StateLayout(spec).width))
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
         return Track(-1e9, 1e9 + end_s, still, np.ones(2, dtype=bool))
@@ -418,7 +418,7 @@ def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
     states = track.states
     grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
     # The lags of all grid points are computed at once, which is faster than reading by reading.
-    layout = Layout(spec)
+    layout = StateLayout(spec)
     gradients = [states[:, layout.places[Gradient(name)]] for name in spec.sensors]
     memory = memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)
     return grid, np.hstack((states, memory))

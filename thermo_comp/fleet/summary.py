@@ -15,7 +15,7 @@ import numpy as np
 from ..judging.evaluation import Drift
 from ..judging.verdicts import Verdict
 from ..typing import Bools, Floats
-from .table import COLUMNS, Column, Row, is_fitted
+from .table import COLUMNS, Row, TableColumn, is_fitted
 
 # Probability of one or more false outliers, and of one or more false drifts, in a fleet.
 _FALSE_ALARMS = 0.05
@@ -43,7 +43,7 @@ class Spread(NamedTuple):
     of the sd of the unit's value by its fit.
     """
 
-    quantity: Column
+    quantity: TableColumn
     names: tuple[str, ...]
     values: Floats
     is_counted: Bools
@@ -132,7 +132,7 @@ def summarise(rows: Sequence[Row], earlier: Sequence[Row] = ()) -> Summary:
     )
 
 
-def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
+def spread_of(quantity: TableColumn, rows: Sequence[Row]) -> Spread | None:
     """Measure the spread of a quantity over units; None if no unit determines the quantity."""
     columns = [name for name in (quantity.name, quantity.sd) if name]
     known = [row for row in rows if all(row[name] is not None for name in columns)]
@@ -154,7 +154,7 @@ def spread_of(quantity: Column, rows: Sequence[Row]) -> Spread | None:
     return Spread(quantity, names, values, is_counted, middle, sd, z)
 
 
-def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
+def _determined(quantity: TableColumn, values: Floats, own_sd: Floats) -> Bools:
     """
     Choose the units whose data determine a quantity: units are added in the order of the sd by
     their fits, until this sd exceeds five times the spread of the units chosen so far.
@@ -175,8 +175,8 @@ def _determined(quantity: Column, values: Floats, own_sd: Floats) -> Bools:
     return is_counted
 
 
-def _deviations(quantity: Column, values: Floats, middle: float) -> Floats:
-    """Return the deviations from the median, of values, in ppm or of logarithms (`Column.by`)."""
+def _deviations(quantity: TableColumn, values: Floats, middle: float) -> Floats:
+    """Return deviations from the median: of values, in ppm or of logarithms (`TableColumn.by`)."""
     if quantity.by == 'ppm':
         return (values / middle - 1.0) * 1e6
     if quantity.by == 'logarithm':

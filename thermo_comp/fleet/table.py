@@ -38,7 +38,7 @@ _FORMULA = ('=', '+', '-', '@')
 _LACKS = {'temperature', 'ramps', 'directions', 'misfit'}
 
 
-class Column(NamedTuple):
+class TableColumn(NamedTuple):
     """A column of the table: name, which includes the unit of measurement, kind, meaning."""
 
     name: str
@@ -131,7 +131,7 @@ def _places(name: str) -> dict[str, str]:
 
 
 COLUMNS = tuple(
-    Column(*(text.format(*place) for text in (*line, *_COMPARED.get(line[0], ()))))
+    TableColumn(*(text.format(*place) for text in (*line, *_COMPARED.get(line[0], ()))))
     for line in _TABLE
     for place in _places(line[0]).items()
 )

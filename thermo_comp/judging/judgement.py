@@ -18,7 +18,7 @@ from ..unit.gravity import MICRO_G, ug_text
 from ..unit.metrics import means_by
 from . import verdicts
 from .verdicts import Section, Sections, Verdict
-from .windows import Windows
+from .windows import JudgedWindows
 
 # Claimed sd above which a valid calibration is called wide [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
@@ -61,7 +61,7 @@ class Judgement:
     moved: tuple[str, ...]
     axis_rms: Floats
     n_positions: int
-    windows: Windows
+    windows: JudgedWindows
     rate: verdicts.RateJudgement | None
     by_force: dict[float, Section] = field(default_factory=dict)
 
@@ -116,7 +116,7 @@ class Judgement:
 
 
 def judge(
-    windows: Windows,
+    windows: JudgedWindows,
     calibration: Calibration,
     tolerance: float | None = None,
     *,
@@ -220,17 +220,19 @@ def _numbers(section: Section) -> str:
     return text
 
 
-def _windows(n: int, windows: Windows) -> str:
+def _windows(n: int, windows: JudgedWindows) -> str:
     return f'{counted(n, "window")} of {windows.window_s:g} s'
 
 
-def distinct_positions(windows: Windows) -> int:
+def distinct_positions(windows: JudgedWindows) -> int:
     """Count the directions of the force that are more than five degrees apart."""
     means = means_by(windows.position, windows.force)
     return len(distinct_directions(means / np.linalg.norm(means, axis=1, keepdims=True)))
 
 
-def axis_shifts(windows: Windows, misalignment_sd: tuple[float, ...]) -> tuple[AxisShift, ...]:
+def axis_shifts(
+    windows: JudgedWindows, misalignment_sd: tuple[float, ...]
+) -> tuple[AxisShift, ...]:
     """Fit shifts of bias, scale, misalignment to ``|f| = g``; none for fewer than 6 positions."""
     if distinct_positions(windows) < POSITIONS_NEEDED:
         return ()
@@ -277,7 +279,7 @@ def change_texts(shifts: tuple[AxisShift, ...]) -> tuple[str, ...]:
     return tuple(collected)
 
 
-def rms_by_axis(windows: Windows) -> Floats:
+def rms_by_axis(windows: JudgedWindows) -> Floats:
     """Return by regime and axis the RMS of the force less its mean in the position, (2, 3)."""
     about = within_positions(windows.force, windows.position)
     return np.array(

@@ -15,7 +15,7 @@ from ..unit.correction import Correction
 from ..unit.metrics import means_by, residual_statistics
 from ..unit.prediction import SlowUncertainty
 from ..unit.rate_bias import MILLIDEGREE
-from .windows import Windows
+from .windows import JudgedWindows
 
 #: Largest ratio of RMS error to claimed RMS at which a calibration is valid.
 LARGEST_RATIO = 2.0
@@ -90,7 +90,9 @@ class Sections(dict[str, Section]):
         return {name: {**asdict(part), 'ratio': part.ratio} for name, part in self.items()}
 
 
-def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats) -> Sections:
+def sections_of(
+    windows: JudgedWindows, raw: Floats, residual: Floats, claimed: Floats
+) -> Sections:
     """Summarise the residuals of windows, shape (n,) or (n, axes), by section."""
     inside, dynamic = windows.is_inside, windows.is_dynamic
     sections = Sections()
@@ -100,7 +102,7 @@ def sections_of(windows: Windows, raw: Floats, residual: Floats, claimed: Floats
     return sections
 
 
-def by_force(windows: Windows, claimed: Floats) -> dict[float, Section]:
+def by_force(windows: JudgedWindows, claimed: Floats) -> dict[float, Section]:
     """Summarise the residuals per known |f| [m/s^2]; empty if |f| is gravity in all windows."""
     if windows.is_usual.all():
         return {}
@@ -141,7 +143,7 @@ class RateJudgement:
         }
 
 
-def judge_rates(windows: Windows, calibration: Calibration) -> RateJudgement | None:
+def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgement | None:
     """
     Judge a gyroscope by windows at rest; return None without a gyroscope or angular rates.
 

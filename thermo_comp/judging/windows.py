@@ -20,7 +20,7 @@ from ..fitting.sensors import readings_in_order
 from ..online.checks import variance_along
 from ..online.compensator import Compensator
 from ..online.status import CompensatorConfig
-from ..thermal.state import BOARD, RATE, WEIGHT, Layout
+from ..thermal.state import BOARD, RATE, WEIGHT, StateLayout
 from ..typing import Bools, Floats, Ints, Stamps
 from ..unit.calibration import AXES, Calibration
 from ..unit.correction import Correction
@@ -38,9 +38,9 @@ _LEAST_FILLED = 0.9
 
 
 @dataclass(frozen=True)
-class Windows:
+class JudgedWindows:
     """
-    Windows at rest of all bags, in order; arrays of n rows.
+    JudgedWindows at rest of all bags, in order; arrays of n rows.
 
     A window lasts exactly `window_s` from `start_ns`; `time`: from the bag's first sample to the
     window's middle [s]; `count`, `mean`: number and mean of the window's raw samples. A position
@@ -77,7 +77,7 @@ class Windows:
     def __len__(self) -> int:
         return len(self.time)
 
-    def select(self, rows: Bools) -> Windows:
+    def select(self, rows: Bools) -> JudgedWindows:
         """Return the windows of some rows; all fields but `window_s` and `gravity` are arrays."""
         kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[2:]}
         return replace(self, **kept)
@@ -117,7 +117,7 @@ def corrected_windows(
     *,
     gravity: float | None = None,
     window_s: float = WINDOW_S,
-) -> Windows:
+) -> JudgedWindows:
     """
     Build the windows of bags, corrected if there is a calibration; raises RecordingError if the
     sample rate is too low for windows of `window_s`.
@@ -141,7 +141,7 @@ def corrected_windows(
         noise_sd = np.sqrt(mean_white)
         known = calibration.nonlinearity
         is_inside &= table['size'] <= (known.force_range_m_s2[1] if known else AT_REST * gravity)
-    return Windows(
+    return JudgedWindows(
         window_s=window_s,
         gravity=gravity,
         is_dynamic=table['weight'] > 0.5,
@@ -157,7 +157,7 @@ def corrected_windows(
     )
 
 
-def columns_of(windows: Windows, bags: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     """Return the columns of a table of windows."""
     force = windows.force.T
     return {
@@ -194,7 +194,7 @@ def _table(
     """Combine the partial sums of bags into windows, one per row."""
     n_gyro = 0
     if calibration is not None and calibration.gyroscope is not None:
-        n_gyro = 9 + Layout(Correction(calibration).memory).width
+        n_gyro = 9 + StateLayout(Correction(calibration).memory).width
     kind = np.dtype(
         [(name, np.int64) for name in _ONCE]
         + [(name, float) for name in (*_AVERAGED, 'excess')]

@@ -37,14 +37,14 @@ TWINS = (
 _MAX_LISTED = 20
 _MAX_SHOWN = 80
 
-_FIRST_STAMP_S = 1e8  # limits of a `Part` from this number on are stamps (the year 1973) [s]
+_FIRST_STAMP_S = 1e8  # limits of a `BagPart` from this number on are stamps (the year 1973) [s]
 
 #: Message type and number of messages of each topic of a bag.
 Present = Mapping[str, tuple[str, int]]
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class BagPart:
     """Part of a bag from `begin` to before `end`: times since the first sample, or stamps [s]."""
 
     begin: float | None = None
@@ -82,7 +82,7 @@ class Part:
         return '' if self == WHOLE else f'[{begin}:{end}]'
 
 
-WHOLE = Part()  # a whole bag
+WHOLE = BagPart()  # a whole bag
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +101,7 @@ class Topics:
     board: str = BOARD.name
     case: str = CASE.name
     further: Mapping[str, str] = field(default_factory=dict)
-    part: Part = WHOLE
+    part: BagPart = WHOLE
     input: Input = 'auto'  # 'auto' prefers counts to an Imu
 
     @classmethod

@@ -17,7 +17,7 @@ from ..fitting.sensors import learn_detector
 from ..judging.evaluation import Epoch, history_of, judge_bags
 from ..judging.judgement import Judgement
 from ..judging.verdicts import Verdict
-from ..judging.windows import WINDOW_S, Windows, corrected_windows, usual_window
+from ..judging.windows import WINDOW_S, JudgedWindows, corrected_windows, usual_window
 from ..replay import check_unit
 from ..text import counted
 from ..typing import Floats
@@ -57,8 +57,8 @@ class Evidence:
     The content of a report; missing parts are None or empty.
 
     `windows`: windows at rest of all bags; `judgement`: judgement of `windows`; `steps`: residuals
-    after each step of the model; `left_out`: for each `Windows.position` its RMS of ``|f| - g`` by
-    a fit to the other positions [m/s^2]; `findings`: reservations about calibration or bags;
+    after each step of the model; `left_out`: for each position of `windows` its RMS of ``|f| - g``
+    by a fit to the other positions [m/s^2]; `findings`: reservations about calibration or bags;
     `checks`: passed checks; `gravity_sd`: sd of gravity included in the covariance [m/s^2].
     """
 
@@ -66,7 +66,7 @@ class Evidence:
     calibration: Calibration | None = None
     gravity: float | None = None
     bags: tuple[ReducedBag, ...] = ()
-    windows: Windows | None = None
+    windows: JudgedWindows | None = None
     judgement: Judgement | None = None
     steps: tuple[ResidualRow, ...] = ()
     left_out: Mapping[int, float] = field(default_factory=dict)

@@ -48,7 +48,7 @@ class Gradient(Quantity):
     by_board = -1.0
 
 
-class Layout:
+class StateLayout:
     """
     Order of the numbers of a thermal state: BOARD to UNKNOWN, (value, variance) pairs, plays.
 

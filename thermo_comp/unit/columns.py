@@ -29,7 +29,7 @@ import numpy as np
 from ..quantities import QUANTITIES
 from ..thermal.lags import BOARD_INPUT, Lag, MemorySpec, Play
 from ..thermal.quantity import Quantity
-from ..thermal.state import BOARD, WEIGHT, Gradient, Layout, Rate
+from ..thermal.state import BOARD, WEIGHT, Gradient, Rate, StateLayout
 from ..typing import Floats
 from .functions import by_element, hold
 from .schema import check_ranges
@@ -292,7 +292,7 @@ class ColumnTable:
         reference_temperature: float,
         temperature_range_c: tuple[float, float] = UNBOUNDED,
     ) -> None:
-        layout = Layout(memory)
+        layout = StateLayout(memory)
         self.columns = tuple(columns)
         self._reference = reference_temperature
         lower, upper = temperature_range_c

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..thermal.lags import BOARD_INPUT, Lag, MemorySpec
-from ..thermal.state import BOARD, UNKNOWN, VAR_BOARD, WEIGHT, Layout
+from ..thermal.state import BOARD, UNKNOWN, VAR_BOARD, WEIGHT, StateLayout
 from ..typing import Floats
 from .calibration import Calibration
 from .columns import ColumnTable, memory_of
@@ -117,7 +117,7 @@ class Correction:
         """
         Find the columns that depend on each quantity of the state whose variance is propagated.
         """
-        self.layout = layout = Layout(self.memory)
+        self.layout = layout = StateLayout(self.memory)
         pair = np.array([layout.pairs.get(c.source, -1) for c in self.table.columns], np.int64)
         columns = np.argsort(pair, kind='stable')
         self._pair_columns = columns[pair[columns] >= 0]
@@ -177,8 +177,9 @@ class Correction:
 
     def by_pairs(self, slopes: Floats) -> Floats:
         """
-        Differentiate bias and relative scale w.r.t. the quantities of `Layout.pairs`, (p, 6, n),
-        given the derivatives of the columns phi w.r.t. these quantities, (n_columns, n).
+        Differentiate bias and relative scale w.r.t. the quantities of `StateLayout.pairs`, shape
+        (p, 6, n), given the derivatives of the columns phi w.r.t. these quantities, (n_columns,
+        n).
         """
         columns = self._pair_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ..thermal.lags import BOARD_INPUT, Lag, Play, start_root
-from ..thermal.state import BOARD, RATE, WEIGHT, Gradient, Layout, Rate
+from ..thermal.state import BOARD, RATE, WEIGHT, Gradient, Rate, StateLayout
 from ..typing import Floats
 from .calibration import Calibration, parameter_layout
 from .correction import Correction, memory_of_unit
@@ -245,7 +245,7 @@ def ramp_states(
     Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s];
     the gradient due to self-heating is `soak_gradient_k`.
     """
-    layout = Layout(memory_of_unit(calibration))
+    layout = StateLayout(memory_of_unit(calibration))
     states = np.zeros((len(temperature), layout.width))
     states[:, BOARD], states[:, WEIGHT] = temperature, float(rate != 0.0)
     gradient = calibration.board_lag_s * rate
@@ -264,7 +264,7 @@ def ramp_states(
 
 def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> None:
     """Add a constant change of the first sensor's gradient to thermal states, in place."""
-    layout = Layout(memory_of_unit(calibration))
+    layout = StateLayout(memory_of_unit(calibration))
     for quantity, place in layout.places.items():
         if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:
             states[:, place] += change_k
