@@ -46,7 +46,7 @@ class Rest:
     """
     A window of samples at rest. `stamp_ns`: stamp of the window's middle; `n`: number of samples;
     `mean`, `sd`: of the samples [input units]; `state`: mean thermal state, in the order of the
-    `thermal.state.Layout` of `Start.memory`; `shares`: fraction of the unknown initial state of
+    `StateLayout` of `Start.memory`; `shares`: fraction of the unknown initial state of
     each lag that has not yet decayed; `rate`: mean angular rate [rad/s], empty if unknown.
     """
 

@@ -231,7 +231,7 @@ class ThermalTracker:
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
         """
-        Thermal state at a stamp as a flat tuple, in the order of `state.Layout`; the board must
+        Thermal state at a stamp as a flat tuple, in the order of `StateLayout`; the board must
         have at least one reading. The variance of a gradient is that of the sensor, without the
         variance of the board temperature; the variance of a lag does not include the variance of
         the lag's unknown initial state.
