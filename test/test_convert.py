@@ -194,7 +194,7 @@ def test_every_row_with_a_fault_is_counted(tmp_path):
     # The bag contains clipped samples and samples in wrong order: the node rejects them.
     assert block.accel[:, 0].max() == 2.0 * STANDARD_GRAVITY
     assert (np.diff(block.accel_stamp_ns) < 0).sum() == 1
-    # Log times rise from row to row, also where stamps fall.
+    # Log times never fall from row to row, also where stamps fall.
     assert (np.diff(block.log_ns['accel']) >= 0).all()
 
 

@@ -153,7 +153,7 @@ def test_a_table_of_sections_is_read_as_begin_end_force_and_sd():
     assert parse_sections('49.05') == (Section(0.0, math.inf, 49.05, 0.0),)
     for wrong, said in (
         ('fast', 'expected numbers'),
-        ('1 2', 'and its sd smaller'),
+        ('1 2', 'must be above its sd'),
         ('5 3 10', 'must end after its begin'),
         ('1 2 3 4 5', 'one number in m/s'),
         ('nan', 'finite'),

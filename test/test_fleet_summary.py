@@ -20,7 +20,7 @@ MONDAY = datetime(2026, 1, 5)
 
 
 def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
-    """Draw a fleet of n units: normal (sizes: log-normal) quantities, or near those in `like`."""
+    """Draw n units: normal or, if compared by logarithm, log-normal; or `like` plus noise."""
     rows = []
     for i in range(n):
         cells = {}

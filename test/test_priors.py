@@ -246,8 +246,8 @@ def test_rests_at_one_temperature_correct_a_bias_change_and_keep_the_response():
 def after(change, ups):
     """
     Update the calibration of sibling 9 by rests of 10 min, whose counts are changed by a function
-    of counts and calibration. Return the change of the bias at 20 degC [m/s^2], its sd, the
-    relative change of the scale factor, and its sd, shape (4, 3).
+    of counts and calibration. Return the change of the bias at 20 degC and the sd of the new
+    bias [m/s^2], the relative change of the scale factor and the new relative sd, shape (4, 3).
     """
     old, day = fitted(9).calibration, parse_cyclogram('20 10min')
     records = arrays(sibling(KIND, 9, 0.15), [Position(day, up) for up in ups], 999)

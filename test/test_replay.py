@@ -196,7 +196,7 @@ def test_inputs_are_copied_unchanged(tmp_path):
     assert copies == messages
 
 
-def test_a_calibration_of_another_unit_is_refused_unless_the_user_states_the_serial(tmp_path):
+def test_a_calibration_of_another_unit_is_refused_unless_serial_names_it_or_is_empty(tmp_path):
     bag = thermal_test(tmp_path / 'bag', minutes=1.0, serial='T-2')
     calibration = rich_calibration()
     for serial in (None, 'T-2'):

@@ -74,7 +74,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
 
 
 def test_a_further_error_source_does_not_change_the_other_random_numbers(unit):
-    """Thermometer noise does not change counts; drift of the bias does not change their noise."""
+    """Thermometer noise does not change counts; drifts of the unit do not change their noise."""
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)
     assert np.all(noisy.board != plain.board)
@@ -108,7 +108,7 @@ def test_simulated_white_noise_has_the_stated_density(unit):
     frequency, power = welch(accel, fs=50.0, nperseg=16384, axis=0)
     # With a carried remainder, rounding noise rises with f^2; it is 1 (ug)^2/Hz at 0.4 Hz.
     band = (frequency > 0.01) & (frequency < 0.4)
-    # The mean of 128 lines, each a mean over 87 half-overlapping segments, is uncertain by 1 %.
+    # The mean of 128 lines, each a mean over 86 half-overlapping segments, is uncertain by 1 %.
     np.testing.assert_allclose(
         power[band].mean(axis=0), 2.0 * np.array(unit.noise_density) ** 2, rtol=0.05
     )

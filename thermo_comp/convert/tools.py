@@ -119,7 +119,7 @@ def _read_px4(text: str, number: int | None) -> Content | None:
         return None
     number = _choose(numbers, number, lambda n: values.has(f'TC_A{n}_X'))
     if values.get('TC_A_ENABLE', 1.0) != 1.0:
-        raise CalibrationError('is 0: the set is not in use', key='TC_A_ENABLE')
+        raise CalibrationError('is 0: PX4 uses no TC_A set', key='TC_A_ENABLE')
 
     def cubics(prefix: str) -> tuple[Floats, float, float, float]:
         bias = [[values[f'{prefix}X{p}_{axis}'] for p in range(4)] for axis in range(3)]

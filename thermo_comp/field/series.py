@@ -108,7 +108,7 @@ def read_rests(
     """
     Read the rest logs of a calibration's unit.
 
-    Returns the rests, the source of an update aged by `ahead` days, and notes for the user.
+    Returns the rests, the `Source` of an update whose claim is aged by `ahead` days, and notes.
 
     Rests before the date of the calibration are left out, unless all are. Rests used by an earlier
     update are left out only if `is_for_update`. Raises RecordingError if no rest remains.
@@ -171,7 +171,7 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Return an update's source, whose name has the time of the last rest and `ahead` [days]."""
+    """Return an update's `Source`; its name: time of the last rest, days of ageing after it."""
     end = np.datetime64(max(rest.stamp_ns for _, rest in rests), 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)

@@ -222,7 +222,7 @@ def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOp
     """
     Return the prior for the selection of the columns: the sds of bias and scale are five times the
     largest error of |f|, but 5 % to 100 % of those of `prior`. With wider priors, bias and scale
-    would take large values in a model that lacks effects, as few attitudes do not determine both.
+    would take large values in a model that lacks columns, as few attitudes do not determine both.
     """
     norms = np.linalg.norm(position_means(regression.windows) / regression.nominal_scale, axis=1)
     limit = 5.0 * float(np.abs(norms - regression.norms(state)).max())

@@ -184,7 +184,7 @@ def _section(begin_s: float, end_s: float, size: float, sd: float = 0.0) -> Sect
     # The limit 1e7 m/s^2, above the acceleration in a gun, detects typing errors.
     if not (0.0 < size < 1e7 and 0.0 <= sd < size):
         raise ValueError(
-            f'a specific force must be above 0 and its sd smaller, got {size:g} +- {sd:g} m/s^2'
+            f'a specific force must be above its sd and below 1e7 m/s^2, got {size:g} +- {sd:g}'
         )
     return Section(begin_s, end_s, size, sd)
 

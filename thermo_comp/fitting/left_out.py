@@ -246,7 +246,7 @@ def _gains(before: Score, after: Score) -> list[tuple[float, float] | None]:
 
 
 def score_of(regression: Regression, posterior: PosteriorMode) -> Score:
-    """Score a model on left-out positions, sections and halves of the program."""
+    """Score a model on left-out positions, sections and halves of the chamber program."""
     regression.whiten(posterior.prior.noise)
     last = int(regression.windows.section.max())
     numbers = np.arange(last + 1 if last else 0)

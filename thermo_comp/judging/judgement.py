@@ -194,8 +194,7 @@ def _verdict(judgement: Judgement, claims: bool, calibration: Calibration) -> tu
         parts.append(f'{ug_text(worst)} RMS {where}, limit {ug_text(tolerance)}')
     elif claims:
         parts.append(
-            f'largest ratio of RMS to claimed in a regime {ratio:.2g}, '
-            f'limit {verdicts.LARGEST_RATIO:g}'
+            f'largest ratio of RMS to claimed RMS {ratio:.2g}, limit {verdicts.LARGEST_RATIO:g}'
         )
     else:
         parts.append(

@@ -202,7 +202,7 @@ def _verdict(sections: Sections, window_s: float, claims: bool) -> tuple[Verdict
     ratio = sections.worst_ratio
     text = (
         f'{text}, {_mdeg(total.claimed_rms)} claimed {over}; '
-        f'largest ratio of RMS to claimed in a regime {ratio:.2g}, limit {LARGEST_RATIO:g}'
+        f'largest ratio of RMS to claimed RMS {ratio:.2g}, limit {LARGEST_RATIO:g}'
     )
     # At constant temperature the correction is constant, so a residual as large as the raw
     # residual is not a fault.

@@ -174,7 +174,7 @@ class Block:
 
     @property
     def n_messages(self) -> int:
-        """Number of messages of all roles."""
+        """Number of messages of the accelerometer and of all thermometers."""
         return sum(map(len, self.log_ns.values()))
 
     @property

@@ -276,7 +276,7 @@ def _pieces(compression: str, source: Any, limit: int, step: int) -> Iterator[by
 
 
 def _reader(compression: str, source: Any) -> Callable[[int], bytes]:
-    """Return a function that decompresses and returns the next n bytes, b'' at the end."""
+    """Return a function that decompresses and returns up to n further bytes, b'' at the end."""
     if compression == 'zstd':
         decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW)
         return decompressor.stream_reader(source, read_across_frames=True).read

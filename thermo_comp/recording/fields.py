@@ -161,7 +161,7 @@ class _Cursor:
         self._at = np.zeros(len(messages), np.int64)
         heads = number_at(gather(messages.data, messages.start, 2), 0, '>u2')
         if (messages.size < 4).any() or (heads > 1).any():
-            raise RecordingError('only plain CDR (0 or 1) is read')
+            raise RecordingError('only CDR of representation 0 or 1 is read')
         self._is_big = heads == 0
 
     def number(self, kind: str) -> Any:

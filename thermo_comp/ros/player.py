@@ -95,7 +95,7 @@ def opened_player(
 
 
 class Player:
-    """A node with the publishers of one bag."""
+    """A node with one publisher for each topic of a bag."""
 
     def __init__(self, node: Node, reader: RecordingReader, rate: float) -> None:
         self.node, self._reader, self._rate = node, reader, rate

@@ -54,9 +54,9 @@ class ChangeDetector:
         self._baseline_s = 0.5 * sensor.lag_s
         self._swing_memory_s = SWING_MEMORY_LAGS * sensor.lag_s
         self._rate_variance = (sensor.fastest_ramp_k_min / 60.0) ** 2
-        # Memory (1 / tracking frequency) of each filter [s]: the memory that detects the filter's
-        # acceleration soonest at readings of 1 Hz. The filter's memory determines the spectral
-        # density of the acceleration, which is used for any interval of readings.
+        # Memory (1 / tracking frequency) of each filter [s]: the memory that detects a second
+        # derivative ``share * onset`` of the temperature [K/s^2] soonest in readings at 1 Hz. The
+        # memory determines the spectral density of this derivative for any interval of readings.
         self._noise = sensor.noise_sd_c**2 + sensor.quantum_c**2 / 12.0
         onset = smallest_rate / sensor.lag_s
         memories = [

@@ -204,7 +204,8 @@ class ThermalMemory:
         still: Sequence[tuple[float, float]] = (),
     ) -> list[float]:
         """
-        Return each lag [K] and its `extra` variance [K^2], then each play less its input [K].
+        Return each lag [K] and its variance without that of its initial state [K^2], then each
+        play less its input [K].
 
         still: for each input the possible error of constant readings [K], and the time since their
             last change [s]; empty without constant readings

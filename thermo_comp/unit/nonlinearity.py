@@ -132,7 +132,7 @@ def unit_of(kind: Kind) -> float:
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of the result is (k2^2 + k3) times the cube of the correction: at 10 g, 1e-14 g with
+    error of the result is (k2^2 - k3) times the cube of the correction: at 10 g, 1e-14 g with
     k2 = 100 ug/g^2, and 1e-11 g with k3 = 10 ug/g^3.
     """
     r = k3 * x * x
