@@ -36,7 +36,7 @@ def test_a_degenerate_input_ends_with_a_sentence_in_bounded_memory(name, command
         ('stamps all zero', 'all samples are stamped 0 s: the driver does not stamp them'),
         ('worn on a wrist', 'as if worn or driven, but must rest in each position'),
         ('a drive in a car', 'worn, driven or shaken?'),
-        ('axes not orthogonal', 'the angle between two of the axes is less than 60 degrees'),
+        ('axes not orthogonal', 'the angle between two of the axes is some 60 degrees or less'),
     ],
 )
 def test_the_message_of_a_refusal_names_its_cause(name, text, tmp_path, cli):

@@ -54,7 +54,7 @@ def test_a_fit_with_large_mounting_offsets_must_not_increase_left_out_norms():
     # hour) to scale factors: its evidence was larger, but its error was 5 mg.
     def trial(norm, log_evidence):
         posterior = SimpleNamespace(
-            prior=SimpleNamespace(offset_scale=0.0),
+            prior=SimpleNamespace(offset_scale=0.0, informative=None),
             layout=SimpleNamespace(pose=np.zeros(0)),
             log_evidence=log_evidence,
         )

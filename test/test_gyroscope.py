@@ -196,7 +196,9 @@ def test_the_message_on_a_wrong_gyroscope_names_the_key():
         with pytest.raises(CalibrationError, match=said):
             parse_calibration(text.replace(old, new).encode())
     gyro = rich_calibration().gyroscope
-    with pytest.raises(ValueError, match=r'`posterior\.rest` must have one number per parameter'):
+    with pytest.raises(
+        ValueError, match=r'`posterior\.diagonal` must have one number per parameter'
+    ):
         replace(gyro, response=gyro.response[1:])
     with pytest.raises(ValueError, match='`bias_function` must be 0 at the reference, got 1'):
         RateCurve(Polynomial((1.0, 2.0)))

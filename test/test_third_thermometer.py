@@ -62,7 +62,7 @@ def record(path, run):
 
 def fitted(bags):
     sources, _ = fit_sources(bags)
-    # These groups, a sixth of all columns, suffice, because the effect of the lid has no lag.
+    # These groups suffice, because the effect of the lid has no lag.
     groups = ('curve', 'gradient', 'board')
     return fit(sources, FitOptions(gravity=STANDARD_GRAVITY, groups=groups)).calibration
 

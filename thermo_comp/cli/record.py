@@ -199,7 +199,7 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print each change of the account since the last call on a line; `last`: printed texts."""
+    """Print a line for each text of the account that is not yet in `last`, and put it there."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)

@@ -370,7 +370,7 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
         # If the positions determine the misalignment, these samples are not those of a triad.
         kind = FitError if data_checks.determines_misalignment(up) else UndeterminedError
         return kind(
-            'in the fit the angle between two of the axes is less than 60 degrees, which no '
+            'in the fit the angle between two of the axes is some 60 degrees or less, which no '
             'accelerometer has: is the topic that of the accelerometer, do all positions have the '
             'same order and signs of the axes, and are there at least 9 positions?'
         )

@@ -28,7 +28,7 @@ from ..typing import Floats
 from .reduction import ReducedBag
 from .sources import angular_velocity
 
-# Shortest time [s] and smallest number of samples, before or after a gap, for a mean level.
+# Shortest time [s] and smallest number of samples for the mean level before or after a gap.
 _MARGIN_S, _MARGIN_SAMPLES = 10.0, 120
 # Smallest number of samples before a step, and after it, for a test of the step.
 _FEWEST_SAMPLES = 8

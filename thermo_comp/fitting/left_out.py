@@ -178,8 +178,8 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     Return the gain of the model of `after` over that of `before` if it is significant, else 0.
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
-    sections. If the drifts of both models are equal, the gain is the log ratio of the norms of
-    left-out positions, which must exceed two standard errors. `by_halves`: whether an increased
+    sections. If the drifts of both models are equal, the gain is the log ratio of the errors of
+    left-out norms, if it exceeds two standard errors. `by_halves`: whether an increased
     error of left-out halves of the program, a sign of too many columns, excludes a gain.
     """
     *drifts, norms = _beyond_thermometer(before, after)

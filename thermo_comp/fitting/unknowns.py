@@ -99,7 +99,7 @@ class Windows:
 
     @cached_property
     def share(self) -> Floats:
-        """Prior sd of weights / `Prior.column_sd`: 1, or 1e-6 if not in `acts_on`, (3, m)."""
+        """Prior sd of weights / `Prior.column_sd`: 1, or 1e-6 on axes not in `acts_on`, (3, m)."""
         acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(acts.T, 1.0, 1e-6)
 

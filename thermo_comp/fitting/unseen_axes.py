@@ -93,8 +93,8 @@ def judge_unseen_axes(fit: Fit, known: Calibration | None) -> list[Finding]:
 def _known_ranges(fit: Fit, known: Calibration | None) -> Floats:
     """
     Return the range of board temperature of each axis without an added error of its scale factor,
-    shape (2, 3) [degC]. The range is infinite for an axis along which no position has gravity,
-    because the fit's prior covariance of its scale factor includes the error.
+    shape (2, 3) [degC]. The range is infinite for an axis along which no position has gravity:
+    its scale factor keeps the sd of the prior, which includes the error.
     """
     lower, upper = _seen(fit, known)
     reach = FREE_RANGE_SHARE * (upper - lower)

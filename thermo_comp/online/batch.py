@@ -34,7 +34,7 @@ _TOO_FAST, _REFUTED = _REASONS['n_too_fast'], _REASONS['n_refuted']
 PIECE: Final = 4096
 #: Indices in the result of `corrected`: force x, y, z, then the whole covariance matrix.
 _COLUMNS: Final = (0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8)
-#: The rows of `_COLUMNS` that are force x, y, z and covariance xx, xy, xz, yy, yz, zz.
+#: Places in `_COLUMNS` of force x, y, z and covariance xx, xy, xz, yy, yz, zz.
 _SAMPLE = [0, 1, 2, 3, 4, 5, 7, 8, 11]
 
 
@@ -277,7 +277,7 @@ def _judge(
     looks = zip(segments, first.tolist(), stamps[first].tolist(), rows, strict=True)
     held = _REFUTED if compensator.is_refusing else 0
     for (segment, count), begin, stamp_ns, row in looks:
-        # The first sample of a new segment is checked even if it is not published.
+        # The check of |f| uses the first sample of a new segment even if it is not published.
         is_bad = bool(reasons[begin])
         if segment.is_too_fast:
             held = _TOO_FAST

@@ -190,7 +190,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     ) -> None:
         stamps = _as_times('stamp_ns', stamp_ns)
         if len(stamps) and int(np.max(stamps)) >= STAMP_END_NS:
-            raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))}')
+            raise ValueError(f'`stamp_ns` must be below 2**31 s, got {int(np.max(stamps))} ns')
         times = stamps if log_ns is None else _as_times('log_ns', log_ns, len(stamps))
         pieces = []
         for at, name, values, width in columns:

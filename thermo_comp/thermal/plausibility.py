@@ -113,7 +113,7 @@ class SensorCheck:
         self._first: list[tuple[int, float]] | None = []
 
     def forget_other(self) -> None:
-        """Forget the other sensor's change, because readings of a sensor were wrong."""
+        """Measure the other sensor's temperature change anew: readings of either were wrong."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:

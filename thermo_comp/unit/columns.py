@@ -214,8 +214,8 @@ def bank(
     columns += _family('square', ['cube'], lags=coarse)
     even = _family('gradient_even', ['gradient_even'], sensors, (0, 1, 2), widths=EVEN_WIDTHS)
     even += _family('gradient_even', ['size', 'square'], sensors, (0, 1, 2))
-    # The load of a heat pump is an even function of the heat flow; the effect of a temperature
-    # change is an even function of the gradient less its value at rest.
+    # The load of a heat pump is an even function of the gradient; an effect that is equal in
+    # heating and cooling is an even function of the gradient less its value at rest.
     rest = at_rest or {}
     columns += even + [
         replace(column, group='gradient_even_about_rest', rest_k=rest[column.sensor])

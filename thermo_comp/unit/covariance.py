@@ -38,7 +38,7 @@ BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
 N_ROWS: Final = len(_PAIRS)
 _FIRST, _SECOND = np.array(BETWEEN).T
 _OF_M: Final = [BETWEEN.index((u, u)) for u in (6, 7, 8)]
-#: Pairs of indices in (1, x, y, z) of the products in each of the elements xx, xy, xz, yy, yz, zz.
+#: Terms of the polynomials xx, xy, xz, yy, yz, zz: pairs of indices in (1, x, y, z).
 _TERMS: Final = [
     [(i, j) for i, j in combinations_with_replacement(range(4), 2) if i < first and j < second]
     for first, second in combinations_with_replacement((2, 3, 4), 2)

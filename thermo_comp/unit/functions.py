@@ -79,7 +79,10 @@ class _Family(ABC):
 
 @dataclass(frozen=True)
 class Polynomial(_Family):
-    """``c[0] + c[1] t + c[2] t^2 + ...`` (Eq. (10)): c[0] is 0 for a bias, 1 for a scale."""
+    """
+    ``c[0] + c[1] t + c[2] t^2 + ...``, t: board less reference temperature [K]; c[0] is 0 for a
+    bias, 1 for a scale (Eq. (10) of the paper).
+    """
 
     coefficients: Annotated[tuple[float, ...], QUANTITIES['coefficients']]
     kind: Literal['polynomial'] = 'polynomial'
@@ -179,8 +182,8 @@ class CubicSpline(_Family):
 @dataclass(frozen=True)
 class Exponential(_Family):
     """
-    ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``, whose value at the
-    reference temperature is 0 (bias) or 1 (scale). An e-fold [K], of any sign, is the change of
+    ``constant + sum_j amplitudes[j] exp(t / e_fold_k[j])``, t: board less reference temperature;
+    the value at t = 0 is 0 (bias) or 1 (scale). An e-fold [K], of any sign, is the change of
     temperature that multiplies a term by e.
     """
 

@@ -34,7 +34,7 @@ class GroupEvidence:
 
 @dataclass(frozen=True)
 class Source:
-    """One bag of the data of a fit, or a rest log of an update."""
+    """One bag of a fit, or all rest logs of an update."""
 
     name: str
     sha256: str = ''
