@@ -96,7 +96,7 @@ BOUNDS = """\
 
 Each number in a calibration is one of the quantities in the table. The bounds are wider than any instrument needs; a
 calibration within these bounds gives finite results and a positive definite covariance. Further bounds depend on the full
-scale of the unit. The bias including its curve must stay within twice the full scale over the whole temperature range. The
+scale of the unit. The bias at the reference temperature, and its change, must each be within twice the full scale. The
 largest contribution of a column, and of one standard deviation of a parameter, must stay within a million times twice the
 full scale. The relative scale including the largest contributions of all columns must stay between 0.1 and 10.
 """

@@ -173,7 +173,7 @@ def test_diagnostics_name_faults_of_samples(peer, saved):
             driver.counts(stamp_ns, x, y, z)
         _, status, values = wait(lambda _, values: values['saturated'] == '2')
         assert status.level == DiagnosticStatus.ERROR
-        assert 'samples saturated (+-32767), dropped: 2' in status.message
+        assert 'samples saturated (full scale 32767), dropped: 2' in status.message
         assert 'samples not finite, dropped: 1' in status.message
         assert (values['samples in'], values['samples out']) == ('4', '1')
         assert values['sample stamp [ns]'] == str(stamp_ns)

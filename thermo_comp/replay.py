@@ -51,7 +51,7 @@ class ReplayResult:
     output: Path
     counters: Counters
     n_flags: int
-    #: Stamp [ns] and value of the first regime flag, and of each flag unlike the flag before it.
+    #: Stamp [ns] and value of the first regime flag, and of each flag that differs from the last.
     switches: list[tuple[int, bool]]
     #: Warnings that the node would give: exchanged thermometers, temperatures outside the
     #: calibrated range.
@@ -92,7 +92,7 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
-    """Return the roles of the topics that a recording must have to be corrected."""
+    """Return the inputs that the correction of a recording needs: samples, board temperature."""
     needs_board = any(calibration.needs_temperature for calibration in calibrations)
     return ('accel', 'board') if needs_board else ('accel',)
 
@@ -249,7 +249,7 @@ def _rows_of(table: AbstractContextManager[WriteRows]) -> Iterator[WriteBlock]:
 
 
 def _imu_of(block: Block, corrected: CompensatedBlock) -> ImuColumns | None:
-    """Return the Imu fields except force; an angular rate with covariance -1 is not corrected."""
+    """Return the Imu fields except force; covariance[0] = -1: no angular rate to correct."""
     if block.imu is None:
         return None
     imu = block.imu.take(corrected.index)

@@ -38,6 +38,6 @@ def valid_serial(serial: str) -> str:
         shown = one_line(serial[:LONGEST_SERIAL])
         raise ValueError(
             f'`serial` must be one printable line of 1 to {LONGEST_SERIAL} characters, '
-            f"got {len(serial)}: '{shown}'"
+            f"got {len(serial)} characters: '{shown}'"
         )
     return serial

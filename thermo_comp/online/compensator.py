@@ -79,7 +79,7 @@ class CompensatorStatus:
     is_board_lost: bool = True
     is_case_lost: bool = True
     excess: Excess = Excess(0.0, 0.0, 0.0, 0.0)  # noqa: RUF009 - it is immutable
-    #: Whether the board temperature has changed before the case in a ramp: topics swapped?
+    #: Whether the board temperature changes before that of the case in a ramp: topics swapped?
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
     #: Whether |f| at rest differs from gravity by more than the tolerance: nothing is published.
@@ -234,7 +234,7 @@ class Compensator:
         self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
         if self.gravity.is_refuted and not is_too_fast:
-            # The gravity check uses samples dropped for |f|, too, so that it may accept |f| again.
+            # The check of |f| uses dropped samples, too, and so can let the output go on.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
@@ -308,7 +308,7 @@ class Compensator:
         is_same = self.calibration == model.calibration
         self._use(model.calibration)
         if is_same and self._gravity_settings == before:
-            # Only other settings have changed: a stop by the check of |f| persists.
+            # Calibration and tolerance of |f| are unchanged: keep the result of the check of |f|.
             self.gravity = gravity
         self.stuck = self._stuck_check()
         if self.stuck.limit_ns == stuck.limit_ns:

@@ -32,7 +32,7 @@ from .status import CompensatorConfig, Counters
 
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
-SLOW_NS: Final = 10_000_000_000  # time for which `SlowState`, and so its variance, is held [ns]
+SLOW_NS: Final = 10_000_000_000  # time for which a `SlowState` and its variance are used [ns]
 YOUNG_READINGS: Final = 30  # number of board readings that determine the board's rate
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
@@ -54,7 +54,7 @@ class Segment(NamedTuple):
     """A time interval with a linear correction, and the checks that apply to its samples."""
 
     start_ns: int
-    # False if an earlier call, or the block before, has opened this segment.
+    # False if an earlier call of `ThermalSide.segment` has returned this segment.
     is_new: bool
     is_too_fast: bool  # whether samples come faster than the converter can make them
     noise_excess: float  # relative excess of the noise variance because of the samples' rate
@@ -92,7 +92,7 @@ class Model:
 
 
 class ThermalSide:
-    """Queued readings, thermal state and segments, for single samples and for arrays."""
+    """The queue of readings, the thermal state and the segments of a compensator."""
 
     def __init__(self, model: Model, config: CompensatorConfig, counters: Counters) -> None:
         self.counters = counters
@@ -138,7 +138,7 @@ class ThermalSide:
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
         if self.calibration.unit == unit:
-            # A stop because of the sample rate persists while the unit is the same.
+            # For the same unit, output that was stopped by the check of the rate stays stopped.
             self.rate = rate
         self.queue.keep(lambda entry: entry[2] in self.inputs)
         is_same = self.calibration.detector == old.settings
@@ -250,7 +250,7 @@ class ThermalSide:
         return self._slow_rows
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
-        """Return the thermal state that determines the slowly varying variance for `SLOW_NS`."""
+        """Return the arguments of the slowly varying variance, new after each `SLOW_NS`."""
         # The unknown initial lag states depend on the board's rate, which the first readings after
         # a start do not show: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS

@@ -31,7 +31,8 @@ from .reader import LoadedCalibration
 from .relay import Relay
 from .waitloop import WaitLoop
 
-IDLE_S = 5.0  # time without samples until readings are used [s]; Fast DDS may deliver 3 s late
+# Time without samples until waiting readings are used [s]; Fast DDS may deliver samples 3 s late.
+IDLE_S = 5.0
 #: Readings stamped later than the samples by more than this time use another clock [s].
 AHEAD_S = 5.0
 #: Samples have stopped if the next sample is late by the larger of two times [cycles], [s].
@@ -49,7 +50,7 @@ _RISEN = {
     'n_stuck': (_ERROR, 'samples stuck or all zero, dropped'),
     'n_too_fast': (_ERROR, 'samples too fast for their conversion cycle, dropped'),
     'n_unsound': (_ERROR, 'samples without a finite correction, dropped'),
-    'n_saturated': (_ERROR, 'samples saturated (+-{full_scale:g}), dropped'),
+    'n_saturated': (_ERROR, 'samples saturated (full scale {full_scale:g}), dropped'),
     'n_not_finite': (_WARN, 'samples not finite, dropped'),
     'n_out_of_order': (_WARN, 'samples out of order, dropped'),
     'n_time_jumps': (_WARN, 'jumps of time backwards, estimators reset'),

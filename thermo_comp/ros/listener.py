@@ -30,12 +30,12 @@ _AS_OFFERED = QoSProfile(
 
 
 class LiveTopics:
-    """Receives the inputs of the compensating node, each topic once it has a publisher."""
+    """Receives the input topics of the compensating node; subscribes to published topics only."""
 
     def __init__(self, topics: Topics, ros_args: Sequence[str] = ()) -> None:
         self._topics, self._ros_args = topics, ros_args
         self._inputs: dict[Role, RawSubscription] = {}
-        #: Received messages: role, messages, times of reception [ns].
+        #: Received messages: 'accel' or thermometer, messages, times of reception [ns].
         self._received: list[tuple[Role, list[bytes], list[int]]] = []
         self._feeds: dict[Role, Topic] = {}
         self._fields: dict[Role, LiveField] = {}
@@ -72,7 +72,7 @@ class LiveTopics:
         return sum(topic.n_lost for topic in self._inputs.values())
 
     def blocks(self, wait: Callable[[float], bool]) -> Iterator[News | None]:
-        """Yield the received blocks, and None after each `wait` [s], until `wait` returns True."""
+        """Yield received blocks, and None after each call of `wait`, until `wait` is True."""
         is_over = False
         while not is_over:
             is_over = wait(BLOCK_S)

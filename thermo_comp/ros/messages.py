@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the step from the names of topics and types to rclpy: message classes, QoS profiles, readings.
+Owns rclpy's message classes and QoS profiles by name, and numbers read from any message.
 
 A temperature may be a number in a message of any type. The class of a message is imported at run
 time: the package of a driver's messages is installed with the driver and is no dependency.
@@ -47,7 +47,7 @@ def qos_of(topic: NodeTopic) -> QoSProfile:
 
 
 class LiveField:
-    """A number in the messages of a topic; ThermoCompError if type or field does not exist."""
+    """A numeric field in the messages of a topic; ThermoCompError if type or field is missing."""
 
     def __init__(self, topic: str, kind: str, path: str) -> None:
         try:

@@ -5,7 +5,7 @@ Owns the node's parameters: their table, and the services that set them.
 
 The table of the parameters is `NodeConfig`. The node runs with one immutable `NodeConfig`; a
 change makes a new `NodeConfig` or is refused as a whole. A separate process reads files, while a
-thread waits for it; the node's loop then replaces the reference to the `NodeConfig`. Requests are
+thread waits for the process; then the node's loop starts to use the new `NodeConfig`. Requests are
 answered in order of arrival, but a request without a file does not wait for requests with files.
 """
 
@@ -208,7 +208,7 @@ def _checked(name: str, value: Any) -> Any:
             got += f' ({type(value).__name__}); quote it: \'"{value!s:.60}"\''
         elif not (value.isprintable() and len(value) <= longest):
             rule = f'one printable line of at most {longest} characters'
-            got = f'{len(value)}: {got}'
+            got = f'{len(value)} characters: {got}'
         elif choices and value not in choices:
             rule = f'one of {", ".join(choices)}'
     elif isinstance(value, bool) or not isinstance(value, int | float):

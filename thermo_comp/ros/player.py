@@ -4,8 +4,8 @@
 Owns the player: publishes a bag on the node's input topics, with `/clock`, at a multiple of real
 time or as fast as the subscribers acknowledge messages.
 
-Topics have the node's relative names, messages are unchanged and in the bag's order; ROS 1
-messages are rewritten in CDR. After `WINDOW` messages of a topic the player waits until every
+Topics have the node's relative names. Messages keep the bag's order and their bytes; only ROS 1
+messages are rewritten, in CDR. After `WINDOW` messages of a topic the player waits until every
 reliable subscriber has acknowledged them. Fast DDS requests acknowledgements with every message
 only while the history is full, otherwise every 3 s, so the histories are small, and
 transient-local durability keeps them full.
@@ -72,7 +72,7 @@ def play(
     ros_args: Sequence[str] = (),
     progress: Callable[[float], None] = lambda _: None,
 ) -> PlayReport:
-    """Play a bag as `opened_player` once all topics have subscribers, or after `wait_s` [s]."""
+    """Play a bag (see `opened_player`) once all topics have subscribers, or after `wait_s`."""
     with opened_player(path, rate, topics, ros_args) as player:
         wait_until(lambda: not player.unheard(), wait_s)
         if wait_s > 0.0:
@@ -122,7 +122,7 @@ class Player:
     def run(
         self, progress: Callable[[float], None], throttle: Callable[[int], object] = lambda _: None
     ) -> PlayReport:
-        """Send the bag; `throttle` gets the number of samples after each WINDOW, and may block."""
+        """Send the bag; call `throttle` with the number of sent samples after each WINDOW."""
         reader, n_sent = self._reader, dict.fromkeys(self._publishers, 0)
         total = sum(reader.info.topics[name][1] for name in reader.topics.values())
         topics = {publisher.topic_name: role for role, publisher in self._publishers.items()}

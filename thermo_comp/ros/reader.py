@@ -28,7 +28,7 @@ from ..online.trial import tried
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 
-#: Time limit for reading a file [s]; above it the file hangs, as on a lost network drive.
+#: Time limit for reading a file [s]; a file that takes longer is refused, as on a lost drive.
 LIMIT_S = 10.0
 _ENDING_S = 0.5  # time to wait for a killed process [s]
 _PR_SET_PDEATHSIG = 1  # option of Linux prctl: the signal sent when the parent ends
@@ -37,7 +37,7 @@ NICENESS = 5  # added to the niceness of the process, so that samples have prior
 
 @dataclass(frozen=True, slots=True)
 class LoadedCalibration:
-    """A calibration, its file as the user named it, and the hash of the bytes that were parsed."""
+    """A calibration, the path of its file as the user gave it, and the hash of the file."""
 
     calibration: Calibration
     path: str
@@ -81,7 +81,7 @@ def read(name: str, directory: str = '') -> LoadedCalibration:
 
 
 def read_within(name: str, directory: str, limit_s: float = LIMIT_S) -> LoadedCalibration:
-    """Run `read` in a thread; CalibrationError if the file hangs."""
+    """Run `read` in a thread; CalibrationError if `read` takes longer than `limit_s`."""
     answer: Future[LoadedCalibration] = Future()
 
     def run() -> None:

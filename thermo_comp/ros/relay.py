@@ -4,7 +4,7 @@
 Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
 
 Messages do not identify their publisher. While several publishers may send on a topic, its
-messages are dropped, and also the first batch after a publisher has left, which may be from it.
+messages are dropped; so is the first batch after a publisher left: the publisher may have sent it.
 """
 
 from bisect import bisect_left, bisect_right
@@ -29,7 +29,7 @@ from .reader import LoadedCalibration
 from .rest_log import BLOCK, RestKeeper
 from .waitloop import RawSubscription, RCLError, WaitLoop
 
-#: Without samples, a reading is used when a reading with a stamp later by this time arrives [ns].
+#: Without samples, a reading is used once a reading stamped at least this much later arrives [ns].
 IDLE_NS = 1_000_000_000
 
 # A received temperature: time of reception [ns]; thermometer, stamp [ns], degC.
@@ -62,7 +62,7 @@ class Relay:
         self.traffic = Traffic()
         samples = self._open_samples(config)
         self.running = Running(loaded, config, compensator, samples, self._converter(config))
-        #: Subscriptions by thermometer, and the fields of their messages.
+        #: Subscription of each thermometer, and the field of its messages with the temperature.
         self.thermometers: dict[str, RawSubscription] = {}
         self._fields: dict[str, LiveField] = {}
         for name in compensator.thermal.inputs:

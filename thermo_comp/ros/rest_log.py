@@ -46,7 +46,7 @@ _SHORTEST = {False: 44, True: 316}  # shortest message [bytes]: of counts, and o
 
 
 class RestLog:
-    """A folder of rests, written by a thread; `n_lost` lines were not written, for `reason`."""
+    """A folder of rests, written by a thread; `n_lost` rests were not written, for `reason`."""
 
     def __init__(self, folder: str) -> None:
         self._folder = Path(folder).expanduser()
@@ -154,8 +154,8 @@ class RestKeeper:
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
         """Sum messages that the compensator has corrected; queue the rests that end in them."""
-        # All messages are summed with the present calibration, although after a reload the old
-        # calibration has corrected up to two seconds of them.
+        # All messages are summed with the present calibration, although those that arrived before
+        # a reload were corrected with the old calibration.
         self._use(loaded, compensator)
         stamps, samples = samples_of(messages, is_imu=loaded.calibration.unit.input != 'counts')
         if not len(stamps):

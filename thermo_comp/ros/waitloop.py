@@ -202,7 +202,7 @@ class WaitLoop:
             self._guard.trigger()
 
     def call_every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call a function every `period_s`, instead of that of an earlier call; needs no timer."""
+        """Call a function every `period_s`, instead of the function of an earlier `call_every`."""
         self._period_ns = int(period_s * 1e9)
         self._call_ns = time.monotonic_ns() + self._period_ns
         self._callback = callback

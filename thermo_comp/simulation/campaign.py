@@ -171,8 +171,8 @@ class Position:
 
 def plan(name: str, seed: int = 0) -> tuple[Position, ...]:
     """
-    Return the positions of a test in the order of their recording: 'chamber-18' (of 9.5 h each),
-    'chamber-9' (3 h each), 'tumble' (18 positions of 20 min at room temperature), 'tumble-3',
+    Return the positions of a test in the order of their recording: 'chamber-18' (18 positions of
+    9.5 h), 'chamber-9' (9 of 3 h), 'tumble' (18 of 20 min at room temperature), 'tumble-3',
     'tumble-1' ('tumble', then 3 positions or 1 of 3 h in the chamber), 'held-out' (3 positions
     with ramps and attitudes that no other plan has), 'centrifuge' or 'rate-table' (12 mountings,
     each at rest and at four rates in three soaks). `seed` determines attitudes and temperatures.

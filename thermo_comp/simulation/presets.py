@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the ready-made simulated units: three kinds of instruments, and that of the sample bags."""
+"""Owns the ready-made simulated units: three kinds of instruments and the sample bags' unit."""
 
 import math
 from collections.abc import Iterable

@@ -87,7 +87,7 @@ class SimulatedRun:
 
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
-    """Run a unit through a program as one block; see `simulate_blocks`."""
+    """Simulate a unit in a chamber program as one block; see `simulate_blocks`."""
     return next(simulate_blocks(unit, cyclogram, up, block_size=sys.maxsize, **options))
 
 
@@ -123,7 +123,7 @@ def simulate_blocks(
     spin: Spin | None = None,
 ) -> Iterator[SimulatedRun]:
     """
-    Run a unit through a program in bounded memory; the result does not depend on the block size.
+    Simulate a unit in a chamber program, in blocks; the block size does not change the result.
 
     A temperature reading is in the block that spans its stamp, or else in the last block.
     `up` is the direction of the specific force without `spin`; the scale factor [counts/cycle per
@@ -138,7 +138,7 @@ def simulate_blocks(
     n_cycles = math.floor(duration * rate_hz * (1.0 + 1e-12))
     if n_cycles < 1:
         raise ValueError(
-            f'the program of {duration:g} s is shorter than one conversion cycle of '
+            f'the chamber program of {duration:g} s is shorter than one conversion cycle of '
             f'{1.0 / rate_hz:g} s'
         )
     direction = np.asarray(up, dtype=float)

@@ -64,7 +64,7 @@ class Spin:
 def steps(
     begins_s: tuple[float, ...], rates: tuple[float, ...], dwell_s: float, ramp_s: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return times and rates of runs that begin at `begins_s`: `rates`, with ramps in between."""
+    """Return times and rates of runs from `begins_s` [s] on: all `rates`, with ramps between."""
     time, rate = [0.0], [0.0]
     for begin in begins_s:
         now = begin

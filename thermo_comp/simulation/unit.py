@@ -52,7 +52,7 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
-    """Return the random generator of a source, at the start of the stream of an axis or number."""
+    """Return a random generator; each source and each axis (or other index) has a stream."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
 
 
@@ -151,7 +151,7 @@ class GyroModel:
 
 @dataclass(frozen=True)
 class SwitchedLoad:
-    """Electronics that heat a part with `power` [W], off and on for random times [s]."""
+    """Electronics that heat a part with `power` [W], off and on for times within `spell` [s]."""
 
     part: str
     power: float

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the detection of a change: whether the rate of a sensor has left the baseline of the soak.
+Owns the detection of a departure: a sensor's rate leaves the baseline, its rate in the soak.
 
-Two linear filters of temperature and rate, with different memory, integrate the second derivative.
-A rate has departed if it differs from the baseline by more than the swing plus a multiple of the
-filter's noise; the multiple follows from the permitted rate of false alarms (Rice's formula, see
-docs/regime.md). The swing is the amplitude of the oscillation of the rate in a soak: the declared
-ripple of the surroundings divided by the sensor's lag, or the observed amplitude if larger.
+Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
+noise as second derivative. A rate has departed if it differs from the baseline by more than the
+swing plus a multiple of the filter's noise; the multiple follows from the permitted rate of false
+alarms (Rice's formula, see docs/regime.md). The swing is the amplitude of the oscillation of the
+rate in a soak: the declared ripple divided by the sensor's lag, or the observed one if larger.
 
 The readings of a sensor with a quantum lie in cells of one quantum. If noise cannot cross a cell,
 the filters are not used: two edges of cells crossed in the same direction give the mean rate.
@@ -25,8 +25,9 @@ from typing import Final
 from .settings import ThermometerSettings
 from .thermometer import Thermometer
 
-BEND_SHARES = (1.0, 10.0)  # tuned acceleration of a filter / smallest acceleration at an onset
-TUNING: Final = 1.45  # best memory of a filter / (noise sd / acceleration)^0.4, readings at 1 Hz
+# Second derivative for which a filter is tuned / second derivative at the slowest ramp's onset.
+BEND_SHARES = (1.0, 10.0)
+TUNING: Final = 1.45  # best memory / (noise sd / second derivative)^0.4, for readings at 1 Hz
 # Noise variance of the rate / the filter's rate variance, if most noise is that of quantization.
 CELL_NOISE_SHARE: Final = 0.4
 SETTLING_MEMORIES: Final = 5.0  # age / memory of a filter at which the noise is stationary
@@ -41,8 +42,8 @@ class ChangeDetector:
     """
     Baseline, swing and departure of the rate of change of one sensor's temperature.
 
-    `rate` [K/s] is the output of the filter with the longer memory. `swing` [K/s] is the largest
-    distance from the baseline that the rate is known to reach in a soak.
+    `rate` [K/s] is the output of the filter with the longer memory, or of `Thermometer` if the
+    sensor has wide cells. `swing` [K/s]: amplitude of the oscillation of the rate in a soak.
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class ChangeDetector:
         self._reading = nan
 
     def settle(self, sensor: Thermometer, least_error: float = 0.0) -> None:
-        """Begin a soak: take the rate as baseline, with `least_error` [K/s] or a larger error."""
+        """Begin a soak: the rate becomes the baseline, with at least the error `least_error`."""
         self._baseline = self.rate
         self._baseline_error = max(self.swing, least_error, 2.0 * sqrt(sensor.var_rate))
         self._edge = nan  # a cell edge crossed before the soak would give the ramp's rate

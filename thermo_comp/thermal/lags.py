@@ -173,7 +173,7 @@ def start_root(lags: Sequence[tuple[Any, ...]]) -> Floats:
     Return a factor of the covariance of `start_covariance`, which is the factor times its
     transpose, shape (n, number of first-order lags) [K].
 
-    The factor exists even if the covariance is singular, because two lags are nearly equal. The
+    The factor exists even if the covariance is singular, as with two nearly equal lags. The
     input before the first reading is modelled as a random walk with ``D = 2 sd^2 / START_TAU_S``
     [K^2/s], so that ``P_kl = D tau_k tau_l / (tau_k + tau_l)`` for two lags of one input, and 0
     for lags of different inputs. Then P_kl decays as ``exp(-dt / tau_k) exp(-dt / tau_l)``.

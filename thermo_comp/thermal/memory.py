@@ -51,7 +51,7 @@ class LagBank:
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """Use the next input value [K], of an error `sd` [K]; the input is linear in between."""
+        """Use the next input value [K], of the error sd `sd`; in between the input is linear."""
         seen_ns = self.stamp_ns
         if seen_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
@@ -112,7 +112,7 @@ class LagBank:
 
 @lru_cache(maxsize=1024)
 def _coefficients(taus: tuple[float, ...], dt_ns: int) -> tuple[list[float], list[float]]:
-    """Return by lag the factors of its state and of the input's change, for a step [ns]."""
+    """Return for each lag the factors of its state and of the input's change in a step [ns]."""
     dt = dt_ns * 1e-9
     lost = [-math.expm1(-dt / tau) for tau in taus]
     return [1.0 - part for part in lost], [
@@ -175,7 +175,7 @@ class ThermalMemory:
             self._held = [] if self._needs_sensors else self._held
 
     def board_step(self, stamp_ns: int, board: float, sd: float = 0.0) -> None:
-        """Use the next board temperature [degC], of an error `sd` [K]."""
+        """Use the next board temperature [degC], with an error of the sd `sd` [K]."""
         self.board.step(stamp_ns, board, sd)
         values = self.board.lagging
         if self._needs_sensors:

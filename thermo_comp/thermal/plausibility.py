@@ -50,8 +50,8 @@ LARGEST_ERROR: Final = 60.0
 LEAD_K: Final = 0.5
 LEAD_SHARE: Final = 0.15
 #: A sensor leads after `LEAD_READINGS` readings in a row at which the ratio of the slower to the
-#: faster rate exceeds `LEAD_RATE_SHARE`; above `DOUBTFUL_RATE_SHARE` a lead of the board adds
-#: variance.
+#: faster rate exceeds `LEAD_RATE_SHARE`. If the ratio exceeds `DOUBTFUL_RATE_SHARE`, a lead of
+#: the board adds variance.
 LEAD_READINGS: Final = 5
 LEAD_RATE_SHARE: Final = 0.3
 DOUBTFUL_RATE_SHARE: Final = 0.03
@@ -113,7 +113,7 @@ class SensorCheck:
         self._first: list[tuple[int, float]] | None = []
 
     def forget_other(self) -> None:
-        """Measure the other sensor's temperature change anew: readings of either were wrong."""
+        """Measure the other sensor's change from now on: readings of a sensor were wrong."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
@@ -157,7 +157,7 @@ class SensorCheck:
         self._n_same = 0
         self._other_then = nan
         age = (stamp_ns - last_ns) * 1e-9
-        # Accept at once a reading that differs from the estimate by less than `LARGEST_STEP`.
+        # Accept at once a reading within `LARGEST_STEP` of the temperature expected now.
         if (
             fault is Fault.NONE
             and abs(celsius - sensor.temperature) + abs(sensor.rate) * age < LARGEST_STEP
@@ -197,7 +197,7 @@ class SensorCheck:
                 # Expect the judged sensor to change as the other sensor, with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The board may reach the temperature of the leading sensor, but not pass it.
+            # The board cannot pass the leading sensor's temperature unless that changes, too.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns

@@ -7,8 +7,8 @@ The dynamic state *begins* when the rate of the leading sensor has left the base
 (`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state is
 *held* while the rate of the case or of the board, at present or predicted half a lag ahead, may
 exceed the relaxed rate; so it continues in a ramp of constant rate. With `end_condition` = 'case'
-(the paper's rule) only the rate of the case is tested, and the board is used only while the case
-is lost. The derivation of the detector is in docs/regime.md.
+(the paper's rule) only the rate of the case is tested; the board's is tested while the case gives
+no readings. The derivation of the detector is in docs/regime.md.
 
 References
 ----------
@@ -24,7 +24,7 @@ from .change_detector import ChangeDetector
 from .settings import OBVIOUS_SHARE, DetectorSettings, ThermometerSettings
 from .thermometer import Thermometer
 
-HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state, in lags of the leading sensor
+HOLD_LAGS: Final = 0.75  # shortest duration of the dynamic state / lag of the leading sensor
 # Margin for "the rate is below a limit", in sd of the rate. Half a sd suffices, because in a soak
 # most of the variance of the rate is an allowance for a ramp that may begin at any time.
 SURE_SIGMAS: Final = 0.5
@@ -96,8 +96,8 @@ class RegimeDetector:
 
         if not is_dynamic:
             speed = OBVIOUS_SHARE * self._relaxed_rate
-            # If two wide cells of a quantized sensor are crossed in a row, the temperature is in a
-            # ramp, even if no soak has been seen.
+            # A sensor with wide cells that crosses two cells in one direction is in a ramp, even
+            # if the regime is unknown.
             is_static = regime is Regime.STATIC
             if departure and (
                 is_static or (lead.settings.has_wide_cells and departure * lead.rate > speed)
@@ -118,7 +118,7 @@ class RegimeDetector:
             >= self._dwell_ns * (1.0 + 2.0 * change.swing / self._relaxed_rate)
             and (self._held_until_ns is None or stamp_ns >= self._held_until_ns)
         ):
-            # Before the first soak the swing is not estimated: allow a larger error.
+            # Before the first soak no swing is estimated: allow a larger error of the baseline.
             is_first = self.regime == Regime.UNKNOWN
             change.settle(lead, 0.5 * self._relaxed_rate if is_first else 0.0)
             self.regime = Regime.STATIC
@@ -126,7 +126,7 @@ class RegimeDetector:
         return self.regime
 
     def _turn(self, stamp_ns: int, direction: int) -> None:
-        """Set a direction that has lasted half a dwell time: with coarse quanta the rate steps."""
+        """Use a direction after half a dwell time: coarse quanta may change the rate's sign."""
         if direction == self.direction or not direction:
             self._turning_ns = None
         elif self._turning_ns is None:

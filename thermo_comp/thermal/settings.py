@@ -12,8 +12,8 @@ from typing import Annotated, Final, Literal, get_args
 from ..quantities import QUANTITIES, NotNegative, Positive, refuse_impossible
 
 CELL_SIGMAS: Final = 2.5  # quantum / noise sd above which a reading counts as an interval (cell)
-# Quantum / noise sd above which noise never moves a reading: 6 sd of the difference of two
-# readings.
+# Quantum / noise sd above which noise never changes a reading: 6 sd of the difference of the noise
+# of two readings.
 WIDE_CELL_SIGMAS: Final = 8.5
 # Hysteresis of the dynamic state: rate that begins the state / rate below which the state ends.
 OBVIOUS_SHARE: Final = 1.5
@@ -121,8 +121,8 @@ class DetectorSettings:
 class ThermalConfig:
     """Times of the tracker that the user sets; ValueError if a value is out of its range."""
 
-    #: Time over which the two sets of coefficients are blended after a change of regime [s],
-    #: longer if the sets differ much (`Correction.gentle_transition`); 0 = step, as in the paper.
+    #: Time over which the two sets of coefficients are blended after a change of regime [s], which
+    #: `Correction.gentle_transition` lengthens if the sets differ much; 0 = step, as in the paper.
     transition_time_s: NotNegative = 30.0
     #: Age of the board temperature after which nothing is published [s]; also the time for which
     #: the readings after an impossible step of the board temperature are refused.

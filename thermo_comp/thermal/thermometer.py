@@ -3,8 +3,8 @@
 """
 Owns the recursive estimate of T, dT/dt, d2T/dt2 and their variances from stamped readings.
 
-Two Kalman filters of (temperature, rate, acceleration) interact [1]_: *quiet*, in which the
-acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
+Two Kalman filters of temperature, rate and acceleration (d2T/dt2) interact [1]_: *quiet*, in which
+the acceleration is almost constant (a soak, the middle of a ramp), and *bending*, in which the
 acceleration changes as at the onset and end of a ramp behind a thermal lag [2]_. The estimate is
 the mixture of the quiet and the bending filter, with the variance of a mixture. If a sensor's
 quantum exceeds the noise, all temperatures in a cell (an interval of one quantum) give the same
@@ -48,7 +48,7 @@ NOISE_MEMORY: Final = 200.0  # number of innovations over which the noise factor
 State = tuple[float, float, float, float, float, float, float, float, float]
 """Temperature, rate, acceleration; then elements 00, 01, 02, 11, 12, 22 of their covariance."""
 
-_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # before the first reading
+_NOWHERE: State = (nan, nan, nan, inf, 0.0, 0.0, inf, 0.0, inf)  # state before the first reading
 
 
 class Thermometer:
@@ -225,8 +225,8 @@ class Thermometer:
         rate = self.rate
         unknown = 0.0
         if not -horizon <= ahead <= horizon:
-            # Beyond the extrapolation horizon the temperature is held. Add the variance of the
-            # change since, at the present rate or in a ramp that has begun after the last reading.
+            # After the extrapolation horizon the temperature is held constant. Add the variance of
+            # a change at the present rate, or in a ramp that has begun after the last reading.
             dt = horizon if ahead > 0.0 else -horizon
             beyond = ahead - dt
             unseen = min(0.5 * self._bend * abs(beyond), self._rate_sd)
@@ -270,7 +270,7 @@ class Thermometer:
         noise = self._noise
         if variance < 4.0 * noise:
             # The sd of the prediction is less than twice the noise: match the moments of the
-            # prediction truncated to the cell. Readings that flicker about an edge locate it.
+            # prediction truncated to the cell. Readings that flicker show where the edge is.
             spread = variance + noise
             sd = sqrt(spread)
             low = (reading - half - expected) / sd

@@ -20,7 +20,7 @@ from .settings import DetectorSettings, ThermalConfig
 from .state import BOARD, GRADIENT, MEMORY_SETTLED_SD, USUAL_BOARD_LAG_S
 from .thermometer import RESTART_READINGS, Thermometer
 
-#: Relative sd of the gradient that is estimated from the board's rate while a sensor is lost.
+#: Relative sd of a gradient that is estimated while its sensor is lost (gives no readings).
 LOST_GRADIENT_RELATIVE_SD: Final = 0.5
 #: Time without a regime decision after which the regime is unknown / lag of the case thermometer.
 UNWATCHED_SHARE: Final = 0.25
@@ -62,7 +62,7 @@ class ThermalTracker:
         self._weight = 0.0
         self._weight_ns = 0
         self._target = 0.0
-        #: Gradient of each sensor less board lag times rate, at its last static reading [K].
+        #: Last gradient in the static regime less board lag times board rate, by sensor [K].
         self._rest_gradients: dict[str, float] = {}
         self._begin_watch()
 
@@ -145,7 +145,7 @@ class ThermalTracker:
                 if sensor is board or not bank.taus or bank.stamp_ns is None:
                     continue
                 if not self.is_live(stamp_ns, sensor):
-                    # Update the lags of a gradient whose sensor is lost with an estimate.
+                    # The sensor is lost: update the lags of its gradient with an estimate.
                     gradient, variance = self._lost_gradient(name, stamp_ns, board.rate)
                     bank.step(stamp_ns, gradient, sqrt(variance))
         for name in self.spec.sensors:
@@ -156,7 +156,7 @@ class ThermalTracker:
     def _use(
         self, name: str, sensor: Thermometer, check: SensorCheck, stamp_ns: int, celsius: float
     ) -> bool:
-        """Update a thermometer; a jump adds to the memory's variance, a gap resets the memory."""
+        """Update a thermometer, and the memory after a jump or gap; False: reading not used."""
         if check.has_wrong_start(stamp_ns, celsius):
             self._begin_again(name, sensor)
         before_ns, before, n_restarts = sensor.stamp_ns, sensor.temperature, sensor.n_restarts
@@ -316,7 +316,7 @@ class ThermalTracker:
         return gradient, variance
 
     def is_settled(self, stamp_ns: int) -> bool:
-        """Whether the effect of temperatures before the start on the memory has decayed."""
+        """Whether the effect of temperatures before the first reading on the lags has decayed."""
         state = self.sample(stamp_ns)
         gradients = list(state[GRADIENT : GRADIENT + 2 * len(self.spec.sensors) : 2])
         lags = self.memory.at(stamp_ns, state[BOARD], gradients)[: 2 * len(self.spec.lags)]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the calibration of one unit: immutable dataclasses whose fields are the keys of its file.
+Owns the calibration of one unit: immutable dataclasses with the keys of the calibration file.
 
 Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
 (0..1), and phi_j the columns of the thermal response (`columns`), common to the static and the
@@ -58,7 +58,7 @@ Input = Literal['counts', 'm/s^2']
 
 @dataclass(frozen=True)
 class Unit:
-    """The calibrated unit and its raw samples."""
+    """Serial number; unit of measure, full scale and interval of the raw samples."""
 
     serial: Annotated[Serial, 'Serial number of the unit, one printable line.']
     input: Annotated[Input, 'Unit of the raw samples: counts per conversion cycle, or m/s^2.']
@@ -121,7 +121,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Slowly varying error of a regime's curves at one board temperature, not in the posterior."""
+    """Slow error of a regime's curves at a board temperature, beyond that of the posterior."""
 
     temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
     sd_m_s2: Annotated[
@@ -132,8 +132,9 @@ class LackOfFit:
 @dataclass(frozen=True)
 class RegimeSet:
     """
-    The curves of one regime. Outside `temperature_range_c` the curves continue along their
-    tangents for a quarter of the range and are constant beyond; the covariance increases.
+    The curves of one regime. Outside `temperature_range_c` a curve follows that of the other
+    regime at a constant difference; outside both ranges it continues along a tangent for a quarter
+    of the range and is then constant. The covariance grows with the distance from the range.
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated range of T_board [degC].']
@@ -143,9 +144,9 @@ class RegimeSet:
     z: AxisSet
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
-        'Error on data left out of the fit, in excess of the posterior; includes the error of '
+        'Error on data left out of the fit, beyond the sd of the posterior; includes the error of '
         'scale factors at temperatures at which no position had the axis along gravity. The '
-        'variance is linear between the entries, and constant outside their temperatures.',
+        'variance is linear between two entries, and constant outside all entries.',
     ] = ()
 
     def __post_init__(self) -> None:
@@ -181,7 +182,7 @@ class ResponseTerm(Column):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration of one unit; ValueError if its parts contradict each other."""
+    """Calibration of one unit; ValueError if two of its values contradict each other."""
 
     format_version: Annotated[int, f'Version of the layout of this file: {FORMAT_VERSION}.']
     unit: Unit
@@ -208,7 +209,7 @@ class Calibration:
         'Standard deviations of M[1][0], M[2][0], M[2][1], used if `posterior` is null.',
     ] = (0.0, 0.0, 0.0)
     sensors: Annotated[
-        tuple[str, ...], 'Thermometers other than that of the board; the first leads in a ramp.'
+        tuple[str, ...], "Thermometers beside the board's; in a ramp the first leads the board."
     ] = ('case',)
     response: Annotated[
         tuple[ResponseTerm, ...], QUANTITIES['columns'], 'Columns of the thermal response.'
@@ -233,7 +234,7 @@ class Calibration:
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
     ] = field(default_factory=DetectorSettings)
     provenance: Provenance = field(default_factory=Provenance)
-    evidence: Annotated[tuple[GroupEvidence, ...], 'Correction by each group of columns.'] = ()
+    evidence: Annotated[tuple[GroupEvidence, ...], 'Contribution of each group of columns.'] = ()
     posterior: Annotated[Posterior | None, 'Covariance of all parameters; null: unknown.'] = None
     nonlinearity: Annotated[
         Nonlinearity | None,
@@ -279,7 +280,7 @@ class Calibration:
                 )
 
     def _check_gyroscope(self) -> None:
-        """Apply the rules for the three accelerometers to the gyroscope."""
+        """Check the gyroscope by the rules for the three accelerometers."""
         try:
             rate_triad(self)
         except ValueError as error:
@@ -342,7 +343,7 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
 
 
 def rate_triad(calibration: Calibration) -> Calibration:
-    """Return a calibration's gyroscope as a triad of scale 1; ValueError without a gyroscope."""
+    """Return a calibration of the gyroscope alone, of scale 1; ValueError without gyroscope."""
     gyroscope = calibration.gyroscope
     if gyroscope is None:
         raise ValueError('`calibration` must have a gyroscope')
@@ -382,7 +383,7 @@ def rate_triad(calibration: Calibration) -> Calibration:
 
 
 def gyroscope_of(triad: Calibration) -> Gyroscope:
-    """Return the `Gyroscope` of a triad of scale 1, as `rate_triad` returns it."""
+    """Convert a calibration in the form that `rate_triad` returns to a `Gyroscope`."""
     x, y, z = (axis.bias for axis in triad.axes)
     static, dynamic = (
         RateSet(*(RateCurve(axis.bias_function, axis.delta) for axis in regime_set.axes()))

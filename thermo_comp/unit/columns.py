@@ -6,8 +6,8 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
 is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
 dynamic regime. u is limited to the column's range, and t to the calibrated temperatures. Outside
-the calibrated temperatures the curves of the sets continue along their tangents, but powers of t
-are constant: no recording determines how a coefficient changes with temperature there.
+the calibrated temperatures the curves of the sets continue along their tangents, but the factor
+t^power is constant, because no recording determines the coefficients at these temperatures.
 
 The function `bank` makes the columns in groups. A group has the columns of the kind with the
 group's name, except for the following groups. Group *product* has the kind board, and group
@@ -15,7 +15,7 @@ group's name, except for the following groups. Group *product* has the kind boar
 coefficients that change with temperature. Group *square* also has the kind cube, and group
 *gradient_even* the kinds size and square. Group *part* has the kinds board, square and cube, whose
 sum with a curve over the board temperature is a curve over a part's temperature. Group
-*gradient_even_about_rest* has *gradient_even* as functions of the gradient less its rest value.
+*gradient_even_about_rest* has the kinds of *gradient_even* with the gradient less its rest value.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,19 +36,19 @@ from .schema import check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
 UNBOUNDED: Final = (-1e9, 1e9)
-#: Time constants of the bank [s], in steps of a factor sqrt(2), from a few reading intervals to
-#: the longest lag that bags determine. Columns linear in a lag have all time constants, so that
-#: sums of columns approximate any time constant in between. Products and powers of lags have
-#: smaller effects, and every second time constant.
+#: Time constants of the columns of `bank` [s], in steps of a factor sqrt(2), from a few reading
+#: intervals to the longest lag that bags determine. Columns linear in a lag have all 15 time
+#: constants: sums of columns approximate any time constant in between. Products and powers of lags
+#: have smaller effects, so every second time constant suffices.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
-#: Widths of the even columns [K], half-widths of the plays [K], and time constants of the lagged
+#: Widths of kind gradient_even [K], half-widths of plays [K], and time constants of the lagged
 #: board temperatures that are inputs of plays [s]; 0 = board temperature.
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Time constants of the bend columns [s]; smallest distance between the knees of bends [K];
-#: largest number of knees per lag of a bank, and per given lag of a part.
+#: Kind bend: time constants [s]; temperature span per knee (the temperature at which the slope
+#: changes) [K]; largest number of knees per lag, and per lag of a part, with a third of this span.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
@@ -64,7 +64,7 @@ _Value = Annotated[float, QUANTITIES['value of a column']]
 
 class Part(NamedTuple):
     """
-    The lag of a part of the unit behind the board, in the keys of a column.
+    The lag of a part of the unit behind the board; the fields are keys of a column.
 
     tau_s, second_tau_s: time constants of the two stages [s]; the second is 0 for a single stage
     sensor_share: the part lags the board temperature plus this share of the sensor's gradient
@@ -106,7 +106,7 @@ class Column:
     sensor_share: Annotated[
         float,
         QUANTITIES['share'],
-        'The part lags T_board + sensor_share * g_s (board, square, cube, play, bend).',
+        'The part lags T_board + sensor_share * g_s (kinds board, square, cube, play, bend).',
     ] = 0.0
     lead_s: Annotated[
         float,
@@ -115,17 +115,17 @@ class Column:
         '`sensor_share` is 0; 0 = none.',
     ] = 0.0
     width_k: Annotated[
-        float, QUANTITIES['width'], 'Width of gradient_even, or half-width of play.'
+        float, QUANTITIES['width'], 'Width of kind gradient_even, half-width of a play.'
     ] = 0.0
     rest_k: Annotated[
         float,
         QUANTITIES['gradient'],
-        'Gradient g_s at rest, for gradient_even, size and square without lag.',
+        'Gradient g_s in a soak, for the kinds gradient_even, size, and square without lag.',
     ] = 0.0
     knee_k: Annotated[
         float,
         QUANTITIES['gradient'],
-        'Temperature less T_ref at which the slope of a bend changes.',
+        'Temperature of the part less T_ref at which the slope of a bend changes.',
     ] = 0.0
     power: Annotated[int, QUANTITIES['power'], 'Exponent of the factor T_board - T_ref.'] = 0
     during: Annotated[
@@ -134,7 +134,7 @@ class Column:
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],
-        'Range to which the value is limited, before the factors for `power` and `during`.',
+        'Range to which the value is limited, without the factors for `power` and `during`.',
     ] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -242,7 +242,7 @@ def _family(
     lags: Sequence[Part] = (Part(0.0),),
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
-    """Return one column of a group for each combination of the arguments' values."""
+    """Return the columns of a group: one for each combination of the listed values."""
     return [
         Column(
             *(group, kind, sensor, *part, width),
@@ -326,7 +326,7 @@ class ColumnTable:
             for term in dict.fromkeys(terms.tolist())
             if term.form is not LINE
         ]
-        # The temperature of a part is computed from two numbers of a state: board less lag.
+        # The temperature of a part is the board temperature less the lag of the part.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD
 
@@ -360,7 +360,7 @@ class ColumnTable:
         return excess
 
     def factors(self, board: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """Return the factor phi / u (power of t times regime weight), and its slope over t."""
+        """Return the factor ``phi / u = t^power r``, and its derivative w.r.t. t."""
         t = hold(board - self._reference, *self._t_range)
         n_powers = int(self._power.max(initial=0))
         powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
@@ -376,7 +376,7 @@ class ColumnTable:
     def slopes(self, states: Floats) -> tuple[Floats, Floats | None]:
         """
         Differentiate u, without limits of range: w.r.t. the quantity that u is computed from, and
-        w.r.t. the board temperature at constant lag (None without a function of t - lag).
+        w.r.t. the board temperature at constant lag (None if no column has a function of t - lag).
         """
         slopes, scaled = np.ones((len(self._places), states.shape[1])), self._scaled(states)
         for rows, term in self._terms:

@@ -37,7 +37,7 @@ _GAP_TEMPERATURES = 33
 #: Variance of rounding [counts^2]: twice 1/12, as the converter adds the remainder to the next
 #: cycle.
 ROUNDING_VARIANCE = 1.0 / 6.0
-#: Smallest noise variance of a message / largest variance of any axis: the minimum keeps the
+#: Smallest noise variance of a sample / largest variance of any axis: this minimum keeps the
 #: covariance positive definite in spite of rounding, and is far below the noise of any instrument.
 _LEAST_SHARE = 1e-13
 #: Largest number accepted in a result of `Correction.line`: with smaller numbers the corrected
@@ -60,15 +60,15 @@ class Excess(NamedTuple):
     temperature: float  # board temperature beyond the range of the regime's set, signed [K]
     rate: float  # rate of the board temperature beyond its range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
-    relative: float  # sum of all distances outside the ranges, each in half ranges
+    relative: float  # excess of temperature plus rate plus largest of the columns [half ranges]
 
 
 class Correction:
     """
-    Bias, scale and error variances: the two sets blended by the dynamic weight, and the response.
+    Evaluates bias, scale and error variances of a calibration at thermal states.
 
     memory: lags, plays and rates of the states; by default those of `memory_of_unit`
-    noise: noise variance of one message per axis, rounding included [m^2/s^4]
+    noise: noise variance of one sample per axis, rounding included [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: elements yx, zx, zy of the misalignment matrix M
     beyond: additional variance at forces beyond those of the fit
@@ -149,7 +149,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Lengthen a transition [s] to limit the force's rate of change to GENTLE_RATE."""
+        """Lengthen a transition [s], so that the force changes at GENTLE_RATE at most."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         static, dynamic = self.curves.values(board)
         gap = dynamic - static
@@ -201,7 +201,7 @@ class Correction:
         `slow` is the slowly varying error covariance, shape (n_slow, n), see
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
         segment (1 s), scale and its change, then the coefficients of the covariance with the noise
-        of a message, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow` and 21
+        of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow` and 21
         rows to the result, see `ForceCorrection.rows`.
         """
         ends = np.array((start, end), dtype=np.float64)
@@ -254,7 +254,7 @@ class Correction:
     ) -> tuple[Floats, Floats]:
         """
         Evaluate a, b, c of each axis' error variance ``a + b x + c x^2``, (3, 3, n), without noise
-        of a message, and the factor (3, n) of the variance of the parameters outside the ranges.
+        of a sample, and the factor (3, n) of the variance of the parameters outside the ranges.
 
         The difference of dynamic and static set (`gap`) is added as an error while the sets are
         blended, outside the calibrated ranges, and while the regime is unknown. While the regime
@@ -264,14 +264,14 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # If the columns have no lags, the excess of the rate adds variance, else that of lags.
+            # Only without lags the excess of the rate adds variance; else that of the lags does.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
         variances = (shares * states[VAR_BOARD], states[self.layout.variances])
         by_source, direct = self.table.slopes(states)
         by_pair = self.by_pairs(by_source * factors[0])
-        # Derivative w.r.t. the board temperature: the response has t^power, gradients and lags.
+        # Derivative w.r.t. the board temperature, on which t^power, gradients and lags depend.
         on_board = raw * factors[1]
         if direct is not None:
             on_board = on_board + direct * factors[0]
@@ -289,9 +289,9 @@ class Correction:
             columns_out = np.where(self._is_present, self.table.excess(raw), 0.0).max(
                 axis=1, initial=0.0
             )
-            # Outside the calibrated range the curves are extrapolated. Add as errors the change of
-            # the curves since the edge of the range and, also for parts still outside the range,
-            # the distance outside times the sd of the slopes within the range.
+            # Outside the calibrated range the curves are extrapolated. Add two errors: the slope
+            # at the edge of the range times the board's distance from the edge, and the sd of the
+            # slopes within the range times the distance of the board or of the farthest part.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
@@ -314,8 +314,8 @@ class Correction:
 
     def _spread(self, variances: Floats, moved: Floats) -> Floats:
         """
-        Propagate independent errors of variances (p, n) to the variance ``a + b x + c x^2`` of
-        each axis, (3, 3, n); `moved`: bias and relative scale per unit of each error, (p, 6, n).
+        Propagate p independent errors with variances (p, n) to the coefficients a, b, c of each
+        axis' variance, (3, 3, n); `moved`: derivatives of bias and relative scale, (p, 6, n).
         """
         variance, bias, scale = variances[:, np.newaxis], moved[:, :3] / self.K, moved[:, 3:]
         parts = np.empty((*bias.shape[:2], 3, bias.shape[2]))

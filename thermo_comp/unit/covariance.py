@@ -43,7 +43,7 @@ _TERMS: Final = [
     [(i, j) for i, j in combinations_with_replacement(range(4), 2) if i < first and j < second]
     for first, second in combinations_with_replacement((2, 3, 4), 2)
 ]
-#: Number of coefficients of all six elements, and the indices of the constants of xx, yy, zz.
+#: Number of coefficients of all six polynomials; indices of the constants of xx, yy, zz.
 N_COEFFICIENTS: Final = sum(map(len, _TERMS))
 CONSTANTS: Final = tuple(sum(map(len, _TERMS[:element])) for element in (0, 3, 5))
 
@@ -62,7 +62,7 @@ class CovarianceMap:
 
 @lru_cache(maxsize=16)
 def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
-    """Return, for each coefficient, the rows of the covariance of u that it sums, and factors."""
+    """Return the rows of the covariance of u, and their weights, whose sum is a coefficient."""
     # Derivative of the force w.r.t. the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
     J = np.zeros((3, 4, 9))
     J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0

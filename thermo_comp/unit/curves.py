@@ -136,7 +136,7 @@ class Curves:
 
     def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
         """
-        Differentiate biases and scales w.r.t. the curves' parameters, in the posterior's order.
+        Differentiate bias and scale of each axis w.r.t. all parameters of a `posterior.Block`.
         """
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
@@ -157,7 +157,7 @@ class Curves:
 
     @cached_property
     def _families(self) -> list[int]:
-        """Index of the first curve with the same function families, for each of the six curves."""
+        """For each of the six curves, the index of the first curve with equal basis functions."""
         bases = [
             tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
             for functions in zip(*self._functions.rows, strict=True)
@@ -167,7 +167,7 @@ class Curves:
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
         Differentiate values beyond the ranges w.r.t. a function's free coefficients, (n_free, n).
-        A set beyond its range is a curve or tangent of the other set plus a constant difference.
+        Beyond its range a curve is a constant plus a tangent, or the curve of the other set.
         """
         function = self._functions.rows[regime][place]
         own_range, other_range = (

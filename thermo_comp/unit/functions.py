@@ -5,8 +5,8 @@ Owns functions of temperature (polynomial, cubic spline, exponential) that are 0
 
 A single ``t = T_board - T_ref`` [K] gives the same bits as an array: the code uses only ``+ - *
 /`` in a fixed order, and `math.exp` number by number. Each function is linear in its free
-coefficients, so `basis` gives the regressors of the fit and of the parameter covariance (equations
-9 and 10 of the paper).
+coefficients, so `basis` gives the regressors of the fit and of the parameter covariance. The paper
+has polynomials (its equations 9 and 10).
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class CubicSpline(_Family):
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> CubicSpline:
-        """Return a spline with the same knots and other values."""
+        """Return a spline with equal knots, `at_reference` at t = 0, plus `values` elsewhere."""
         at = self.knots_k.index(0.0)
         moved = (*values[:at], 0.0, *values[at:])
         return replace(self, values=tuple(at_reference + v for v in moved))
@@ -166,7 +166,7 @@ class CubicSpline(_Family):
         return self._along(self._pieces, t, is_slope=is_slope)
 
     def basis(self, t: Kelvins) -> list[Floats]:
-        """Evaluate the derivatives of the spline w.r.t. its free values: the cardinal splines."""
+        """Evaluate the derivatives w.r.t. the free coefficients: the cardinal splines."""
         return [self._along(pieces, np.asarray(t)) for pieces in self._cardinal_pieces]
 
     def _along(self, pieces: Floats, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -201,7 +201,7 @@ class Exponential(_Family):
                 f'got {len(self.e_fold_k)}'
             )
         if any(abs(e_fold) < 1.0 for e_fold in self.e_fold_k):
-            # A shorter e-fold overflows within any useful temperature range.
+            # With a shorter e-fold exp(t / e_fold) may overflow within a useful range of t.
             raise ValueError('`e_fold_k` must be at least 1 K in magnitude')
 
     @property
@@ -210,7 +210,7 @@ class Exponential(_Family):
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
-        """Return a sum of the same exponentials with other amplitudes."""
+        """Return the sum of exponentials with equal e-folds and the amplitudes `values`."""
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
@@ -230,7 +230,7 @@ TemperatureFunction = Polynomial | CubicSpline | Exponential
 
 
 class Functions:
-    """A table of functions of temperature, whose rows are evaluated at different temperatures."""
+    """A table of functions of temperature; row k is evaluated at the temperatures ``t[k]``."""
 
     def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
         self.rows = rows

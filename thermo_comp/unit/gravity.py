@@ -8,7 +8,7 @@ import re
 #: Standard gravity [m/s^2], exact by definition: 3rd General Conference on Weights and Measures,
 #: 1901.
 STANDARD_GRAVITY = 9.80665
-#: Rotation of the Earth [rad/s]: WGS 84, NIMA TR8350.2.
+#: Angular rate of the Earth's rotation [rad/s]: WGS 84, NIMA TR8350.2.
 EARTH_RATE = 7.292115e-5
 #: One micro-g, a unit of accelerometer errors [m/s^2].
 MICRO_G = 1e-6 * STANDARD_GRAVITY

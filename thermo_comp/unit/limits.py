@@ -3,9 +3,9 @@
 """
 Owns the limits of a calibration's bias and scale over its temperatures.
 
-The largest bias, level plus curve, is twice the full scale. The effect of a column on the bias,
-and of a parameter's sd on bias or scale, may be a million times the limit of bias or scale: far
-beyond any instrument, but without overflow.
+The bias at the reference temperature, and its change over temperature, are each at most twice the
+full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, may be a
+million times the limit of bias or scale: far beyond any instrument, but without overflow.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .posterior import ParameterLayout
 if TYPE_CHECKING:
     from .calibration import Calibration
 
-#: Limits of the relative scale, also if all columns together change the scale most.
+#: Limits of the relative scale, also with the largest change of the scale by all columns.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
 #: Largest bias / full scale: the bias of samples in an offset code is half of their range.
 FULL_SCALES = 2.0
@@ -57,7 +57,7 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
         if not effect <= WORST * most:
             raise ValueError(
                 f'`response[{k}].bias` must keep the largest effect of the column within '
-                f'{WORST * most:g}, got {effect:g}'
+                f'{WORST * most:g} input units, got {effect:g}'
             )
     for regime, part, ends in zip(('static', 'dynamic'), sets, edges, strict=True):
         at_work = [term.during in ('always', regime) for term in response]
@@ -96,7 +96,7 @@ def _check_axes(calibration: Calibration, most: float) -> None:
         force = calibration.unit.full_scale / abs(axis.scale_factor)
         if fault := QUANTITIES['full-scale force'].fault(force):
             raise ValueError(
-                f'`axes.{name}.scale_factor` makes unit.full_scale a force that {fault}, '
+                f'`axes.{name}.scale_factor` makes unit.full_scale a force that {fault} m/s^2, '
                 f'got {force:g}'
             )
 
@@ -109,7 +109,7 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
         raise ValueError(f'`{key}.bias_function` must be finite over its {_AROUND}')
     if max(-least, largest) > most:
         raise ValueError(
-            f'`{key}.bias_function` must stay within {most:g} over its {_AROUND}, '
+            f'`{key}.bias_function` must stay within {most:g} input units over its {_AROUND}, '
             f'reaches {max(reached, key=abs):g}'
         )
 
@@ -130,7 +130,7 @@ def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
 
 
 def _extremes(function: TemperatureFunction, edges: Sequence[float]) -> tuple[float, float]:
-    """Return the extremes of a function within its range, and at the ends of its tangents."""
+    """Return the smallest and largest value of a function in its range and on its tangents."""
     lower, upper = edges
     t = np.linspace(lower, upper, _GRID)
     beyond_k = TANGENT_SPANS * (upper - lower)

@@ -76,10 +76,9 @@ class NonlinearTerm:
 @dataclass(frozen=True)
 class Nonlinearity:
     """
-    The nonlinearity of the three axes.
-
-    Beyond the forces of the fit the polynomials continue, and the covariance includes an unknown
-    square term, with a coefficient of the sd `beyond_sd_g_g2`, from the largest force on.
+    The nonlinearity of the three axes. Beyond the forces of the fit the polynomials continue, and
+    the covariance includes the variance of an unknown term K2 d^2, where d is the force above the
+    largest force of the fit, and K2 has the sd `beyond_sd_g_g2`.
     """
 
     force_range_m_s2: Annotated[
@@ -116,7 +115,7 @@ class Nonlinearity:
                 )
 
     def coefficients(self, t: Floats) -> Floats:
-        """Return K2, Kq [s^2/m], K3 [s^4/m^2] by axis at temperatures t [K], shape (3, 3, n)."""
+        """Return K2, Kq [s^2/m], K3 [s^4/m^2] by axis at t [K] from T_ref, shape (3, 3, n)."""
         result = np.zeros((3, 3, len(t)))
         for term in self.terms:
             at, slope = np.array([term.coefficient, term.per_kelvin])[:, :, np.newaxis]
@@ -132,7 +131,7 @@ def unit_of(kind: Kind) -> float:
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of the result is (k2^2 - k3) times the cube of the correction: at 10 g, 1e-14 g with
+    error of the result is (k2^2 - k3) times the cube of x - f: at f = 10 g, 1e-14 g with
     k2 = 100 ug/g^2, and 1e-11 g with k3 = 10 ug/g^3.
     """
     r = k3 * x * x
@@ -234,7 +233,7 @@ class ForceCorrection:
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
     def regressors(self, force: Floats, board: Floats) -> Floats:
-        """Differentiate the readings w.r.t. the coefficients in the file's order, (n, 3, 2 k)."""
+        """Differentiate readings w.r.t. the k coefficients, then per_kelvin, shape (n, 3, 2 k)."""
         size = np.abs(force)
         each = {'square': force**2, 'odd_square': size * force, 'cube': force**3}
         values = [each[term.kind] / unit_of(term.kind) for term in self._of.terms]
@@ -257,10 +256,10 @@ class ForceCorrection:
         Return the contribution of the nonlinear terms to the coefficients of x^2 to x^6 in the
         error variance of an axis, (5, n), at temperatures less the reference, (n,).
 
-        `rows`, `rest`: factor of the covariance of the coefficients (2 k, rank), and variances
-        added to it; `on_bias`, `on_scale`: factors of bias and relative scale, (rank, n). The
-        covariances of the coefficient of |f| f with other parameters are omitted: most are
-        negative, so the result is too large.
+        `rows`, `rest`: covariance of the coefficients of k terms as a factor, (2 k, rank), and
+        variances added to its diagonal; `on_bias`, `on_scale`: factors for bias and relative
+        scale, (rank, n). The covariances of Kq with other parameters are omitted: most are
+        negative, so in most cases the result is too large.
         """
         kinds = [term.kind for term in self._of.terms]
         k = len(kinds)

@@ -17,7 +17,7 @@ from ..quantities import QUANTITIES
 from ..typing import Floats
 from .functions import TemperatureFunction
 
-#: Part of a variance that is below the resolution of single precision.
+#: Fraction of a variance that is below the resolution of single precision.
 _NEGLIGIBLE = 1e-7
 #: Smallest (negative) eigenvalue of a correlation matrix that is due to rounding.
 _MOST_NEGATIVE = -1e-6
@@ -50,7 +50,7 @@ class Posterior:
 
     @classmethod
     def of(cls, matrix: npt.NDArray[np.floating[Any]], variances: Floats) -> Posterior:
-        """Encode a factor, shape (n_parameters, rank), and the variances added to it."""
+        """Encode a factor, shape (n_parameters, rank), and the variances of diag(diagonal)."""
         return cls(matrix.shape[1], _encoded(matrix), _encoded(variances))
 
     @property
@@ -134,7 +134,7 @@ class ParameterLayout(NamedTuple):
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """Encode a covariance; the factor omits at most `tolerance` of each variance."""
+    """Encode a covariance; `diagonal` has at most the fraction `tolerance` of a variance."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')

@@ -7,8 +7,8 @@ initial lag states, and the thermal states of a soak and of a ramp.
 In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a part
 of time constant tau lags the board by ``tau q (1 - exp(-s / tau))``, and a play has its largest
 distance from its input. In a soak (q = 0) gradients, lags and plays are 0, except for the gradient
-of the first sensor due to self-heating, `soak_gradient_k`. The static set applies in a soak, the
-dynamic set in a ramp. Predicted variances include neither noise nor errors of the thermometers.
+of the first sensor and its lags: these are `soak_gradient_k`. In a soak the static set applies, in
+a ramp the dynamic set. Predicted variances include neither noise nor thermometer errors.
 """
 
 from collections.abc import Callable
@@ -63,8 +63,8 @@ class SlowUncertainty:
     ) -> Floats:
         """
         Evaluate the rows of the error covariance (see `unit.covariance`) at thermal states, shape
-        (width, n), one by one. `start_shares`, (n_lags, n): remaining shares of the lags' initial
-        states; `start_rates`, (n,): `ThermalMemory.start_rate` of each state, by default 0.
+        (width, n). `start_shares`, (n_lags, n): `ThermalMemory.remaining_shares` of each state;
+        `start_rates`, (n,): `ThermalMemory.start_rate` of each state, by default 0.
         Returns `Correction.n_slow` rows: a, b, c of each axis' error variance ``v(x) = a + b x + c
         x^2`` [m^2/s^4], then the rows between axes and misalignment, then the contribution of a
         nonlinearity to the coefficients of x^2 to x^6 of each axis' variance.
@@ -138,7 +138,7 @@ class SlowUncertainty:
     ) -> tuple[Floats, Floats]:
         """
         Return the variance of the bias due to the parameters at thermal states (n, width), and
-        the variance of the bias less its mean (`mean_of`), shapes (n, 3) [m^2/s^4].
+        that of the bias less the mean that `mean_of` computes, shapes (n, 3) [m^2/s^4].
         """
         columns = states.T
         phi = self._correction.table.values(columns)

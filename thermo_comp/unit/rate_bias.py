@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the bias of a unit's gyroscope, a sum of a curve over temperature and of columns."""
+"""Owns the bias of a unit's gyroscope: a curve over temperature plus weighted columns."""
 
 import math
 from dataclasses import dataclass, field
@@ -75,8 +75,8 @@ class Gyroscope:
     ]
     slow_noise_rad_s_sqrt_h: Annotated[
         tuple[_Slow, _Slow, _Slow],
-        'Slow noise: random walk of the bias, per root hour, over times shorter than its '
-        'correlation time.',
+        'Slow noise: random walk of the bias, per root hour, over times shorter than the '
+        'correlation time of the slow noise.',
     ] = NIL
     residual_sd_rad_s: Annotated[
         tuple[_Deviation, _Deviation, _Deviation],

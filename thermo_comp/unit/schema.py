@@ -41,7 +41,7 @@ Vector = tuple[float, float, float]
 
 
 def build(hint: type[Value], data: Any, key: str = '') -> Value:
-    """Build a value of a type hint; raises SchemaError with the key if the values do not fit."""
+    """Build a value of a type hint; SchemaError with the key if `data` do not fit the hint."""
     result: Value = _build(hint, data, key)
     return result
 

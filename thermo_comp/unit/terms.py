@@ -57,7 +57,7 @@ class Term(ABC):
     width_key: ClassVar[str] = ''
     #: Keys of a column that must be greater than 0.
     positive: ClassVar[_Names] = ()
-    #: Range of all values of a column of the kind, or None for the range in the bags.
+    #: Range of all possible values of the kind; None: the range is that of the fitted bags.
     bounds: ClassVar[tuple[float, float] | None] = None
     is_temperature: ClassVar[bool] = False
     #: Whether the fit estimates weights for the scale as well as for the bias.
@@ -155,7 +155,7 @@ class GradientLag(Term):
 
 
 class Square(Term):
-    """Quadratic term over the temperature of a part or, without a lag, over a heat flow."""
+    """Square of the lag of a part, for a curve over its temperature; or square of g_s - rest."""
 
     kind, formula = 'square', '(T_board - lagged T_board)^2, or q_s^2 without lag'
     groups = (('square', 'curves of parts that lag'),)
@@ -167,7 +167,7 @@ class Square(Term):
 
 
 class Cube(Board):
-    """Cubic term of a curve over the temperature of a part that lags the board."""
+    """Cube of the lag of a part, for a cubic curve over the temperature of the part."""
 
     kind, formula, groups = 'cube', '(T_board - lagged T_board)^3', ()
     order, form, centre_key = 3, Form(lambda x: x * x * x, lambda x: 3.0 * x * x), 'rest_k'
@@ -202,7 +202,7 @@ class Play(Term):
     groups = (('play', 'hysteresis'),)
 
     def source(self, column: Column) -> Quantity:
-        """Return ``P(v) - v``, P the play of half-width `width_k`, v = t or t less its lag."""
+        """Return ``P(v) - v``, P the play of half-width `width_k`, v: t, or t lagged."""
         lag = _lag_of_part(column)
         return lags.Play(lag.tau_s, column.width_k, *lag[2:])
 
