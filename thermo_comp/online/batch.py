@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the correction of arrays of samples, with the same bits as sample by sample.
+Owns the correction of arrays of samples, with the same bits as that of single samples.
 
 The compensator uses the temperature readings one by one. The segments between the readings are
 collected, evaluated together and applied to all samples with the arithmetic of single samples.
@@ -55,7 +55,7 @@ class CompensatedBlock:
 def process_block(
     compensator: Compensator, block: Block, angular_rate: Floats | None = None
 ) -> CompensatedBlock:
-    """Correct a block's samples and angular rates (n, 3), with the same bits as one by one."""
+    """Correct a block's samples and angular rates (n, 3), with the bits of single samples."""
     thermal = compensator.thermal
     stamps = np.asarray(block.accel_stamp_ns, dtype=np.int64)
     samples = np.asarray(block.accel, dtype=np.float64)
@@ -123,8 +123,8 @@ def _push(
     while arrivals and arrivals[-1][0] <= place:
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
-            # As in the node, the oldest readings of a full queue are applied; after the first
-            # sample only those up to the stamp of the next sample.
+            # The node applies waiting readings while no samples come. Here a full queue applies
+            # its old readings; after the first sample only up to the stamp of the next sample.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

@@ -7,7 +7,7 @@ make, and |f| at rest, which must be gravity.
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
 calibration, or the calibration of another unit, |f| at rest differs from gravity by more than the
-claimed uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
+stated uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
 scatter is within the sensor's noise and its mean agrees with the mean of the previous window. A
 step of |f| from a rest to another rest is judged within a second.
 """
@@ -81,7 +81,7 @@ class StuckCheck:
         self.runs: tuple[Run, ...] = ()
 
     def again(self, stamp_ns: int, x: float, y: float, z: float) -> bool:
-        """Take a sample with the last reading of any axis; return whether the sample is stuck."""
+        """Take a sample that repeats a reading of an axis; return whether the sample is stuck."""
         last = self.last
         self.last = sample = (x, y, z, stamp_ns)
         runs = self.runs or ((last, 0, 0.0),) * 3

@@ -204,7 +204,7 @@ class ThermalSide:
 
     @property
     def fresh_until_ns(self) -> int:
-        """The last stamp at which the board temperature is fresh; `EVER_NS` without a reading."""
+        """The last stamp at which the board temperature may be used; `EVER_NS` without reading."""
         if not self.model.needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
@@ -252,7 +252,7 @@ class ThermalSide:
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
         """Return the arguments of the slowly varying variance, new after each `SLOW_NS`."""
         # The unknown initial lag states depend on the board's rate, which the first readings after
-        # a start do not show: evaluate the variance in each segment.
+        # a start do not determine: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS
         key = start_ns // (SEGMENT_NS if is_young else SLOW_NS)
         if key != self._slow_key:

@@ -82,7 +82,7 @@ class Reporter:
         self._level = DiagnosticStatus.STALE
         self._n_publishers = 0
         self._last_samples = time.monotonic()
-        # At the last report: all counters, stamp of the newest sample.
+        # All counters, and the stamp of the newest sample, at the time of the last report.
         self._before = self._count()
         self._before_ns: int | None = None
 
@@ -209,7 +209,7 @@ class Reporter:
         }
 
     def _force_values(self, calibration: Calibration, status: CompensatorStatus) -> dict[str, str]:
-        """Return the values on the samples: |f|, rests, noise and uncertainty of each axis."""
+        """Return the values for the samples: |f|, rests, noise and uncertainty of each axis."""
         values, gravity = {'force excess [m/s^2]': f'{self._force_excess():.3f}'}, status.gravity
         if gravity is not None:
             values |= {

@@ -4,7 +4,7 @@
 Owns rclpy's message classes and QoS profiles by name, and numbers read from any message.
 
 A temperature may be a number in a message of any type. The class of a message is imported at run
-time: the package of a driver's messages is installed with the driver and is no dependency.
+time: a driver brings the package of its messages, which is no dependency of this package.
 """
 
 import re
@@ -26,7 +26,7 @@ _STEP = re.compile(r'([A-Za-z]\w*)|\[([0-9]{1,6})\]|\.')
 
 
 def message_class(kind: str) -> Any:
-    """Import the class of a type; ImportError, AttributeError or ValueError without a class."""
+    """Import a message class by its type; ImportError, AttributeError, ValueError if missing."""
     package, _, name = kind.partition('/msg/')
     return getattr(import_module(f'{package}.msg'), name)
 

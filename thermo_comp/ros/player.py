@@ -52,11 +52,11 @@ PATIENCE = 30.0  # longest time in which a subscriber may acknowledge no message
 
 @dataclass(frozen=True, slots=True)
 class PlayReport:
-    """Summary of a playback; topics by their full names."""
+    """Summary of a playback; the topics are full names."""
 
     n_messages: dict[str, int]
     duration_s: float  # wall time from the first message to the last acknowledgement [s]
-    #: Topics without a subscriber, and with a best-effort subscriber, which may lose messages.
+    #: Topics without a subscriber; topics with a best-effort subscriber, which may lose messages.
     unheard: list[str]
     lossy: list[str]
     #: Description of the bag, with topics chosen by type and parts that could not be read.

@@ -26,7 +26,7 @@ PROFILE = Path(__file__).with_name('fastdds_profile.xml')
 
 def use_profile() -> None:
     """Set the node's Fast DDS profile, unless a profile is set; call it before ROS starts."""
-    # The Fast DDS profile saves 25 % of CPU time with reliable subscribers (docs/benchmarks.md).
+    # The Fast DDS profile saves 25 % of CPU time with reliable subscribers (docs/ros_interface.md).
     if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
         os.environ[VARIABLE] = str(PROFILE)
 

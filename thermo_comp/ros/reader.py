@@ -28,7 +28,7 @@ from ..online.trial import tried
 from ..unit.calibration import Calibration
 from ..unit.calibration_file import SIZE_LIMIT, parse_calibration
 
-#: Time limit for reading a file [s]; a file that takes longer is refused, as on a lost drive.
+#: Time limit for reading a file [s]; a slower file, as on a lost network drive, is refused.
 LIMIT_S = 10.0
 _ENDING_S = 0.5  # time to wait for a killed process [s]
 _PR_SET_PDEATHSIG = 1  # option of Linux prctl: the signal sent when the parent ends

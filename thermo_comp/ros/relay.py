@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the processing of samples in the node, in order of arrival and independent of wake-ups.
+Owns the processing of samples in the node in order of arrival, whenever the loop wakes up.
 
 Messages do not identify their publisher. While several publishers may send on a topic, its
 messages are dropped; so is the first batch after a publisher left: the publisher may have sent it.

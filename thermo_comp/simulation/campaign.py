@@ -62,7 +62,7 @@ PLAN_NAMES = (
     *('centrifuge', 'rate-table'),
 )
 # Times of runs through several rotation rates [s]: ends of the soaks; time from the start of a run
-# to the end of its soak; duration of each rate; duration of a change of the rate.
+# to the end of the soak; duration of each rate; duration of a change of the rate.
 _SOAK_ENDS_S, _LEAD_S, _DWELL_S, _RAMP_S = (3600.0, 8100.0, 13500.0), 1800.0, 300.0, 60.0
 # Radius [m] and rotation rates [rad/s] of the simulated machines. Centrifuge: 1 m, 2 to 10 g
 # horizontally; rate table: 0.25 m, up to 1000 deg/s.
@@ -79,13 +79,13 @@ class Cyclogram:
 
     @property
     def duration_s(self) -> float:
-        """Duration of the program [s]."""
+        """Duration of the chamber program [s]."""
         return self.time_s[-1]
 
 
 def parse_cyclogram(text: str) -> Cyclogram:
     """
-    Read a program in the form below, or the name of a ready-made program.
+    Read a chamber program in the form below, or the name of a ready-made chamber program.
 
     Steps are separated by commas, semicolons or lines: ``TARGET[@RATE] [SOAK]`` with the target in
     degC, the rate in K/min and the soak as ``90min``, ``1.5h`` or ``30s``. The first step is the

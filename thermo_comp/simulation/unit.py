@@ -52,7 +52,7 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, axis: int = 0) -> np.random.Generator:
-    """Return a random generator; each source and each axis (or other index) has a stream."""
+    """Return a random generator; each source and axis (or other index) has its stream."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), axis)))
 
 

@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the detection of a departure: a sensor's rate leaves the baseline, its rate in the soak.
+Owns the detection of departures: a temperature's rate leaves the baseline, its rate in a soak.
 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
 noise as second derivative. A rate has departed if it differs from the baseline by more than the
-swing plus a multiple of the filter's noise; the multiple follows from the permitted rate of false
+swing plus a multiple of the sd of its noise; the multiple follows from the permitted rate of false
 alarms (Rice's formula, see docs/regime.md). The swing is the amplitude of the oscillation of the
-rate in a soak: the declared ripple divided by the sensor's lag, or the observed one if larger.
+rate in a soak: the ripple of the surroundings (a setting) divided by the lag of the sensor, or the
+observed amplitude if larger.
 
 The readings of a sensor with a quantum lie in cells of one quantum. If noise cannot cross a cell,
 the filters are not used: two edges of cells crossed in the same direction give the mean rate.
@@ -105,7 +106,7 @@ class ChangeDetector:
         return self._stamp_ns == stamp_ns and self._age_s > 0.0
 
     def is_back(self) -> bool:
-        """Whether the rate is within the swing and the error of the baseline."""
+        """Whether the rate is nearer to the baseline than swing plus error of the baseline."""
         return abs(self.rate - self._baseline) < self.swing + self._baseline_error
 
     def update(self, stamp_ns: int, sensor: Thermometer, pace: float) -> int:

@@ -51,7 +51,7 @@ class LagBank:
         self.has_extra = False
 
     def step(self, stamp_ns: int, value: float, sd: float = 0.0) -> None:
-        """Use the next input value [K], of the error sd `sd`; in between the input is linear."""
+        """Use the next input value [K], of error sd `sd`; the input is linear between values."""
         seen_ns = self.stamp_ns
         if seen_ns is None:
             self.stamp_ns = self.start_ns = stamp_ns
@@ -241,7 +241,7 @@ class ThermalMemory:
     def _first_order(
         self, stamp_ns: int, board: float, gradients: Sequence[float]
     ) -> tuple[list[float], list[float]]:
-        """Return each first-order lag [K], and its extra variance [K^2]."""
+        """Return each first-order lag [K], and its variance without that of the initial state."""
         values, extra = self.board.at(stamp_ns, board)
         for name, gradient in zip(self.spec.sensors, gradients, strict=True):
             if (bank := self.banks[name]).taus:

@@ -194,7 +194,7 @@ class SensorCheck:
         if self.lag_s > 0.0:
             dt = (now_ns - (self._seen_ns or now_ns)) * 1e-9
             if dt > 0.0:
-                # Expect the judged sensor to change as the other sensor, with a first-order lag.
+                # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
             # The board cannot pass the leading sensor's temperature unless that changes, too.

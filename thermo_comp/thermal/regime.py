@@ -6,7 +6,7 @@ Owns the causal decision between static and dynamic regime; the only clock is th
 The dynamic state *begins* when the rate of the leading sensor has left the baseline of the soak
 (`change_detector`), or when the rate of any sensor is clearly that of a ramp. The dynamic state is
 *held* while the rate of the case or of the board, at present or predicted half a lag ahead, may
-exceed the relaxed rate; so it continues in a ramp of constant rate. With `end_condition` = 'case'
+exceed the relaxed rate, and so throughout a ramp of constant rate. With `end_condition` = 'case'
 (the paper's rule) only the rate of the case is tested; the board's is tested while the case gives
 no readings. The derivation of the detector is in docs/regime.md.
 
@@ -148,7 +148,7 @@ class RegimeDetector:
 
 
 class _Watch:
-    """Change detection of a sensor, and whether its rate is low now and half a lag ahead."""
+    """The change detector of a sensor, and the test that its rate is low and will stay low."""
 
     def __init__(self, settings: DetectorSettings, sensor: ThermometerSettings) -> None:
         self.change = ChangeDetector(

@@ -94,7 +94,7 @@ class DetectorSettings:
     ] = 60.0
     end_condition: Annotated[
         EndCondition,
-        'Sensors that must settle before the dynamic state ends: the leading sensor alone '
+        'Sensors whose rates must be low before the dynamic state ends: the leading one alone '
         '(`case`, as in the paper), or leading sensor and board (`board`).',
     ] = 'board'
     case: Annotated[ThermometerSettings, 'Settings of the case thermometer.'] = field(

@@ -32,7 +32,7 @@ RESTART_READINGS: Final = 4  # number of consecutive outliers of equal sign for 
 # Mean time in the quiet mode [s]; the mean time in the bending mode is the lag of the sensor.
 SOAK_S: Final = 900.0
 # Sd of the process noise of the temperature's second derivative in the quiet filter, divided by
-# that in the bending filter; `CELL_SHARE`: for a sensor whose quantum hides its noise.
+# that in the bending filter; `CELL_SHARE`: for a sensor with wide cells.
 QUIET_SHARE: Final = 5e-3
 CELL_SHARE: Final = 0.2
 _ROOT_HALF: Final = 0.7071067811865476  # 1 / sqrt(2)

@@ -282,7 +282,7 @@ class ThermalTracker:
         excess = max(gradient - of_ramp - upper, lower - gradient + of_ramp)
         if excess > SELF_HEATING_CHANGE_K:
             usual = max(SELF_HEATING_CHANGE_K, SELF_HEATING_CHANGE * max(-lower, upper))
-            # In surroundings other than those of the fit the board may lag twice as much.
+            # In other surroundings the board may lag the case twice as much as in the fit.
             return max(excess - usual - abs(of_ramp), 0.0)
         return 0.0
 

@@ -121,7 +121,7 @@ class AxisSet:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """Slow error of a regime's curves at a board temperature, beyond that of the posterior."""
+    """Slow error of a regime's curves at a board temperature, not predicted by the posterior."""
 
     temperature_c: Annotated[Celsius, 'Board temperature of the entry [degC].']
     sd_m_s2: Annotated[
@@ -197,7 +197,7 @@ class Calibration:
     ]
     slow_noise_m_s2_sqrt_h: Annotated[
         tuple[_Slow, _Slow, _Slow],
-        'Slow noise of each axis: random walk of the bias, per root hour, over times shorter '
+        'Slow noise of each axis: growth of the sd of the bias per root hour, over times shorter '
         'than the correlation time of the slow noise.',
     ] = (0.0, 0.0, 0.0)
     misalignment: Annotated[
@@ -222,7 +222,7 @@ class Calibration:
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'Range of T_s - T_board - board_lag_s * dT_board/dt in the bags, s: first of `sensors`; '
+        'Range of T_s - T_board - board_lag_s * dT_board/dt in the fit, s: first of `sensors`; '
         'null: unknown. A value far outside the range (loose sensor) adds to the sd of T_board.',
     ] = None
     soak_gradient_k: Annotated[
@@ -234,7 +234,7 @@ class Calibration:
         DetectorSettings, 'Settings of the thermometers and of the regime detector.'
     ] = field(default_factory=DetectorSettings)
     provenance: Provenance = field(default_factory=Provenance)
-    evidence: Annotated[tuple[GroupEvidence, ...], 'Contribution of each group of columns.'] = ()
+    evidence: Annotated[tuple[GroupEvidence, ...], 'RMS correction by each group of columns.'] = ()
     posterior: Annotated[Posterior | None, 'Covariance of all parameters; null: unknown.'] = None
     nonlinearity: Annotated[
         Nonlinearity | None,
@@ -330,7 +330,7 @@ class Calibration:
 
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
-    """Return the index of each parameter of a calibration in its posterior."""
+    """Return the indices in the posterior of all parameters of a calibration."""
     axes = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     pairs: list[tuple[TemperatureFunction, TemperatureFunction]] = []
     for static, dynamic in axes:

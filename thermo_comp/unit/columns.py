@@ -53,7 +53,7 @@ BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
-# Types of the names of groups and kinds: text for type checkers, a choice for the file's schema.
+# A name of a group or kind is a text for type checkers, and one of the names in the schema.
 if TYPE_CHECKING:
     _Group: TypeAlias = str
     _Kind: TypeAlias = str
@@ -208,7 +208,7 @@ def bank(
     columns += _family('product', ['board'], powers=(1, 2), lags=coarse)
     columns += _family('gradient_x_temperature', ['gradient'], sensors, powers=(1,))
     columns += _family('gradient_x_temperature', ['gradient_lag'], sensors, (1,), coarse_gradient)
-    # The bias of a part that lags the board by m is a polynomial in its temperature t - m:
+    # A bias that depends on a part, which lags the board by m, is a polynomial of t - m:
     # (t - m)^2 = t^2 - 2 t m + m^2, (t - m)^3 = t^3 - 3 t^2 m + 3 t m^2 - m^3.
     columns += _family('square', ['square'], powers=(0, 1), lags=coarse)
     columns += _family('square', ['cube'], lags=coarse)

@@ -57,8 +57,8 @@ _CHUNK = 2048
 class Excess(NamedTuple):
     """How far a thermal state lies outside the calibrated ranges; 0 inside."""
 
-    temperature: float  # board temperature beyond the range of the regime's set, signed [K]
-    rate: float  # rate of the board temperature beyond its range, signed [K/s]
+    temperature: float  # board temperature beyond the range of the present regime, signed [K]
+    rate: float  # rate of the board temperature beyond this regime's range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
     relative: float  # excess of temperature plus rate plus largest of the columns [half ranges]
 

@@ -32,7 +32,7 @@ Real = TypeVar('Real', float, Floats)
 
 _OF_AXES: Final = [(u + i, u + j) for u in (0, 2, 4) for i, j in ((0, 0), (0, 1), (1, 1))]
 _PAIRS: Final = list(combinations_with_replacement(range(9), 2))
-#: Pairs of errors u of two axes, or of the misalignment and any error, each pair once.
+#: Pairs of errors u of two different axes, and pairs of a misalignment error and any error.
 BETWEEN: Final = [pair for pair in _PAIRS if pair not in _OF_AXES]
 #: Number of rows of a covariance of the nine errors u.
 N_ROWS: Final = len(_PAIRS)
@@ -62,7 +62,7 @@ class CovarianceMap:
 
 @lru_cache(maxsize=16)
 def _sums(yx: float, zx: float, zy: float) -> tuple[Ints, Floats]:
-    """Return the rows of the covariance of u, and their weights, whose sum is a coefficient."""
+    """Return, for each coefficient, rows of the covariance of u and the weights of their sum."""
     # Derivative of the force w.r.t. the errors u: coefficients of 1, x, y, z, shape (axis, 4, u).
     J = np.zeros((3, 4, 9))
     J[0, 0, 0] = J[0, 1, 1] = J[1, 0, 2] = J[1, 2, 3] = J[2, 0, 4] = J[2, 3, 5] = 1.0

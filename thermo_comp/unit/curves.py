@@ -167,7 +167,7 @@ class Curves:
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
         Differentiate values beyond the ranges w.r.t. a function's free coefficients, (n_free, n).
-        Beyond its range a curve is a constant plus a tangent, or the curve of the other set.
+        Beyond its range a curve is a constant plus either a tangent or the other set's curve.
         """
         function = self._functions.rows[regime][place]
         own_range, other_range = (

@@ -6,7 +6,7 @@ Owns functions of temperature (polynomial, cubic spline, exponential) that are 0
 A single ``t = T_board - T_ref`` [K] gives the same bits as an array: the code uses only ``+ - *
 /`` in a fixed order, and `math.exp` number by number. Each function is linear in its free
 coefficients, so `basis` gives the regressors of the fit and of the parameter covariance. The paper
-has polynomials (its equations 9 and 10).
+uses polynomials (equations 9 and 10).
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class CubicSpline(_Family):
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> CubicSpline:
-        """Return a spline with equal knots, `at_reference` at t = 0, plus `values` elsewhere."""
+        """Return a spline on `knots_k` through `at_reference` plus `values` (0 at t = 0)."""
         at = self.knots_k.index(0.0)
         moved = (*values[:at], 0.0, *values[at:])
         return replace(self, values=tuple(at_reference + v for v in moved))
@@ -210,7 +210,7 @@ class Exponential(_Family):
         return self.amplitudes
 
     def with_free(self, values: tuple[float, ...], at_reference: float) -> Exponential:
-        """Return the sum of exponentials with equal e-folds and the amplitudes `values`."""
+        """Return a sum of the exponentials `e_fold_k`, with the amplitudes `values`."""
         return replace(self, constant=at_reference - math.fsum(values), amplitudes=values)
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 #: Limits of the relative scale, also with the largest change of the scale by all columns.
 SMALLEST_RELATIVE_SCALE, LARGEST_RELATIVE_SCALE = 0.1, 10.0
-#: Largest bias / full scale: the bias of samples in an offset code is half of their range.
+#: Largest bias / full scale; samples in an offset code have a bias of half of their range.
 FULL_SCALES = 2.0
 #: Largest accepted effect of a column or of a parameter's sd / limit of the bias or scale.
 WORST = 1e6

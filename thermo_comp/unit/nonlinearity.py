@@ -69,7 +69,7 @@ class NonlinearTerm:
     left_out_gain: Annotated[
         float,
         QUANTITIES['log evidence'],
-        'Log of the ratio of mean-square errors on left-out data, without to with the term.',
+        'Log of the mean-square error on left-out data without the term / with the term.',
     ] = 0.0
 
 
@@ -102,8 +102,8 @@ class Nonlinearity:
 
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
         """
-        Raise ValueError if the slope of the terms is too large at a |f| up to `force` [m/s^2], at
-        one of the temperatures less the reference [K].
+        Raise ValueError if the slope of the terms reaches `LARGEST_SLOPE` at a |f| up to `force`
+        [m/s^2], at one of the temperatures [K from the reference].
         """
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]

@@ -19,7 +19,7 @@ from .functions import TemperatureFunction
 
 #: Fraction of a variance that is below the resolution of single precision.
 _NEGLIGIBLE = 1e-7
-#: Smallest (negative) eigenvalue of a correlation matrix that is due to rounding.
+#: Most negative eigenvalue of a correlation matrix that rounding can cause.
 _MOST_NEGATIVE = -1e-6
 _FLOAT32 = np.dtype('<f4')
 
@@ -134,7 +134,7 @@ class ParameterLayout(NamedTuple):
 
 
 def posterior_of(covariance: Floats, tolerance: float = 1e-5) -> Posterior:
-    """Encode a covariance; `diagonal` has at most the fraction `tolerance` of a variance."""
+    """Encode a covariance; `diagonal` has at most the fraction `tolerance` of each variance."""
     diagonal = np.diag(covariance).copy()
     if not np.all(diagonal >= 0.0):
         raise ValueError('`covariance` must not have a negative variance')

@@ -29,7 +29,7 @@ _CHUNK: Final = 64
 
 
 class SlowUncertainty:
-    """Error covariance of a thermal state due to the posterior and unknown initial lag states."""
+    """Error covariance at thermal states due to the posterior and unknown initial lag states."""
 
     def __init__(self, calibration: Calibration, correction: Correction) -> None:
         self._correction = correction

@@ -75,7 +75,7 @@ class Gyroscope:
     ]
     slow_noise_rad_s_sqrt_h: Annotated[
         tuple[_Slow, _Slow, _Slow],
-        'Slow noise: random walk of the bias, per root hour, over times shorter than the '
+        'Slow noise: growth of the sd of the bias per root hour, over times shorter than the '
         'correlation time of the slow noise.',
     ] = NIL
     residual_sd_rad_s: Annotated[

@@ -143,8 +143,7 @@ class GradientLag(Term):
     kind, formula, positive = 'gradient_lag', 'lagged g_s', ('tau_s',)
     groups = (
         ('gradient_lag', 'parts between case and board'),
-        # The columns of group `gradient_x_temperature` give coefficients that change with
-        # temperature.
+        # The columns of the next two groups give coefficients that change with temperature.
         ('product', 'lags, with effects that change with temperature'),
         ('gradient_x_temperature', 'heat flow, with an effect that changes with temperature'),
     )
