@@ -54,7 +54,7 @@ class Segment(NamedTuple):
     """A time interval with a linear correction, and the checks that apply to its samples."""
 
     start_ns: int
-    # False if an earlier call of `ThermalSide.segment` has returned this segment.
+    # False if an earlier call of `ThermalSide.segment` has opened this segment.
     is_new: bool
     is_too_fast: bool  # whether samples come faster than the converter can make them
     noise_excess: float  # relative excess of the noise variance because of the samples' rate

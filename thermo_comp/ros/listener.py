@@ -129,7 +129,7 @@ class LiveTopics:
         self.problems = tuple(problems)
 
     def _subscribe(self, role: Role, topic: str, kind: str, problems: list[str]) -> bool:
-        """Subscribe to a topic if it has a publisher; return whether it is subscribed."""
+        """Subscribe to a topic that has a publisher; return whether the topic is subscribed."""
         name = self._node.resolve_topic_name(split_field(topic)[0])
         if role in self._inputs:
             n_publishers = self._inputs[role].count_publishers()

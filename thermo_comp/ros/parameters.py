@@ -33,7 +33,7 @@ from .waitloop import WaitLoop, overrides
 #: Largest number of waiting requests, and of parameters in a request.
 WAITING_LIMIT, PARAMETERS_LIMIT = 64, 256
 LONGEST_FRAME = 255  # longest frame name that may be set [bytes]
-_LONGEST_REASON = 1000  # longest reason of a refusal [characters]; it may quote the request
+_LONGEST_REASON = 1000  # longest reason of a refusal, which may quote the request [characters]
 
 _DEFAULTS = CompensatorConfig()
 
@@ -52,7 +52,7 @@ class NodeConfig:
 
     calibration_file: str = _parameter(
         '',
-        'Path of the calibration (YAML). Required. Setting the same path reads the file again.',
+        'Path of the calibration (YAML). Required. Setting the present path reads the file again.',
         longest=4096,
     )
     calibration_directory: str = _parameter(

@@ -3,8 +3,8 @@
 """
 Owns the set-up of a process before its first node: handling of signals, Fast DDS profile.
 
-The middleware's signal handlers shut the context down while it is in use, which sometimes ends in
-a segmentation fault. With this module a thread asks the loop to stop, and the loop shuts
+The middleware's signal handlers shut down a context that is in use, which sometimes ends in a
+segmentation fault. With this module a thread asks the loop to stop, and the loop shuts
 everything down in order.
 """
 
@@ -25,8 +25,8 @@ PROFILE = Path(__file__).with_name('fastdds_profile.xml')
 
 
 def use_profile() -> None:
-    """Set the node's Fast DDS profile, unless a profile is set; call it before ROS starts."""
-    # The Fast DDS profile saves 25 % of CPU time with reliable subscribers (docs/ros_interface.md).
+    """Set the node's Fast DDS profile, unless a profile is set; to be called before ROS starts."""
+    # With reliable subscribers the profile saves 25 % of the CPU time (docs/ros_interface.md).
     if VARIABLE not in os.environ and not Path(LOCAL_PROFILE).is_file():
         os.environ[VARIABLE] = str(PROFILE)
 

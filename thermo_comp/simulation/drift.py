@@ -116,7 +116,7 @@ class FlowEffect(Effect):
 
 @dataclass(frozen=True)
 class CreepEffect(Effect):
-    """Creep in a part: its temperature less the temperature lagged by `time_constant` [s]."""
+    """Creep in a part: its temperature less that lagged with the time constant [s]."""
 
     part: str
     time_constant: float

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the simulation of a unit in a chamber program: raw data in blocks, and their truth."""
+"""Owns the simulation of a unit in a chamber program: raw data, true bias, scale and force."""
 
 import math
 import sys

@@ -197,7 +197,7 @@ class SensorCheck:
                 # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The board cannot pass the leading sensor's temperature unless that changes, too.
+            # The board passes the leading sensor's temperature only if that sensor has changed.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns

@@ -218,7 +218,7 @@ class ThermalTracker:
             self._target = target
 
     def weight_at(self, stamp_ns: int) -> float:
-        """Weight of the dynamic set at a stamp; it changes linearly over the transition time."""
+        """Weight of the dynamic set at a stamp, linear in time during a transition."""
         if self._weight == self._target:
             return self._target
         duration = self.config.transition_time_s

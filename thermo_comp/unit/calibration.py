@@ -133,7 +133,7 @@ class LackOfFit:
 class RegimeSet:
     """
     The curves of one regime. Outside `temperature_range_c` a curve follows that of the other
-    regime at a constant difference; outside both ranges it continues along a tangent for a quarter
+    regime at a constant difference; outside both ranges a curve follows a tangent for a quarter
     of the range and is then constant. The covariance grows with the distance from the range.
     """
 

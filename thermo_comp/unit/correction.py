@@ -178,8 +178,7 @@ class Correction:
     def by_pairs(self, slopes: Floats) -> Floats:
         """
         Differentiate bias and relative scale w.r.t. the quantities of `StateLayout.pairs`, shape
-        (p, 6, n), given the derivatives of the columns phi w.r.t. these quantities, (n_columns,
-        n).
+        (p, 6, n); `slopes`: derivatives of the columns phi w.r.t. these, (n_columns, n).
         """
         columns = self._pair_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
@@ -227,8 +226,7 @@ class Correction:
             states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, slow[:9].reshape(3, 3, n)
         )
         between = grown(slow[9:N_ROWS], growth)
-        # The largest force that each axis can measure [m/s^2], and the error variance at this
-        # force.
+        # The largest force that each axis can measure [m/s^2], and the error variance of it.
         most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
         tilts = misalignment_variances(between).max(axis=0)
         variance = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + tilts))
