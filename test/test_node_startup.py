@@ -176,7 +176,7 @@ def test_misspelt_parameters_of_the_node_are_named(unit, capfd):
     overrides += ['-p', 'qos_overrides./imu/uncompensated.subscription.depth:=3']
     with node_in_thread(*overrides):
         printed = capfd.readouterr().err
-        assert 'no parameter `transition_tme`: the value has no effect' in printed
+        assert 'there is no parameter `transition_tme`: value not used' in printed
         assert printed.count('there is no parameter') == 1
 
 

@@ -85,7 +85,7 @@ class CompensationNode:
         known = *(f'qos_overrides.{topic}.' for topic in topics), NOT_GIVEN
         for name in overrides(self.node):
             if not (self.node.has_parameter(name) or name.startswith(known)):
-                self._log.warning(f'no parameter `{one_line(name)}`: the value has no effect')
+                self._log.warning(f'there is no parameter `{one_line(name)}`: value not used')
 
     def run(self) -> None:
         """Serve until shutdown or a signal."""
