@@ -52,7 +52,7 @@ PATIENCE = 30.0  # longest time in which a subscriber may acknowledge no message
 
 @dataclass(frozen=True, slots=True)
 class PlayReport:
-    """Summary of a playback; the topics are full names."""
+    """Summary of a playback; topics are given by their full names."""
 
     n_messages: dict[str, int]
     duration_s: float  # wall time from the first message to the last acknowledgement [s]

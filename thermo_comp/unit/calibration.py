@@ -222,7 +222,7 @@ class Calibration:
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
-        'Range of T_s - T_board - board_lag_s * dT_board/dt in the fit, s: first of `sensors`; '
+        'Range of T_s - T_board - board_lag_s * dT_board/dt in the bags, s: first of `sensors`; '
         'null: unknown. A value far outside the range (loose sensor) adds to the sd of T_board.',
     ] = None
     soak_gradient_k: Annotated[
