@@ -3,11 +3,11 @@
 """
 Owns the drift watch: the comparison of ``|f| - g`` in a rest log with the claimed sd, a forecast.
 
-A unit is within its claim while the RMS of its errors along gravity, over its attitudes and
-starts, is at most `LIMIT` times the claimed sd. The verdict follows from the rests of the last
-week and from the error at the last rest by the ageing model. The forecast is the distribution of
-the time at which the RMS first exceeds the limit, for random walks of bias and scale that begin at
-the present estimate and have the variances estimated from the log.
+A unit is within its claim while the RMS of its errors along gravity, over attitudes and starts, is
+at most `LIMIT` times the sd that its calibration claims for these errors. The verdict follows from
+the rests of the last week and from the error at the last rest by the ageing model. The forecast is
+the distribution of the time at which the RMS first exceeds the limit, for random walks of bias and
+scale that begin at the present estimate and have the variances estimated from the log.
 """
 
 from collections.abc import Sequence
@@ -92,9 +92,9 @@ class Watch:
         week = (
             f'RMS of |f| - g {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} days'
         )
-        week += f', {n_out} of {counted(len(self.week), "day")} outside'
+        week += f', {n_out} of {counted(len(self.week), "day")} above the limit'
         if self.outside_since and self.recent <= 1.0:
-            week += ', but above the limit at the last rest by the ageing model'
+            week += ', but the error at the last rest by the ageing model is above the limit'
         if self.outside_since:
             text = (
                 f'the unit is outside its claim since {self.outside_since} ({week}): update its '

@@ -73,7 +73,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves limit the number of columns, but both detectors have the same columns.
+    # Errors of left-out halves limit the number of columns, which is equal for both detectors.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 

@@ -117,7 +117,7 @@ def fit_bags(
         except np.linalg.LinAlgError as error:
             raise FitError(
                 'the bags do not determine the fit: its equations have no solution in double '
-                'precision. Rests of ten minutes or longer determine more; bags that update a '
+                'precision. Record rests of ten minutes or longer; bags that update a '
                 'prior calibration can be fitted together with its bags'
             ) from error
 
@@ -350,7 +350,7 @@ def _fit(
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """Return the bags without copies of the board's thermometer; and findings on raw data."""
+    """Return the bags without thermometers that repeat the board's; findings on raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name

@@ -79,7 +79,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move all prior sd and noises towards their modes; return also the largest log ratio."""
+    """Move all prior sd and noises towards their modes; return also the largest log change."""
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     sd, determined = prior.column_sd, posterior.determined
     moves = (sd > 0.0) & ~candidates.fixed
@@ -139,8 +139,8 @@ def _updated(
 
 def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> tuple[float, float]:
     """
-    Move the sd of the supports' tilts towards the mode; return also a third of the change of its
-    logarithm. `kelvins`: RMS of the board temperature about the reference [K]
+    Move the sd of the supports' tilts towards the mode; return also a third of the change of log
+    sd. `kelvins`: RMS of the board temperature about the reference [K]
     """
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
@@ -199,7 +199,7 @@ def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> tuple[float
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, sd, slope, bend + 0.1)
-    # Bounds of the offset sd: 1e-4 of the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
+    # Bounds of the offset sd: 1e-4 times the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
     new = float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
     return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
 

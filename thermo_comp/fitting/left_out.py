@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the score of a model on data that took no part in the fit, and the comparison of two scores.
+Owns the score of a model on data left out of the fit, and the comparison of two scores.
 
 Each mounting (a position, or the rests into which knocks divide a position) is left out in turn,
 and so is each section and each half of the chamber's program, in all positions at once. Left-out

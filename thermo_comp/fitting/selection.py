@@ -177,7 +177,7 @@ class Growth:
     def lowest_degree(self, constants: Trial) -> Trial:
         """
         Fit the curve with its first column, and with more columns if they increase the log density
-        by more than `CLEAR_GAIN`: curves of many degrees explain the norms of few positions.
+        by more than `CLEAR_GAIN`: curves of high degree fit the norms of few positions exactly.
         """
         prior = constants.posterior.prior
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
@@ -194,7 +194,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus one set of groups, for the three sets of largest gain."""
+        """Fit the chosen model plus one set of groups, for up to 4 sets of the largest gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []

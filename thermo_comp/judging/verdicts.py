@@ -19,11 +19,11 @@ from .windows import JudgedWindows
 
 #: Largest ratio of RMS error to claimed RMS at which a calibration is valid.
 LARGEST_RATIO = 2.0
-#: Ratio of claimed RMS to raw RMS above which a valid calibration is called wide.
+#: Ratio of claimed RMS to raw RMS above which, without a tolerance, a valid calibration is wide.
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Largest ratio of a window's |f| to the next smaller |f| at which both are summarised together.
+# Largest ratio of a window's known |f| to the next smaller one, with both windows in one section.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')

@@ -87,7 +87,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
     if drift_k is not None:
         drift = drift_k * _slope(calibration)
-        slope = f'{drift_k:g} K times the slope of the correction'
+        slope = f'{drift_k:g} K times the RMS slope of the bias'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
     beyond = 'RMS of |f| − g in excess of noise, attitude and model'
     # The claimed sd already contains the uncertainty of gravity that was given to the fit.

@@ -19,7 +19,7 @@ _MOST_TEMPERATURES = 8
 
 
 class Program(NamedTuple):
-    """A soak, or a ramp from a soak at an end of a set's range to the other end of the range."""
+    """A soak, or a ramp from a soak at one end of a set's temperatures to the other end."""
 
     name: str  # soak, heating or cooling
     regime: RegimeSet
@@ -71,7 +71,7 @@ def evaluate(calibration: Calibration, program: Program, temperature: Floats) ->
 
 
 def curves(calibration: Calibration) -> list[Curve]:
-    """Evaluate each program over the whole range of its set."""
+    """Evaluate soak and ramps over the temperature range of their sets."""
     return [
         evaluate(calibration, program, np.linspace(*program.regime.temperature_range_c, _N_CURVE))
         for program in programs(calibration)
