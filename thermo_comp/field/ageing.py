@@ -83,7 +83,7 @@ class Change:
 
     time: time of a jump; None for a change of the slopes, which holds for all rests
     sd: prior sd of the change of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
-    may_be_gravity: whether a jump of gravity explains the rests about as well as one of levels
+    may_be_gravity: whether a jump of gravity explains the rests about as well as a jump of levels
     """
 
     kind: Literal['levels', 'gravity', 'curve']
@@ -104,7 +104,7 @@ class Change:
 class Rows:
     """
     Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
-    combinations of the rests of a start, with all their information about the six levels.
+    combinations of the rests of a start, with all information of the rests about the six levels.
 
     y: combination of the values ``|f| - g`` of the rests [m/s^2]; `by_...`, lack: see `RestSeries`
     noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row

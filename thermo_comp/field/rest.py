@@ -28,10 +28,9 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node, or a later change of its calibration, with the same `start_ns`.
+    A start of the node, or a later change of the node's calibration, which keeps `start_ns`.
 
-    `start_ns` identifies a start; it is no date, as the computer may set its clock after the
-    start.
+    `start_ns` identifies a start; it is no date, as the computer may set its clock later.
     """
 
     start_ns: int

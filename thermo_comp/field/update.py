@@ -5,8 +5,7 @@ Owns the update of a calibration from rests in the field, and its score on left-
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
 An axis is updated only if the rests reduce the sd of a combination of its bias and scale to at
-most 0.6 times the sd before the update. Other axes keep their values, with an increased
-covariance.
+most 0.6 times the sd before the update. Other axes keep their values; their sd grows.
 """
 
 from collections.abc import Iterator, Sequence
@@ -294,7 +293,7 @@ def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
 
 
 def refuse_another_unit(result: Update) -> None:
-    """Raise FitError if the RMS of |f| - g at the rests of a start exceeds both limits above."""
+    """Raise FitError if the RMS of |f| - g in a start exceeds both limits, `_LARGEST_...`."""
     series = result.series
     residual = series.residual - _gravity_part(series, result.solution)
     rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))

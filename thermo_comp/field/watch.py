@@ -146,7 +146,7 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
     # The RMS of a week responds late to a change. A unit is therefore outside its claim after one
-    # day above the limit if the error by the ageing model at the last rest is above it, too; and
+    # day above the limit if the error by the ageing model at the last rest is also above it; and
     # within its claim after two days within the limit if this error is within the limit, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()

@@ -28,7 +28,7 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior or, without a prior, a model with all columns for which the bags
+    Return the model of the prior or, without a prior, a model of all columns for which the bags
     have thermometers.
 
     `parts`: the lag of each axis, or None for the bank of time constants
@@ -119,7 +119,7 @@ def _better(fit: Fit | None, other: Fit) -> Fit:
 def _may_have_sets(selected: Selected) -> bool:
     """
     Whether the chosen model has two sets, or a model with two sets has a score within one standard
-    error of the chosen model's and, on each axis, less than 80 % of its white noise.
+    error of the chosen model's and, on each axis, less than 80 % of the chosen model's noise.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

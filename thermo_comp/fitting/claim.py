@@ -138,7 +138,7 @@ def _over_offsets(
         return covariance, float(np.hypot(offset_sd, variance**0.5)), 0.0
     if not (is_single and regression.gravity):
         return covariance, offset_sd, 0.0
-    # Bags of one turn-on do not show how well turn-ons repeat: use the prior of this sd.
+    # Bags of one turn-on do not show how well turn-ons repeat: use the prior of their sd.
     values, log_density = _offsets_tried(scale, known_sd, 'turn-on')
     variance = float(np.average(values**2, weights=np.exp(log_density)))
     return covariance, float(np.hypot(offset_sd, variance**0.5)), variance
@@ -217,8 +217,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
     sqrt(S)``, S being the information about the weight given the active columns. A column whose
     bound exceeds two sd of a window's noise enters the covariance with the bound as sd, and zero
-    weight; for this test the bound of an almost constant column is scaled to the change of
-    temperature.
+    weight; for this test the bound of an almost constant column is scaled to the RMS of t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins

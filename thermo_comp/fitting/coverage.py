@@ -157,8 +157,7 @@ def best_rests(candidates: list[Floats]) -> int:
 
     The sd of the constants follows from the directions of the rests of a set and from the
     residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd: the
-    first sets have the longest, quietest rests. If no set has six attitudes, the first set is the
-    best.
+    first sets have the longest, quietest rests. If no set has six attitudes, take the first set.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
     counts = [len(distinct_directions(up)) for up in ups]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 #: Smallest numbers of positions that determine bias and scale factor (six constants), also the
 #: misalignment (nine constants), and also, by |f|, the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
-#: Span of the board temperature below which it does not show a temperature dependence [K].
+#: Span of the board temperature below which no temperature dependence is visible [K].
 LEAST_SPAN_K = 3.0
 
 

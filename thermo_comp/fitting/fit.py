@@ -238,7 +238,7 @@ def _fit_one_environment(
 def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
-    """Repeat a fit whose settled bias is uncertain or whose supports may tilt (`refit_checks`)."""
+    """Repeat a fit whose bias at settled temperatures is uncertain, or with tilting supports."""
     if options.prior is not None or options.model == 'golovach':
         return result
     if refit_checks.extrapolates(result.fit):

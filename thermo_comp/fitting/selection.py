@@ -246,7 +246,7 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose by left-out data between fits begun with a small and with a large prior sd of mounting
     offsets. If left-out data do not decide, the fit begun with the large sd is chosen only if its
-    log density exceeds the other by `CLEAR_GAIN`. Mounting offsets and misalignments explain the
+    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the
     norms of few positions equally well, but only misalignments predict the norm of a new position.
     """
     small, large = fits[0], fits[-1]

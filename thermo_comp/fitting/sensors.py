@@ -234,7 +234,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 
 
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
-    """Return the bags without thermometers whose readings equal the board's, and their names."""
+    """Return the bags without thermometers that repeat the board's readings; their names."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
     is_read = any(len(bag.board.value) for bag in bags)
     copies = [

@@ -41,7 +41,7 @@ class Windows:
     The data of a fit: windows sorted by position and time, with every column of the table.
 
     position, bag: number of each window's position (within one bag), and bag, from 0, shape (n,)
-    section: number of the section of the program, from 0, see `windows.N_SECTIONS`, shape (n,)
+    section: number of the section of the position, from 0, see `windows.N_SECTIONS`, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: number of samples divided by the median number of a window, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
