@@ -280,7 +280,7 @@ def learn(
 
     At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
     of the node is left out if an equation of its rests (a row) is more than 5 sd from the
-    prediction by all other rows. Returns the model's sds, the model of all rows, the rests used.
+    prediction by all other rows. Returns the model's sds, the model with all rows, the rests used.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)

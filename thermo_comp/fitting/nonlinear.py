@@ -185,7 +185,7 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return `Folds.gain_of` of errors of left-out norms, without to with `dropped`."""
+        """Return the gain (`Folds.gain_of`) by `dropped` in the errors of left-out norms."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:
