@@ -373,8 +373,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior. If
-    # the initial lag states explain the residual, `noise` is close to the residual of two sets.
+    # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior, nor
+    # does any residual if the white noise is at most 1.5 times the residual of two sets.
     contradiction = ''
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and noise > 1.5 * alone
     if options.prior is not None and is_above:

@@ -13,7 +13,7 @@ does not depend on the attitude) and, if the other positions determine |f|, ``|f
 
 A model is better than another model if its error is smaller by more than the standard error over
 the folds, both for positions and for sections of the program. A model that describes only one
-recording fails for positions, one that describes only one chamber program fails for sections.
+recording fails for positions, a model of only one chamber program fails for sections.
 
 References
 ----------
