@@ -154,7 +154,7 @@ class TestWindows:
     def test_samples_too_slow_for_a_window_are_refused(self, tmp_path):
         bag = resting(tmp_path / 'bag', 20.0, rate_hz=1.0)
         with pytest.raises(
-            RecordingError, match='too low for windows of 10 s: give --window as 30 or a m'
+            RecordingError, match='too low for windows of 10 s: give --window as 30 s or a '
         ):
             judged(bag, calibration(), window_s=10.0)
 

@@ -30,11 +30,11 @@ from ..unit.calibration import Calibration
 from ..unit.gravity import MICRO_G
 from .series import RestSeries
 
-#: Centre of the prior of an sd, relative to that of the turn-on offset's sd: for the random walks
-#: of bias and of scale times g, per root day, and for the scatter of a rest. Prior sd of the
+#: Prior centres of sds, divided by the prior centre of the turn-on offset's sd: of the random
+#: walks of bias and of scale times g, per root day, and of the scatter of a rest. Prior sd of the
 #: natural logarithm of each sd in `Ageing` (1 sd is a factor of 5).
 _WALK_SHARE, _SCATTER_SHARE, _LOG_SD = 0.5, 0.3, 1.6
-#: Centre of the prior of the sd of lag states at a start, relative to that of the calibration.
+#: Prior centre of the sd of lag states at a start, divided by the sd in the calibration.
 _LAG_SHARE = 1.0
 #: Smallest centre of the prior of the turn-on offset's sd [m/s^2].
 _LEAST_TURN_ON = 5.0 * MICRO_G
@@ -52,8 +52,8 @@ _BENDS = (1.0 * MICRO_G, 10.0 * MICRO_G)
 #: is the smallest of `_BENDS`.
 _SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
 #: Largest number of rows (equations) per start of the node, in the solution and in the search for
-#: the variances; largest number of all rows in that search, because its computing time grows with
-#: the cube of this number.
+#: the variances; largest number of rows of all starts in the search, whose computing time grows
+#: with the cube of this number.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
 
 
@@ -62,9 +62,9 @@ class Ageing:
     """
     Standard deviations of the ageing model [m/s^2], except for the ratio `lags`.
 
-    bias, scale: of the random walk of the bias, and of the scale times g, per root day
-    turn_on: of the bias offset of a start of the node
-    rest: of the scatter from rest to rest
+    bias, scale: sd of the random walk of the bias, and of the scale times g, per root day
+    turn_on: sd of the bias offset of a start of the node
+    rest: sd of the scatter from rest to rest
     lags: ratio of the sd of the lag states at a start to the sd that the calibration assumes
     """
 
@@ -78,11 +78,12 @@ class Ageing:
 @dataclass(frozen=True)
 class Change:
     """
-    A jump of levels or gravity at `time` [days since 1970], or a change of the bias curves' slope.
+    A jump of levels (bias, and scale times g, of each axis) or of gravity at `time` [days since
+    1970], or a change of the slopes of the bias over temperature.
 
-    time: time of a jump; None for a change of slope, which holds for all rests
+    time: time of a jump; None for a change of the slopes, which holds for all rests
     sd: prior sd of the change of a level or of gravity [m/s^2], or of a slope [m/s^2 per K]
-    may_be_gravity: whether a jump of gravity explains the rests almost as well as one of levels
+    may_be_gravity: whether a jump of gravity explains the rests about as well as a jump of levels
     """
 
     kind: Literal['levels', 'gravity', 'curve']
@@ -92,7 +93,7 @@ class Change:
     may_be_gravity: bool = False
 
     def columns(self, rows: Rows) -> Floats:
-        """Return the derivatives by levels (n, 6), gravity (n, 1) or slopes of the bias (n, 3)."""
+        """Return derivatives of rows by levels (n, 6), gravity (n, 1) or bias slopes (n, 3)."""
         if self.time is None:
             return np.asarray(rows.by_level[:, :3] * rows.warmth[:, np.newaxis])
         of_jump = rows.by_jump[:, 6:] if self.kind == 'gravity' else rows.by_jump[:, :6]
@@ -103,11 +104,11 @@ class Change:
 class Rows:
     """
     Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
-    combinations of the rests of a start, with all their information about the six levels.
+    combinations of the rests of a start, with all information of the rests about the six levels.
 
     y: combination of the values ``|f| - g`` of the rests [m/s^2]; `by_...`, lack: see `RestSeries`
     noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row
-    rank: number of the row within its start
+    rank: number of the row among the rows of its start, from 0
     warmth: mean board temperature at the rests of a start less the reference temperature [K]
     """
 
@@ -126,7 +127,7 @@ class Rows:
 
     @property
     def by_jump(self) -> Floats:
-        """Derivatives by a jump of levels, times `_JUMP_SHARES`, and by one of gravity, (n, 7)."""
+        """Derivatives by a jump of levels, times `_JUMP_SHARES`, and of gravity, (n, 7)."""
         return np.column_stack((self.by_level * _JUMP_SHARES, self.by_gravity))
 
     def at(self, chosen: Bools) -> Rows:
@@ -135,7 +136,7 @@ class Rows:
 
 
 def rows_of(series: RestSeries, scatter: float) -> Rows:
-    """Return the equations of rests, weighted by noise and an assumed sd `scatter` [m/s^2]."""
+    """Return the equations of rests, weighted by noise and a scatter of rests [m/s^2]."""
     parts: list[tuple[Floats, ...]] = []
     variance = series.noise + (series.by_start**2).sum(axis=1) + scatter**2
     for start in np.unique(series.start):
@@ -169,7 +170,7 @@ def rows_of(series: RestSeries, scatter: float) -> Rows:
 
 
 class Model:
-    """The covariance of the rows by the sds in `Ageing`; the walks begin at the day `since`."""
+    """Covariance of rows as a function of `Ageing`; random walks begin at the day `since`."""
 
     def __init__(
         self, rows: Rows, calibration: Calibration, since: float, changes: Sequence[Change] = ()
@@ -264,7 +265,7 @@ class Model:
 
 
 def usual(calibration: Calibration) -> Ageing:
-    """Return the centres of the priors, from the residual sd of the fit or the noise in 1 Hz."""
+    """Return the prior centres of the sds, from the residual sd of the fit or noise in 1 Hz."""
     residual = max(axis.residual_sd_m_s2 for axis in calibration.static.axes())
     turn_on = max(residual or max(calibration.noise_density_m_s2_sqrt_hz), _LEAST_TURN_ON)
     walk = _WALK_SHARE * turn_on
@@ -279,7 +280,7 @@ def learn(
 
     At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
     of the node is left out if an equation of its rests (a row) is more than 5 sd from the
-    prediction by all other rows. Returns the model's sds, the model of all rows, the rests used.
+    prediction by all other rows. Returns the model's sds, the model with all rows, the rests used.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)
@@ -379,7 +380,7 @@ class Solution:
     prior, posterior: covariances at the time of the last rest, before and after the rests are used
     future: covariance that ageing adds during the time of use after the last rest
     gains, innovations: factors of the shift ``gains.T @ innovations``, with a row for each
-        equation; the shift due to the first equations is the product of the first rows
+        equation; the shift due to the first n equations is the product of the first n rows
     gravity: jumps of gravity, each with its size and the sd of the size [m/s^2]
     """
 
@@ -400,8 +401,8 @@ def solve(model: Model, ageing: Ageing, to_file: Floats, bend: Floats, ahead: fl
     """
     Condition the parameters of the calibration on the rests.
 
-    `to_file`, `bend`: derivatives of the n parameters of the file by the six levels, (n, 6), and
-    by the bias slope of each axis, (n, 3); `ahead`: days of use after the last rest
+    `to_file`, `bend`: derivatives of the n file parameters by the six levels of `Change`, (n, 6),
+    and by the bias slope of each axis, (n, 3); `ahead`: days of use after the last rest
     """
     rows = model.rows
     age = np.maximum(rows.time - model.since, 0.0)[:, np.newaxis]

@@ -63,7 +63,7 @@ class RestFinder:
         cycle_s: float = 0.0,
     ) -> None:
         # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample
-        # [m^2/s^4] of each axis, at one sample per `cycle_s`; at a higher rate it is larger.
+        # [m^2/s^4] of each axis, at one sample per `cycle_s`, larger at a higher rate.
         self._scale, self._noise, self._full_scale = scale, float(noise.sum()), full_scale
         self._state_now, self._cycle_s = state_now, cycle_s
         self._cell: _Cell | None = None

@@ -28,9 +28,9 @@ _OF_START, _OF_REST = b' {', b' ['
 @dataclass(frozen=True)
 class Start:
     """
-    A start of the node, or a later change of its calibration, with the same `start_ns`.
+    A start of the node, or a later change of the node's calibration, which keeps `start_ns`.
 
-    `start_ns` identifies a start; it is no date, as many computers set their clock only later.
+    `start_ns` identifies a start; it is no date, as the computer may set its clock later.
     """
 
     start_ns: int
@@ -185,7 +185,7 @@ def rests_of(
     Decode several files into rests without duplicates, sorted by start, then by stamp.
 
     The starts are sorted by the stamp of their last rest, because `start_ns` and the first stamps
-    may be older than the setting of the computer's clock.
+    may be from the time before the computer set its clock.
     """
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}
     n_damaged = 0

@@ -83,7 +83,7 @@ class RestSeries:
         return np.asarray(np.floor(self.time[first])[self.start], dtype=np.int64)
 
     def at(self, chosen: Bools | slice) -> RestSeries:
-        """Return the selected rests, with their starts numbered from 0 again."""
+        """Return the selected rests; the remaining starts are numbered from 0."""
         parts: dict[str, Any] = {
             name: value[chosen]
             for name, value in vars(self).items()
@@ -108,10 +108,10 @@ def read_rests(
     """
     Read the rest logs of a calibration's unit.
 
-    Returns the rests, the `Source` of an update whose claim is aged by `ahead` days, and notes.
-
-    Rests before the date of the calibration are left out, unless all are. Rests used by an earlier
-    update are left out only if `is_for_update`. Raises RecordingError if no rest remains.
+    Returns the rests, the `Source` for the provenance of an update by these rests, in whose name
+    `ahead` is the time of ageing in the covariance [days], and notes. Rests before the date of the
+    calibration are left out, unless all are before this date. Rests of an earlier update are left
+    out if `is_for_update`. Raises RecordingError if no rest remains.
     """
     files: list[Path] = []
     for path in paths:
@@ -171,7 +171,7 @@ def read_rests(
 
 
 def source_of(rests: Sequence[tuple[Start, Rest]], sha256: str, ahead: float = 0.0) -> Source:
-    """Return an update's `Source`; its name: time of the last rest, days of ageing after it."""
+    """Return the `Source` of an update, named by the last rest's time and the days of ageing."""
     end = np.datetime64(max(rest.stamp_ns for _, rest in rests), 'ns').astype('datetime64[s]')
     n_samples = sum(rest.n for _, rest in rests)
     return Source(f'{_UNTIL}{end}{_AGED}{ahead:g} d', sha256, n_samples)
@@ -295,8 +295,8 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     are averaged to one rest.
 
     The windows of a group belong to one start of the node, and differ from the first window of the
-    group by less than 1e-3 rad and 1 K. If vectors differ by an angle, the relative decrease of
-    the norm of their mean is at most half the squared angle.
+    group by less than 1e-3 in each component of the force's direction and 1 K. If vectors differ
+    by an angle, the relative decrease of the norm of their mean is at most half the squared angle.
     """
     direction = force / np.sqrt((force**2).sum(axis=1, keepdims=True))
     group = np.zeros(len(start), dtype=np.int64)

@@ -4,8 +4,8 @@
 Owns the update of a calibration from rests in the field, and its score on left-out rests.
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
-An axis is updated only if the rests reduce the sd of some combination of its bias and scale to 0.6
-of its sd before the update. Other axes keep their values, with an increased covariance.
+An axis is updated only if the rests reduce the sd of a combination of its bias and scale to at
+most 0.6 times the sd before the update. Other axes keep their values; their sd grows.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ from ..unit.provenance import Provenance, ResidualSummary, Source
 from .ageing import Ageing, Change, Model, Solution, learn, solve
 from .series import RestSeries, last_rest, valid_since
 
-#: Names of conclusions that a user can override: another gravity than stated, another unit.
+#: Conclusions that `--allow` excludes: that gravity is not as stated; that the unit is another.
 OVERRIDES = ('gravity', 'unit')
 #: Limits of the RMS of |f| - g over the rests of a start: relative to gravity (1 mg, as after a
 #: shock), and in claimed sd (30, some milli-g for a poor sensor). An RMS above both limits is
@@ -45,10 +45,11 @@ class AxisChange:
 
     bias: change of the bias at the mean temperature of the rests [m/s^2]
     scale: relative change of the scale
-    curve: change of the difference of the bias between warm and cool rests [m/s^2]
-    reading: change of the reading due to bias and scale, at the mean force of the rests [m/s^2]
-    claimed_sd: sd of the reading that the old calibration claims [m/s^2]
-    present_sd: sd of the reading with the old calibration at the last rest, with ageing [m/s^2]
+    curve: change of the bias at the 90 % quantile of temperature less that at the 10 % quantile
+    reading: change of the specific force by bias and scale, at the mean force of the rests
+    claimed_sd: sd of the specific force that the old calibration claims
+    present_sd: sd of the specific force with the old calibration at the last rest, with ageing
+    All values but `scale` and `scale_sd` are in m/s^2.
     """
 
     axis: str
@@ -139,8 +140,8 @@ def update(
         )
     _, aged, is_update = valid_since(calibration)
     first, last = float(series.time.min()), float(series.time.max())
-    # The random walk begins at the time up to which the covariance of the calibration includes
-    # ageing or, if this time is unknown or later than the rests, at the first rest.
+    # The random walks begin at the time `aged` up to which the covariance includes ageing; if this
+    # time is unknown or after the first rest (the last, for an updated file), at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
     to_file, bend = _levels(calibration), _slopes(calibration)
@@ -253,7 +254,7 @@ def _axis_changes(
 
 
 def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bools) -> Judged:
-    """Score updates by the rests before each day or, with fewer than five days, each start."""
+    """Score on each day, or on each start in fewer than 5 days, an update by earlier rests."""
     over, labels = 'days', series.day
     if len(np.unique(labels)) < 5:
         over, labels = 'starts', series.start
@@ -292,7 +293,7 @@ def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
 
 
 def refuse_another_unit(result: Update) -> None:
-    """Raise FitError if |f| - g at the rests of a start is larger than ageing explains."""
+    """Raise FitError if the RMS of |f| - g in a start exceeds both limits, `_LARGEST_...`."""
     series = result.series
     residual = series.residual - _gravity_part(series, result.solution)
     rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))
@@ -339,9 +340,9 @@ def _gravity_texts(result: Update) -> Iterator[str]:
         stated = result.series.gravity[np.argmin(np.abs(result.series.time - time))]
         yield (
             f'from {np.datetime64(int(time * 86400.0), "s")} on |f| is '
-            f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} in '
-            f'all attitudes, as if gravity were not the stated {stated:.5f} m/s^2: no scale '
-            'was changed for this; state the gravity of the place (--gravity; parameter '
+            f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} '
+            f'than before in all attitudes, as if gravity were not the stated {stated:.5f} m/s^2: '
+            'no scale was changed for this; state the gravity of the place (--gravity; parameter '
             'local_gravity of the node) or, if the stated gravity is right, use --allow gravity'
         )
 
@@ -352,7 +353,7 @@ def change_texts(result: Update) -> list[str]:
     lines = [
         f'random walk of the bias {ug_text(ageing.bias)}, of the scale '
         f'{1e6 * ageing.scale / result.calibration.gravity_m_s2:.2g} ppm per root day; '
-        f'sd of the bias offset of a start {ug_text(ageing.turn_on)}, of a rest '
+        f'sd of the bias offset of a start {ug_text(ageing.turn_on)}, of the scatter of rests '
         f'{ug_text(ageing.rest)}'
     ]
     if result.series.by_start.any():
@@ -380,6 +381,6 @@ def change_texts(result: Update) -> list[str]:
         )
     if result.n_outliers:
         lines.append(
-            f'left out, because all other rests contradict: {counted(result.n_outliers, "rest")}'
+            f'{counted(result.n_outliers, "rest")} left out: more than 5 sd from the prediction'
         )
     return lines

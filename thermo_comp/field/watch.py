@@ -3,11 +3,11 @@
 """
 Owns the drift watch: the comparison of ``|f| - g`` in a rest log with the claimed sd, a forecast.
 
-A unit is within its claim while the RMS of its errors along gravity, over its attitudes and
-starts, is at most `LIMIT` times the claimed sd. The verdict follows from the rests of the last
-week and from the error at the last rest by the ageing model. The forecast is the distribution of
-the time at which the RMS first exceeds the limit, for random walks of bias and scale that begin at
-the present estimate and have the variances estimated from the log.
+A unit is within its claim while the RMS of its errors along gravity, over attitudes and starts, is
+at most `LIMIT` times the sd that its calibration claims for these errors. The verdict follows from
+the rests of the last week and from the error at the last rest by the ageing model. The forecast is
+the distribution of the time at which the RMS first exceeds the limit, for random walks of bias and
+scale that begin at the present estimate and have the variances estimated from the log.
 """
 
 from collections.abc import Sequence
@@ -92,9 +92,9 @@ class Watch:
         week = (
             f'RMS of |f| - g {self.recent:.2g} times the limit over the last {_WINDOW_DAYS} days'
         )
-        week += f', {n_out} of {counted(len(self.week), "day")} outside'
+        week += f', {n_out} of {counted(len(self.week), "day")} above the limit'
         if self.outside_since and self.recent <= 1.0:
-            week += ', but above the limit at the last rest by the ageing model'
+            week += ', but the error at the last rest by the ageing model is above the limit'
         if self.outside_since:
             text = (
                 f'the unit is outside its claim since {self.outside_since} ({week}): update its '
@@ -146,7 +146,7 @@ def watch(series: RestSeries, calibration: Calibration, tolerance: float | None 
         forecast, interval = _forecasts(updated, tolerance)
     is_out, is_row_out = recent > 1.0, np.array([not row.is_within for row in days])
     # The RMS of a week responds late to a change. A unit is therefore outside its claim after one
-    # day above the limit if the error by the ageing model at the last rest is above it, too; and
+    # day above the limit if the error by the ageing model at the last rest is also above it; and
     # within its claim after two days within the limit if this error is within the limit, too.
     is_error_out = bool(forecast) and forecast[1] == 0.0
     is_out[-1] &= is_error_out or is_row_out[-2:].any()

@@ -28,7 +28,7 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior or, without a prior, a model with all columns for which the bags
+    Return the model of the prior or, without a prior, a model of all columns for which the bags
     have thermometers.
 
     `parts`: the lag of each axis, or None for the bank of time constants
@@ -73,7 +73,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Left-out halves limit the number of columns, but both detectors have the same columns.
+    # Errors of left-out halves limit the number of columns, which is equal for both detectors.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -119,7 +119,7 @@ def _better(fit: Fit | None, other: Fit) -> Fit:
 def _may_have_sets(selected: Selected) -> bool:
     """
     Whether the chosen model has two sets, or a model with two sets has a score within one standard
-    error of the chosen model's and, on each axis, less than 80 % of its white noise.
+    error of the chosen model's and, on each axis, less than 80 % of the chosen model's noise.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

@@ -155,7 +155,7 @@ def _valid_columns(
             # A part lags in cooling and in heating, so the range of an odd power of its lag is
             # extended to the same values of opposite sign.
             valid = union((valid, (-valid[1], -valid[0])))
-        # A column whose weight belongs only to curves over parts' temperatures gets their group.
+        # A column whose weight is only that of curves over parts' temperatures is of group `part`.
         group = PART if k in weighed and not alone[k] else column.group
         valid = valid if known is None else union((valid, column.range))
         result.append(replace(column, group=group, range=valid))
@@ -163,7 +163,7 @@ def _valid_columns(
 
 
 def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
-    """Return the response columns in a mask of columns, also those in sums for part curves."""
+    """Return the response columns that a mask selects, itself or as a sum (`part_curves`)."""
     sums, n_curves = windows.model.part_curves.sums, len(windows.model.sets.groups)
     contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
     return [int(k) for k in np.flatnonzero(contained[n_curves:])]

@@ -138,7 +138,7 @@ def _over_offsets(
         return covariance, float(np.hypot(offset_sd, variance**0.5)), 0.0
     if not (is_single and regression.gravity):
         return covariance, offset_sd, 0.0
-    # Bags of one turn-on do not show how well turn-ons repeat: use the prior of this sd.
+    # Bags of one turn-on do not show how well turn-ons repeat: use the prior of their sd.
     values, log_density = _offsets_tried(scale, known_sd, 'turn-on')
     variance = float(np.average(values**2, weights=np.exp(log_density)))
     return covariance, float(np.hypot(offset_sd, variance**0.5)), variance
@@ -214,10 +214,10 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
     """
     Add columns that the data do not determine to the prior, so that their variance is not 0.
 
-    The weight of an inactive column is consistent with 0, but the data bound the weight only to
-    ``1 / sqrt(S)``, S being its information given the active columns. A column whose bound exceeds
-    two sd of a window's noise enters the covariance with the bound as sd, and zero weight; for
-    this test the bound of an almost constant column is scaled to the change of temperature.
+    The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
+    sqrt(S)``, S being the information about the weight given the active columns. A column whose
+    bound exceeds two sd of a window's noise enters the covariance with the bound as sd, and zero
+    weight; for this test the bound of an almost constant column is scaled to the RMS of t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
@@ -244,7 +244,7 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
         typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
-        # A curve column that the data do not determine changes the slope by up to half of it.
+        # A curve column that the data do not determine changes this slope by up to half the slope.
         unseen = 0.5 * of_curve
         typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
         sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
@@ -278,7 +278,7 @@ def _over_mountings(
 
     fits = solved(tried)
     # With a large mounting sd the attitudes absorb errors of the model, which increases the log
-    # evidence: relative to the mode, it is limited to that of the norms plus `CLEAR_GAIN`.
+    # evidence. The increase from the mode is limited to that by the norms plus `CLEAR_GAIN`.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -347,7 +347,7 @@ def _excess_over_priors(
 
 
 def _excess(covariance: Floats, other: Floats) -> Floats:
-    """Return ``covariance - other`` with negative eigenvalues, in units of `other`, set to 0."""
+    """Scale ``covariance - other`` by the sds of `other`; set negative eigenvalues to 0."""
     sd = np.sqrt(np.diag(other))
     values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

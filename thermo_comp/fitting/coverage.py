@@ -143,7 +143,7 @@ def rough_centre(means: Floats) -> Floats:
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the largest sd of a constant over the noise sd of |f|, for directions (n, 3)."""
+    """Return the ratio of the largest sd of a constant to the noise sd of |f|; `up`: (n, 3)."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:
@@ -156,8 +156,8 @@ def best_rests(candidates: list[Floats]) -> int:
     Return the index of the best set of rests; each set has mean readings of shape (n, 3).
 
     The sd of the constants follows from the directions of the rests of a set and from the
-    residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd, because
-    earlier sets have stricter thresholds. If no set has six attitudes, the first set is the best.
+    residuals of |f|. The best set is the first whose sd is within 2 % of the smallest sd: the
+    first sets have the longest, quietest rests. If no set has six attitudes, take the first set.
     """
     ups = [directions(means, rough_centre(means)) for means in candidates]
     counts = [len(distinct_directions(up)) for up in ups]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 #: Smallest numbers of positions that determine bias and scale factor (six constants), also the
 #: misalignment (nine constants), and also, by |f|, the sd of mounting offsets.
 POSITIONS_NEEDED, POSITIONS_FOR_MISALIGNMENT, POSITIONS_FOR_MOUNTINGS = 6, 9, 12
-#: Span of the board temperature below which it does not show a temperature dependence [K].
+#: Span of the board temperature below which no temperature dependence is visible [K].
 LEAST_SPAN_K = 3.0
 
 
@@ -74,7 +74,7 @@ def judge_windows(
     Check temperatures, ramps and directions `up`, shape (n, 3), of the windows at rest.
 
     With a prior calibration of the unit, which contains the effects of temperature and of ramps,
-    the span and the ramps are not judged, but temperatures beyond the range of the prior.
+    temperatures beyond the range of the prior are judged instead of the span and the ramps.
     """
     yield _judge_positions(up)
     used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
@@ -148,7 +148,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
 def _ramp_rates(windows: ThermalWindows) -> Floats:
     """
     Return the rate of the board temperature [K/min], shape (n,). The rate is set to 0, as noise,
-    where the slope of the windows' mean temperatures is below half of it.
+    where the slope of the windows' mean temperatures is below half of the rate.
     """
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
@@ -247,7 +247,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
     if options.mounting_sd is not None or options.prior is not None or n < POSITIONS_NEEDED:
         return
-    assumed = f'the uncertainty assumes {ug_text(offset_sd)}: state --mounting-sd'
+    assumed = f'the uncertainty assumes an sd of {ug_text(offset_sd)}: state --mounting-sd'
     # Smallest number of turn-ons that determine the sd of turn-on offsets.
     needed = 4
     if n_turn_ons < min(n, needed):
@@ -373,8 +373,8 @@ def judge_result(
     else:
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
-    # Neither a bias offset of up to 2 sd (2 `slow`) after a new turn-on contradicts the prior, nor
-    # a residual that the initial lag states explain: then `noise` is about that of two sets alone.
+    # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior, nor
+    # does any residual if the white noise is at most 1.5 times the residual of two sets.
     contradiction = ''
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and noise > 1.5 * alone
     if options.prior is not None and is_above:

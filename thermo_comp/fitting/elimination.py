@@ -305,7 +305,7 @@ def _variance(derivatives: Floats, root: Floats) -> Floats:
 
 
 def _square(*blocks: Floats) -> Floats:
-    """Return what the elimination of blocks subtracts from the remaining equations, (k, k)."""
+    """Return the matrix that the elimination of blocks subtracts from the equations, (k, k)."""
     rows = np.concatenate([block.reshape(-1, block.shape[2]) for block in blocks])
     return np.asarray(rows.T @ rows)
 

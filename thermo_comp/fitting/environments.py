@@ -39,7 +39,7 @@ from .windows import ThermalWindows, thermal_windows
 
 
 def _is_far_above(square: Floats | float, usual: float) -> Bools:
-    """Whether an RMS error exceeds five times a usual RMS error; both are mean squares."""
+    """Whether an RMS error exceeds five times a usual one; both arguments are mean squares."""
     return np.asarray(square > 5.0**2 * usual)
 
 
@@ -126,7 +126,7 @@ def contradiction(
     is_changed = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
-        # A minority that agrees by its attitudes alone is of the same environment as the majority.
+        # All bags are of one environment, whose effect on drifts is small in some attitudes.
         is_far[:] = True
     is_changed |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
     return Contradiction(np.flatnonzero(is_far).tolist(), is_changed)

@@ -216,8 +216,8 @@ class Equations(Series):
         """
         Return index and factor of the series of each active nonlinear coefficient, see `Tangent`.
 
-        The factor 1 + S s of the scale multiplies the terms at the reference temperature. It is
-        left out in the terms' change per kelvin, where its effect is negligible.
+        The factor 1 + S s of the scale multiplies the terms at the reference temperature. In the
+        terms' change per kelvin this factor is left out, as its effect is negligible.
         """
         active = np.flatnonzero(layout.nonlinear[0] >= 0)
         if self.forces is None or not len(active):

@@ -117,7 +117,7 @@ def fit_bags(
         except np.linalg.LinAlgError as error:
             raise FitError(
                 'the bags do not determine the fit: its equations have no solution in double '
-                'precision. Rests of ten minutes or longer determine more; bags that update a '
+                'precision. Record rests of ten minutes or longer; bags that update a '
                 'prior calibration can be fitted together with its bags'
             ) from error
 
@@ -238,7 +238,7 @@ def _fit_one_environment(
 def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
-    """Repeat a fit whose settled bias is uncertain or whose supports may tilt (`refit_checks`)."""
+    """Repeat a fit whose bias at settled temperatures is uncertain, or with tilting supports."""
     if options.prior is not None or options.model == 'golovach':
         return result
     if refit_checks.extrapolates(result.fit):
@@ -350,7 +350,7 @@ def _fit(
 def _judged(
     bags: Sequence[ReducedBag], options: FitOptions
 ) -> tuple[list[ReducedBag], list[Finding]]:
-    """Return the bags without copies of the board's thermometer; and findings on raw data."""
+    """Return the bags without thermometers that repeat the board's; findings on raw data."""
     has_board = [bool(len(bag.board.value)) for bag in bags]
     if any(has_board) and not all(has_board):
         name = bags[has_board.index(False)].source.name

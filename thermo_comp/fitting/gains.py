@@ -20,8 +20,7 @@ import numpy as np
 
 from ..typing import Bools, Floats, Ints
 
-# Squares of the factors by which the prior sd of new columns is multiplied; the factor with the
-# largest gain is used.
+# Squares of factors of the prior sd of new columns; the factor with the largest gain is used.
 _SQUARED_FACTORS = (10.0 ** np.arange(-4.0, 1.01, 0.25))[:, None] ** 2
 
 
@@ -46,7 +45,7 @@ def log_bayes_factors(mode: Floats, covariance: Floats, places: Ints, prior_sd: 
 @dataclass(frozen=True)
 class Inactive:
     """
-    Sparsity and quality factors of inactive columns, given the active ones [2]_.
+    Sparsity and quality factors of inactive columns, given the active columns [2]_.
 
     part, column: part (0: bias, 1: scale) and column of each of k inactive columns, shape (k,)
     S: sparsity factor: information about the weights, ordered by column, then axis, (3 k, 3 k)

@@ -87,7 +87,7 @@ def add_gyroscope(
     fixed_sd = replace(fit.posterior.prior, offset_scale=0.0)
     chosen = replace(fit.posterior, prior=fixed_sd)
     claim = claim_of(regression, chosen, lacks_effects=fit.selected.lacks_effects)
-    # The offsets contain the Earth's rate, which is no error of the gyroscope: subtract it.
+    # The offsets contain the Earth's rate, no error of the gyroscope: subtract its variance.
     turn_on = math.sqrt(max(claim.offset_sd**2 - earth_sd**2, 0.0))
     claim = replace(claim, offset_sd=turn_on)
     triad = build_calibration(fit, claim, bags, calibration.unit)

@@ -79,7 +79,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move all prior sd and noises towards their modes; return also the largest log ratio."""
+    """Move all prior sd and noises towards their modes; return also the largest log change."""
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     sd, determined = prior.column_sd, posterior.determined
     moves = (sd > 0.0) & ~candidates.fixed
@@ -139,8 +139,8 @@ def _updated(
 
 def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> tuple[float, float]:
     """
-    Move the sd of the supports' tilts towards the mode; return also a third of the change of its
-    logarithm. `kelvins`: RMS of the board temperature about the reference [K]
+    Move the sd of the supports' tilts towards the mode; return also a third of the change of log
+    sd. `kelvins`: RMS of the board temperature about the reference [K]
     """
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
@@ -150,15 +150,14 @@ def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> tuple[float, float]:
     square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
     effective = posterior.determined[posterior.layout.tilt].sum()
     step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
-    # An error of 15 % of the sd of tilts hardly changes the fit, so a third of the change of its
-    # logarithm is compared with the limit of convergence, 0.05.
+    # An error of 15 % of the sd of tilts hardly changes the fit, so a third of the change of log
+    # sd is compared with the limit of convergence, 0.05.
     return float(sd * np.exp(step)), float(np.abs(step)) / 3.0
 
 
 def _pose_sd(posterior: PosteriorMode) -> tuple[float, float]:
     """
-    Move the sd of the attitudes about their poses towards the mode; return also the change of the
-    logarithm of the sd.
+    Move the sd of attitudes about their poses towards the mode; return also the change of log sd.
     """
     sd, layout = posterior.prior.pose_sd, posterior.layout
     if not layout.pose.size:
@@ -187,8 +186,7 @@ def _toward(
 def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> tuple[float, float]:
     """
     Move the sd of the offsets of mountings or turn-ons, the unknowns at `places`, towards the mode
-    under a half-Student prior; return also the change of log sd, or 0 if the data do not determine
-    the offsets.
+    under a half-Student prior; return also the change of log sd, or 0 for undetermined offsets.
     """
     scale = posterior.prior.offset_scale
     if scale <= 0.0 or not places.size:
@@ -199,7 +197,7 @@ def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> tuple[float
     slope = (STUDENT_NU + 1.0) * square / (STUDENT_NU + square)
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, sd, slope, bend + 0.1)
-    # Bounds of the offset sd: 1e-4 of the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
+    # Bounds of the offset sd: 1e-4 times the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
     new = float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
     return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
 
@@ -341,11 +339,11 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
 
 def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
     """
-    Return the columns that are the only lag in the bias, or in the scale, of a model that also has
-    products or squares of lags there, shape (2, m).
+    Return the columns that are the only lag in the bias (or scale) of a model whose bias (or
+    scale) also has products or squares of lags, shape (2, m).
 
-    A product t m of temperature and lag approximates the lag m at the rates of one program, but
-    not at other rates, so a model with products keeps a lag (marginality, [3]_).
+    A product t m of temperature and lag approximates the lag m at the rates of one chamber
+    program, but not at other rates, so a model with products keeps a lag (marginality, [3]_).
     """
     groups, used = np.array(windows.groups), column_sd > 0.0
     is_lag = used & np.isin(groups, LAGS) & (windows.lag >= 0)

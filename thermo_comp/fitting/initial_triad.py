@@ -3,7 +3,7 @@
 """
 Owns the initial triad: constant bias, scale and misalignment from the mean readings of positions.
 
-Without temperature, the mean readings of the positions lie on an ellipsoid, which is fitted by
+Without thermal effects the mean readings of the positions lie on an ellipsoid, which is fitted by
 robust least squares on ``|f| - g``. The fit begins with the bias and scale that follow from the
 extremes of the mean readings on each axis.
 """

@@ -44,7 +44,7 @@ class Problem:
 
     start: initial bias, scale and misalignment, without effects of temperature
     up: directions of the positions, shape (n_positions, 3)
-    is_by_settled: whether a model must not increase the expected error of the settled bias
+    is_by_settled: whether models must not increase the expected bias error at settled temperatures
     has_pieces: whether the positions are pieces of rests, see `refit_checks`
     """
 
@@ -77,7 +77,7 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     # similar amounts, so only the differences of |f| between positions determine the curve.
     everywhere = np.ones(windows.data.n_positions, dtype=bool)
     at_rest = replace(windows, data=rests.constant_in(windows.data, everywhere, everywhere))
-    # One regression reports progress from 0.7 to 0.95: map this range to a half for each of two.
+    # A regression reports progress from 0.7 to 0.95: map it to one half of this range for each.
     first = replace(problem, progress=lambda part: problem.progress(0.35 + 0.5 * part))
     second = replace(problem, progress=lambda part: problem.progress(0.475 + 0.5 * part))
     fit, of_drifts = _regress(at_rest, first, is_at_rest=True), _regress(windows, second)
@@ -110,7 +110,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Misalignments would explain turn-on offsets, which here are no unknowns: reduce their sd.
+        # Misalignments would explain turn-on offsets, which are no unknowns here: reduce the sd.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)

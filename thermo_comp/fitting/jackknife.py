@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the covariance due to effects that the model lacks: a jackknife over the program's sections.
+Owns the covariance due to effects that the model lacks: a jackknife over sections of the test.
 
 The covariance of a fit contains only the errors due to noise. If the model lacks an effect, the
-best weights differ between sections of the program, and the error in another program is as large
-as these differences. The jackknife [1]_ estimates the differences from fits without one section.
+best weights differ between sections of the chamber program, and the error in another program is as
+large as these differences. The jackknife [1]_ estimates these differences by fits without one
+section.
 
 References
 ----------
@@ -23,7 +24,7 @@ from .regression import PosteriorMode, Regression
 
 def jackknife_covariance(regression: Regression, posterior: PosteriorMode) -> Floats:
     """
-    Return the covariance of the unit's unknowns by the jackknife over the sections of the program,
+    Return the covariance of the unit's unknowns by the jackknife over the sections of the test,
     shape (n_unit, n_unit), or 0 if noise explains how the unknowns change without each section.
     """
     n = posterior.layout.n_unit

@@ -66,7 +66,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     longer, and their directions differ by less than 10 degrees.
     """
     cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
-    # At a low sample rate gaps are long: rests end at borders of cells of usually 30 samples.
+    # At a low sample rate gaps are long: a rest is made of cells, usually of 30 samples each.
     longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
     margin_s = max(_MARGIN_S, _MARGIN_SAMPLES * cycle_s)
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
@@ -174,7 +174,7 @@ def _examine(
 
 
 def _correlation(residual: Floats, sd: Floats) -> Floats:
-    """Return the sd of the mean of residuals / its value for white noise of `sd`, >= 1, (3,)."""
+    """Return sd of the mean of residuals, divided by that for white noise `sd`, >= 1, (3,)."""
     # A lag-1 correlation r of the means of 40 pieces multiplies the variance of the mean of all
     # pieces by (1 + r) / (1 - r).
     size = max(len(residual) // 40, 1)
@@ -248,7 +248,7 @@ def whitened(values: Floats, r: float) -> Floats:
 
 
 def _step(time: Floats, values: Floats, at: float, r: float = 0.0) -> tuple[Floats, float, Floats]:
-    """Fit a step and a linear drift: return the step, its sd / noise sd, residuals (n, k)."""
+    """Fit a step and a linear drift; return step, its sd in noise sds, residuals (n, k)."""
     trend = _trend(time, r)
     jump = whitened((time >= at).astype(np.float64)[:, None], r)[:, 0]
     jump -= trend @ (trend.T @ jump)

@@ -64,7 +64,7 @@ class Layout:
 
     @cached_property
     def shared(self) -> Ints:
-        """Indices of radius, misalignment and poses, common to all axes: the unit's last ones."""
+        """Indices of the unit's unknowns common to all axes: radius, misalignment and poses."""
         return np.concatenate((self.radius, self.misalignment, self.pose.ravel()))
 
     @property

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the score of a model on data that took no part in the fit, and the comparison of two scores.
+Owns the score of a model on data left out of the fit, and the comparison of two scores.
 
 Each mounting (a position, or the rests into which knocks divide a position) is left out in turn,
 and so is each section and each half of the chamber's program, in all positions at once. Left-out
-halves detect columns that interpolate between the sections of one program but would fail in
+halves detect columns that interpolate between sections of one chamber program but would fail in
 another program. The left-out windows are corrected as the node would correct them: with the unit's
 parameters alone, initial lag states at their prior mean, no mounting offsets and no tilts of the
 support. The errors are the drift (the force along each axis less its mean over the position, which
@@ -13,7 +13,7 @@ does not depend on the attitude) and, if the other positions determine |f|, ``|f
 
 A model is better than another model if its error is smaller by more than the standard error over
 the folds, both for positions and for sections of the program. A model that describes only one
-recording fails for positions, a model that describes only one program fails for sections.
+recording fails for positions, a model of only one chamber program fails for sections.
 
 References
 ----------
@@ -117,13 +117,13 @@ class Score:
     """
     Left-out errors of a model.
 
-    positions, sections: drift of left-out positions, and of left-out sections of the program
+    positions, sections: drift of left-out positions, and of left-out sections of the test
     norms: ``|f| - g`` of left-out positions whose norm the other positions determine
     force: force in each window, corrected by a fit without the window's position; NaN if the norm
         of this position is not scored, shape (n, 3)
     drift: drift of each window by a fit without its position or, if that fit does not determine
         the drift, without its section, shape (n, 3)
-    halves: drift of left-out halves of the program, at temperatures that occur in the other half
+    halves: drift of left-out halves of the test, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
     settled: expected error of the bias at settled temperatures [m/s^2], see `settled_bias`; 0 in a
@@ -179,8 +179,8 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
     sections. If the drifts of both models are equal, the gain is the log ratio of the errors of
-    left-out norms, if it exceeds two standard errors. `by_halves`: whether an increased
-    error of left-out halves of the program, a sign of too many columns, excludes a gain.
+    left-out norms, if that exceeds two standard errors. `by_halves`: whether an increased error of
+    left-out halves of the chamber program, a sign of too many columns, excludes a gain.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
@@ -233,8 +233,8 @@ def is_near(chosen: Score, other: Score) -> bool:
 def _beyond_thermometer(before: Score, after: Score) -> list[tuple[float, float] | None]:
     """
     Return the log ratios of `Score.kinds` (`Folds.gain_of`), None for a kind whose errors a coarse
-    thermometer explains. Errors of a coarse thermometer repeat in all bags of one program: a model
-    of these errors is better on left-out bags, but fails in another program.
+    thermometer explains. Such errors repeat in all bags of one chamber program: a model of
+    these errors is better on left-out bags, but fails in another program.
     """
     is_known = before.norms.rms > _NOISE_RATIO * before.by_thermometer
     keep = (not before.is_by_thermometer, not before.is_by_thermometer, is_known)

@@ -177,7 +177,7 @@ class _TermFits:
         return score_of(self._regression, self.posterior(used))
 
     def term(self, kind: int) -> _Active:
-        """Return the indices of a term's coefficient at the reference, and of that per kelvin."""
+        """Return the indices of a term's coefficient, and of its change per kelvin."""
         return frozenset((kind, self._n_kinds + kind))
 
     def loss(self, used: _Active, dropped: _Active) -> float:
@@ -185,7 +185,7 @@ class _TermFits:
         return self.posterior(used).log_evidence - self.posterior(used - dropped).log_evidence
 
     def left_out_gain(self, used: _Active, dropped: _Active) -> tuple[float, float]:
-        """Return the log ratio (`Folds.gain_of`) of left-out norms without and with `dropped`."""
+        """Return the gain (`Folds.gain_of`) by `dropped` in the errors of left-out norms."""
         return self.score(used - dropped).norms.gain_of(self.score(used).norms) or (0.0, 0.0)
 
     def is_determined(self, used: _Active, at: int) -> bool:

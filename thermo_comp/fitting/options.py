@@ -183,7 +183,7 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name in _POLYNOMIALS:
         return Polynomial((0.0, *[1.0] * (1 + _POLYNOMIALS.index(name))))
     if name == 'exponential':
-        # Exponentials that grow by e in 15 K (as leakage currents, which double in 10 K) and 30 K.
+        # Exponentials that grow e-fold in 15 K (leakage currents, which double in 10 K) and 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
     # The spline has four pieces; a knot at the reference temperature replaces nearby knots.
     knots = np.linspace(lower, upper, 5)

@@ -123,7 +123,7 @@ def informative_priors(
         return result
 
     stated = options.ageing_bias, options.ageing_scale
-    # Stated ageing, with several uncorrelated variances added, relative to those of the prior.
+    # Stated ageing, with uncorrelated variances added: 0 to 1 times the variances of the prior.
     tried = [(grown(*stated), share, 0.0) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
         # Ageing to try: sd of the biases [g] and of the scale factors. Both are equal, because

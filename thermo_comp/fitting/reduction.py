@@ -80,7 +80,7 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite, or whose stamps are out of order
     n_saturated: number of samples at the full scale
-    n_cells, n_still_cells: number of cells in the bag, and in its rests
+    n_cells, n_still_cells: number of cells (means of half a second) in the bag, and in its rests
     window_s: length of a window [s]; above the requested length if the sample rate is low
     cycle_s: typical interval between samples [s]
     is_integer: whether all samples are integers
@@ -233,7 +233,7 @@ def _reduced(
     if source.force is None:
         ranges = _rests(cells, min_rest_s, still_sd)
     else:
-        # |f| at rest is not gravity, so the norms of rests cannot decide on the thresholds.
+        # |f| at rest is not gravity, so thresholds cannot be chosen by the norms of rests.
         cells = stillness.without_rotation(cells)
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
@@ -289,8 +289,8 @@ def _cycle_s(cells: Cells) -> float:
 
 def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
     """
-    Keep plausible readings with rising stamps; average groups of readings over about 0.2 s if the
-    readings are closer in time.
+    Keep plausible readings with rising stamps; average groups of readings over about 0.2 s if
+    the mean interval between readings is at most 0.1 s.
 
     No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
     """
@@ -429,7 +429,7 @@ def rounding_sd(variance: Floats, drift: Floats, quantum: Floats) -> Floats:
     """
     Return the sd of the error of a mean by rounding to a converter's steps, shape (3,).
 
-    `variance`: median variance of the rounded samples in a cell. If it is not 0, the noise of the
+    `variance`: median variance of the rounded samples in a cell; above 0, the noise of the
     samples averages the rounding error to 0.
     `drift`: range of the means; a drift over n steps averages the rounding errors of n + 1 steps.
     """

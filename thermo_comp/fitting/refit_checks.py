@@ -42,8 +42,8 @@ SLOW_TILTS = advice(
 
 def extrapolates(fit: Fit) -> bool:
     """
-    Whether the left-out drift of the chosen model exceeds noise, and the expected error of its
-    settled bias is larger than that of a model with fewer groups, see `settled_bias`.
+    Whether the left-out drift of the chosen model exceeds noise, and its bias at settled
+    temperatures is expected to be less accurate than that of a smaller model (`settled_bias`).
     """
     settled, trials = fit.windows.data.settled, fit.selected.trials
     chosen = next((trial for trial in trials if trial.is_chosen), None)

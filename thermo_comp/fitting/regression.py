@@ -135,8 +135,8 @@ class Point:
     @property
     def _common_variance(self) -> float:
         """Prior variance of the sum, over the bags, of an initial lag state."""
-        # The prior sd of the mean of a lag state over the bags is 0.1 of the sd in one bag: a mean
-        # that differs from 0 is an effect of the unit.
+        # The prior sd of the mean of a lag state over the bags is 0.1 times its sd in one bag: a
+        # mean that differs from 0 is an effect of the unit.
         return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
 
     @cached_property
@@ -317,7 +317,7 @@ class Regression(Equations):
         return point.posterior(point)
 
     def step(self, state: State, prior: Prior) -> PosteriorMode:
-        """Take one step towards the mode; the covariance is that of the equations before it."""
+        """Take one step towards the mode; the covariance is that at `state`, before the step."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
         end = point.stepped()
@@ -354,9 +354,9 @@ class Regression(Equations):
 
 def _damped(normal: Normal, layout: Layout) -> Normal:
     """
-    Reduce the step of the nonlinear unknowns by about 1e6, by this factor on their diagonal of the
-    normal equations. With an informative prior, which correlates the unknowns, a factor far above
-    1e6 would cause errors of double precision.
+    Multiply the diagonal of the normal equations of the nonlinear unknowns by 1e6, which divides
+    the step of these unknowns by about 1e6. With an informative prior, which correlates the
+    unknowns, a factor far above 1e6 would cause errors of double precision.
     """
     local, unit = normal.local.copy(), normal.unit.copy()
     at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]

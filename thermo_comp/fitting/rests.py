@@ -22,7 +22,7 @@ from .windows import LAGS, ThermalWindows
 def is_constant(windows: ThermalWindows, part: Ints) -> bool:
     """
     Whether the board temperature changes less (RMS) within positions, or within bags, than from
-    one to the next; `part`: number of the position, or of the bag, of each window, shape (n,).
+    one position or bag to the next; `part`: number of position, or of bag, of each window, (n,).
     """
     t = windows.temperature
     within = within_positions(t[:, None], part)[:, 0]
@@ -38,9 +38,9 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
     Return the heated or cooled positions, shape (n_positions,): those whose temperature changes by
-    more than a tenth of the span of all temperatures, or whose mean temperature is farther than
-    this from the median; all positions if there is no such position. Short rests in other
-    attitudes in a room do not count: their drifts hardly separate bias and scale factor.
+    more than a tenth of the span of all temperatures, or whose mean temperature differs by more
+    than a tenth of the span from the median; all positions if there is no such position. Short
+    rests in other attitudes in a room do not count: their drifts hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]

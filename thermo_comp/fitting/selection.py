@@ -75,7 +75,7 @@ class Selected:
 
     @property
     def lacks_effects(self) -> bool:
-        """Whether the left-out drift exceeds twice the noise of a window, white and slow."""
+        """Whether the left-out drift exceeds twice the noise of a window, white plus slow."""
         prior = self.posterior.prior
         noise = float(prior.sigma.mean() * np.sqrt(1.0 + prior.noise.variance))
         return self.score.rms > 2.0 * noise
@@ -177,7 +177,7 @@ class Growth:
     def lowest_degree(self, constants: Trial) -> Trial:
         """
         Fit the curve with its first column, and with more columns if they increase the log density
-        by more than `CLEAR_GAIN`: curves of many degrees explain the norms of few positions.
+        by more than `CLEAR_GAIN`: curves of high degree fit the norms of few positions exactly.
         """
         prior = constants.posterior.prior
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
@@ -194,7 +194,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus one set of groups, for the three sets of largest gain."""
+        """Fit the chosen model plus one set of groups, for up to 4 sets of the largest gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -246,7 +246,7 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     """
     Choose by left-out data between fits begun with a small and with a large prior sd of mounting
     offsets. If left-out data do not decide, the fit begun with the large sd is chosen only if its
-    log density exceeds the other by `CLEAR_GAIN`. Mounting offsets and misalignments explain the
+    log density is larger by `CLEAR_GAIN`. Mounting offsets and misalignments explain the
     norms of few positions equally well, but only misalignments predict the norm of a new position.
     """
     small, large = fits[0], fits[-1]

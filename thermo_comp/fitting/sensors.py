@@ -118,7 +118,7 @@ def quantum_of(values: Floats) -> float:
 
 
 def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
-    # Second differences of readings contain no linear ramp; white noise of sd s gives s sqrt(6).
+    # Second differences of readings contain no linear ramp; white noise of sd s has sd s sqrt(6).
     second = np.concatenate([np.diff(readings.value, 2) for readings in recorded])
     if not quantum:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
@@ -166,7 +166,7 @@ def _rate_histories(
         n_bins = int(time[-1] / _BIN_S)
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
-        # The mean over a minute is the change of the integral over the minute / 60 s.
+        # The mean over a minute is the change of the integral over the minute, divided by 60 s.
         integral = cumulative_trapezoid(readings.value, time, initial=0)
         edges = np.interp(np.arange(n_bins + 1) * _BIN_S, time, integral)
         means = (edges[_BINS_PER_SIDE:] - edges[:-_BINS_PER_SIDE]) / side
@@ -179,7 +179,7 @@ def _rate_histories(
 
 
 def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
-    """Return 0.7 times the rate of the slowest ramp over 10 min, or `RAMP_K_MIN` if larger."""
+    """Return 0.7 times the slowest rate of ramps over 10 min, RAMP_K_MIN to `usual` [K/min]."""
     slowest = usual / 0.7
     for history in histories:
         is_ramp = np.abs(history.rate) > max(history.least_ramp, 0.1 / 60.0)
@@ -234,7 +234,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 
 
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
-    """Return the bags without thermometers whose readings equal the board's, and their names."""
+    """Return the bags without thermometers that repeat the board's readings; their names."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
     is_read = any(len(bag.board.value) for bag in bags)
     copies = [

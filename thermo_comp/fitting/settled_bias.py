@@ -22,9 +22,9 @@ def settled_error(
     regression: Regression, posterior: PosteriorMode, excess: float, settled: Floats
 ) -> float:
     """
-    Return the expected error of the settled bias [m/s^2]; infinite for a model without a curve.
+    Return the expected error of the bias after all lags settled [m/s^2]; infinite without a curve.
 
-    The error is the root sum of squares of two terms: the posterior sd of the settled bias; and
+    The error is the root sum of squares of two terms: the posterior sd of this bias; and
     `excess`, the left-out drift beyond the noise [m/s^2], times the ratio (if above 1) of this sd
     to that of the bias in the windows. `settled`: columns at settled temperatures, shape (k, m).
     """

@@ -3,7 +3,7 @@
 """
 Owns the input of a fit: sources of blocks of accelerometer samples and temperature readings.
 
-Bags, tables and simulated runs all give blocks of the same type, for the fit and the compensator.
+Bags, tables and simulated runs all give blocks of the type `Block` to fit and compensator.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def fit_sources(
         sources.append(replace(source, sha256=digest(path)))
         twin = names.setdefault(str(sources[-1].sha256), str(path))
         if len(names) < len(sources):
-            raise FitError(f'{path}: is {twin} once more (same content): give it once')
+            raise FitError(f'{path}: has the same content as {twin}: give only one')
     if len(kinds) > 1:
         raise FitError(
             f'{kinds["counts"]} has counts, {kinds["imu"]} has Imu messages: give recordings of '

@@ -41,8 +41,8 @@ def valid_range(values: Floats, smallest_margin: float, order: int = 0) -> Range
 
 def temperature_range(windows: ThermalWindows) -> Range:
     """Return the valid range of board temperatures [degC]."""
-    # A calibration from one temperature is valid within 0.5 K of it or, without a thermometer,
-    # within 50 K, because the covariance then includes an unknown slope over temperature.
+    # A calibration from one temperature is valid within 0.5 K of this temperature or, without a
+    # thermometer, within 50 K, as the covariance then includes an unknown slope over temperature.
     return valid_range(windows.temperature, 0.5 if windows.was_measured else 50.0)
 
 
@@ -70,7 +70,7 @@ def rest_gradient_range(
     windows: ThermalWindows, lag_s: float, known: Calibration | None
 ) -> Range | None:
     """
-    Return the range of the first sensor's gradient less ``lag_s * rate``, its change in ramps.
+    Return the range of the first sensor's gradient less ``lag_s * rate``, the change in ramps.
 
     The range of a prior calibration, `known`, is included. If the prior has no range, the result
     is None without the sensor, without ramps, which determine the lag, or for values above 100 K,

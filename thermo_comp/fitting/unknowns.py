@@ -41,7 +41,7 @@ class Windows:
     The data of a fit: windows sorted by position and time, with every column of the table.
 
     position, bag: number of each window's position (within one bag), and bag, from 0, shape (n,)
-    section: number of the section of the program, from 0, see `windows.N_SECTIONS`, shape (n,)
+    section: number of the section of the position, from 0, see `windows.N_SECTIONS`, shape (n,)
     time: time since the bag's first sample [s], shape (n,)
     weight: number of samples divided by the median number of a window, shape (n,)
     mean: mean raw samples, in input units, shape (n, 3)
@@ -99,7 +99,7 @@ class Windows:
 
     @cached_property
     def share(self) -> Floats:
-        """Prior sd of weights / `Prior.column_sd`: 1, or 1e-6 on axes not in `acts_on`, (3, m)."""
+        """Ratio of a weight's prior sd to `column_sd`: 1e-6 on axes not in `acts_on`, else 1."""
         acts = np.ones((len(self.groups), 3), bool) if self.acts_on is None else self.acts_on
         return np.where(acts.T, 1.0, 1e-6)
 
@@ -192,12 +192,12 @@ class Noise(NamedTuple):
 
     @property
     def variance(self) -> float:
-        """Variance of the sum of the processes / white-noise variance of a window of weight 1."""
+        """Ratio of the variance of all processes to the white-noise variance, as in `ratio`."""
         return self.ratio * self.n_times
 
     @property
     def rate(self) -> float:
-        """Rate of the random walk at short times / white-noise sd of a window [1/sqrt(s)]."""
+        """Random walk at short times, in white-noise sds of a window [1/sqrt(s)]."""
         return math.sqrt(sum(2.0 * self.ratio / time_s for time_s in self.times_s))
 
 
@@ -240,7 +240,7 @@ class Prior:
         near the faces do not determine M and `misalignment_sd` is a smaller constant; else 0
     tilt_sd: sd of the coefficients of the tilts of a support [rad], see `Windows.tilt`
     pose_sd: sd of attitudes about their pose [rad]; the prior of attitudes without pose is flat
-    start_variance_ratio: variance of the initial lag states / their variance in the node's prior
+    start_variance_ratio: variance of the initial lag states, divided by that in the node's prior
     nonlinear_sd: sd of the nonlinear coefficients, then of their changes per kelvin; 0 for an
         inactive coefficient, shape (2 k,)
     informative: prior that replaces all sd of the unit's parameters; column_sd is then only used

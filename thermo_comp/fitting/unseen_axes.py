@@ -25,8 +25,8 @@ from .windows import CURVE, PART
 #: Smallest component of gravity along an axis, in g, for a position to determine the scale factor
 #: of the axis. At 0.5, the relative error of |f| is a quarter of that of the scale factor.
 LEAST_GRAVITY_SHARE = 0.5
-#: Extrapolation of a scale factor without added error, relative to the temperature range of the
-#: positions along its axis; the ranges of the positions of one test differ by about this ratio.
+#: Largest extrapolation of a scale factor without added error, divided by the temperature range of
+#: the positions along its axis: ranges of positions in one test differ by about this ratio.
 FREE_RANGE_SHARE = 0.1
 #: Extrapolation of a scale factor above which a position is advised [K].
 LEAST_KELVINS = 2.0

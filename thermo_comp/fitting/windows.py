@@ -120,7 +120,7 @@ class Model:
 
     @cached_property
     def part_curves(self) -> PartCurves:
-        """Curves over the temperatures of parts; empty without `parts`, or without its columns."""
+        """Curves over the temperatures of parts; empty without `parts` or their columns."""
         parts = self.parts if self.sets.has_cubic else None
         return curves_of(parts or (), self.columns, len(self.sets.groups))
 

@@ -31,7 +31,7 @@ from .windows import WINDOW_S, corrected_windows, sum_length
 
 # Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
 _LARGEST_NOISE_RATIO = 4.0
-# Noise sd of a sample from which an axis is never constant in a rest [counts].
+# Calibrated noise sd of a sample above which constant samples in a rest are a fault [counts].
 _DEAD_NOISE = 0.5
 # Smallest significant change of a constant between calibrations, in standard deviations.
 _SIGNIFICANT_SDS = 3.0
@@ -56,7 +56,7 @@ def open_bags(
     progress: Callable[[float], None] = lambda _: None,
 ) -> list[ReducedBag]:
     """
-    Read bags for windows of `window_s`, with topics and limits of the first calibration, if any.
+    Read bags for windows of `window_s`; the first calibration, if any, sets topics and full scale.
 
     Raises RecordingError if a bag cannot be read, or lacks a board temperature that is needed.
     """
@@ -81,7 +81,7 @@ def open_bags(
         source = replace(source, sha256=digest(Path(path)))
         for other, twin in zip(bags, paths, strict=False):
             if other.source.sha256 == source.sha256:
-                raise RecordingError(f'is {twin} once more (same content): give it once', path)
+                raise RecordingError(f'has the same content as {twin}: give only one', path)
         bag = reduce_source(source, window_s=sum_length(window_s), **(usual | known))
         if 'board' in require and not len(bag.board.value):
             raise RecordingError(
@@ -139,7 +139,7 @@ def evaluate(
     accepted RMS of ``|f| - g`` [m/s^2]; `serial`: see `replay.check_unit`; `force`: the user's
     options about rests at which |f| is not g.
 
-    Raises RecordingError if a recording cannot be read, or none has a window at rest, and
+    Raises RecordingError if a recording cannot be read, or no window at rest is corrected, and
     CalibrationError if a calibration is for another unit.
     """
     models = [model for _, model in calibrations]
@@ -206,7 +206,7 @@ class Drift:
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
     """
     Sort by date the calibrations with the serial number of the first given calibration. Of several
-    calibrations from the same bags, which show no change of the unit, only the first is kept.
+    calibrations from the same bags only the first is kept: their difference is no change in time.
     """
     known: set[tuple[Source, ...]] = set()
     ordered: list[Calibration] = []
@@ -229,7 +229,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
 
 
 def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
-    """List the changes from each calibration to the next; all errors are taken as independent."""
+    """List the changes from each calibration to the next, whose errors are independent."""
     return [
         Drift(
             earlier=before.date,

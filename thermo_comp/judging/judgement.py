@@ -20,7 +20,7 @@ from . import verdicts
 from .verdicts import Section, Sections, Verdict
 from .windows import JudgedWindows
 
-# Claimed sd above which a valid calibration is called wide [m/s^2].
+# RMS of the claimed sd above which, without a tolerance, a valid calibration is wide [m/s^2].
 _WIDE_CLAIM = 1e3 * MICRO_G
 # Smallest significant shift of bias or scale, in standard deviations.
 _SIGNIFICANT_SDS = 3.0
@@ -72,7 +72,7 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """Exit code: 1 if not valid, or for a gyroscope to recalibrate or no better; else 0."""
+        """Exit code: 1 if not valid, or a gyroscope is `RECALIBRATE` or `NO_BETTER`, else 0."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 

@@ -19,11 +19,11 @@ from .windows import JudgedWindows
 
 #: Largest ratio of RMS error to claimed RMS at which a calibration is valid.
 LARGEST_RATIO = 2.0
-#: Ratio of claimed RMS to raw RMS above which a valid calibration is called wide.
+#: Ratio of claimed RMS to raw RMS above which, without a tolerance, a valid calibration is wide.
 WIDE_PART = 0.5
 # Smallest number of windows of a regime that is judged separately.
 _FEWEST_WINDOWS = 6
-# Largest ratio of a window's |f| to the next smaller |f| at which both are summarised together.
+# Largest ratio of a known |f| to the next smaller known |f| whose windows share one section.
 _LEVEL_RATIO = 1.02
 
 SECTIONS = ('static', 'dynamic', 'all', 'outside')
@@ -178,8 +178,7 @@ def judge_rates(windows: JudgedWindows, calibration: Calibration) -> RateJudgeme
         white = np.square(triad.noise_density_m_s2_sqrt_hz) / windows.window_s
         noise = white * (1.0 - 1.0 / np.maximum(counts, 1.0))[:, None]
         hours = counts[:, None] * windows.window_s / 3600.0
-        # Variance of a random walk about its mean over a period: 1/6 of the variance gained in the
-        # period.
+        # The variance of a random walk about its mean is 1/6 of the variance gained in the time.
         walk = np.square(triad.slow_noise_m_s2_sqrt_h) * hours / 6.0
         claimed = np.sqrt(of_thermometers + change + noise + walk)
     changes = np.stack((raw - mean_of(raw), corrected - mean_of(corrected), claimed))

@@ -30,17 +30,17 @@ from ..unit.nonlinearity import AT_REST
 
 #: Default duration of a window of a judgement [s].
 WINDOW_S = 60.0
-# Largest distance outside a calibrated range at which a window counts as inside, because of noise
-# [half ranges].
+# Largest sum of the distances outside the calibrated ranges [half ranges], due to noise of the
+# thermometers, at which a window counts as inside.
 _RANGE_TOLERANCE = 0.02
-# Smallest number of samples of a used partial sum / median over all partial sums.
+# Smallest number of samples of a used partial sum, divided by the median of this number.
 _LEAST_FILLED = 0.9
 
 
 @dataclass(frozen=True)
 class JudgedWindows:
     """
-    JudgedWindows at rest of all bags, in order; arrays of n rows.
+    Windows at rest of all bags, in the order of bags and time; arrays of n rows.
 
     A window lasts exactly `window_s` from `start_ns`; `time`: from the bag's first sample to the
     window's middle [s]; `count`, `mean`: number and mean of the window's raw samples. A position
@@ -133,7 +133,7 @@ def corrected_windows(
         raw = constants.force(raw)
         along = force / np.linalg.norm(force, axis=1, keepdims=True) @ constants.misalignment
         noise = along**2 @ np.array(Correction(calibration).noise)
-        # The converter adds the remainder of rounding to the next sample, so a mean has none.
+        # The converter adds the remainder of rounding to the next sample: a mean lacks this noise.
         white = along**2 @ np.square(calibration.noise_density_m_s2_sqrt_hz)
         mean_white = white / (calibration.unit.cycle_time_s * table['count'])
         variance = np.maximum(table['variance'] - noise, 0.0) + mean_white
@@ -181,8 +181,8 @@ def columns_of(windows: JudgedWindows, bags: Sequence[str]) -> dict[str, npt.NDA
 
 # A structured array of partial sums of samples, or of windows.
 _Table: TypeAlias = npt.NDArray[Any]
-# Integer fields of a window, of which `count` is a sum; all other fields except `excess` are
-# averages over the partial sums of a window.
+# Integer fields: `count` is the sum, the other fields are of the first partial sum of a window.
+# Then fields that are averages over the partial sums; only `excess` is a maximum.
 _ONCE = ('bag', 'position', 'start_ns', 'count')
 _AVERAGED = ('time', 'board', 'rate', 'weight', 'variance', 'swapped', 'size', 'size_sd')
 _TRIPLES = ('mean', 'force')
@@ -208,7 +208,7 @@ def _table(
         if abs(per * bag.window_s - window_s) > 1e-6 * window_s:
             raise RecordingError(
                 f'the sample rate is too low for windows of {window_s:g} s: give --window as '
-                f'{bag.window_s:g} or a multiple',
+                f'{bag.window_s:g} s or a multiple of it',
                 path=bag.source.name,
             )
         sums: list[_Table] = [np.zeros(0, kind)]

@@ -87,7 +87,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
     drift_k, drift, slope = info.thermometers.standard_uncertainty_k, None, ''
     if drift_k is not None:
         drift = drift_k * _slope(calibration)
-        slope = f'{drift_k:g} K times the slope of the correction'
+        slope = f'{drift_k:g} K times the RMS slope of the bias'
     seconds = f'white noise of a mean over {windows.window_s:g} s'
     beyond = 'RMS of |f| − g in excess of noise, attitude and model'
     # The claimed sd already contains the uncertainty of gravity that was given to the fit.
@@ -209,15 +209,14 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
 
 def _four_digits(value: Floats) -> Floats:
     """
-    Return the uncertainties, shape (columns,), that leave four digits of the largest value of each
-    column, see `rounded`.
+    Return the uncertainties, (columns,), that leave four digits (`rounded`) of the largest values.
     """
     largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
     return np.asarray(10.0 ** (np.floor(np.log10(largest)) - 2.0))
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
-    """Return the scale's relative uncertainty due to gravity; NaN if its sd is not stated."""
+    """Return the scale's relative uncertainty due to gravity; NaN if that is not stated."""
     sd = unclaimed_gravity_sd(evidence, info)
     if sd is None or evidence.calibration is None:
         return np.nan

@@ -112,7 +112,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Valid: good, valid with reservations: reserved, not valid: poor, no verdict: open."""
+        """Good: valid; reserved: valid with reservations; poor: not valid; open: no verdict."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -186,7 +186,7 @@ class Evidence:
         return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return per correction the force less |f| in the position's mean direction, (n, 3)."""
+        """Return the force less the vector |f| in the mean direction of the position, (n, 3)."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}

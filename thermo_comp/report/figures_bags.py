@@ -52,7 +52,7 @@ def draw_dynamics(evidence: Evidence) -> Figure:
         panels[0].set_prop_cycle(style.AXIS_CYCLE)
         _plot(panels[0], evidence, drift, unit, label=AXES)
         panels[0].set_ylabel(name)
-        style.legend_above(panels[0], 'a  drift of the readings since the start')
+        style.legend_above(panels[0], 'a  drift of the readings in each position')
     rates, bend, flag = panels[-3:]
     for label, rate, line in (
         ('dT case/dt', shown.case_rate, style.CASE_LINE),
@@ -225,7 +225,7 @@ def draw_every_position(evidence: Evidence) -> Figure:
     axes.set_ylabel('position')
     axes.set_xlabel(name)
     axes.set_xlim(0.0, None)
-    part = f'; the {_MOST} largest' if len(evidence.positions) > _MOST else ''
+    part = f'; the {_MOST} with the largest RMS' if len(evidence.positions) > _MOST else ''
     axes.set_title(f'{judged}: a row is ±{number(limit / MICRO_G, 2)} µg high{part}')
     return figure
 

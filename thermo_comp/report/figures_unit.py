@@ -21,7 +21,7 @@ from .temperature_curves import Curve, curves, slopes
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96
 _BOARD = 'T board, °C'
-# Line, hatch and marker of each program.
+# Line, hatch and marker of a soak and of temperature ramps.
 _LOOKS: dict[str, tuple[style.Line, str, str]] = {
     'soak': (style.STATIC_LINE, '////', 'o'),
     'heating': (style.DYNAMIC_LINE, '\\\\\\\\', '^'),
@@ -111,7 +111,7 @@ def soak_measurements(evidence: Evidence) -> tuple[Floats, Floats]:
 
 
 def draw_shares(curves: Mapping[str, Floats]) -> Figure:
-    """Draw the percentage of units below each RMS residual [micro-g], by section."""
+    """Draw the percentage of units up to each RMS residual [micro-g], for each section."""
     figure = style.new_figure(2.6)
     axes = figure.subplots()
     drawn = {name: np.sort(values[values > 0.0]) for name, values in curves.items()}

@@ -283,8 +283,8 @@ def _of_positions(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
             of_bags.draw_positions,
             'Direction of the specific force in the output frame, position by position, in an '
             'equal-area map of both halves of the sphere, seen from +z; the inner circle is 45° '
-            'of elevation. In a position with a far larger residual the unit was moved, or the '
-            'bag is of another unit.',
+            'of elevation. If one residual is far larger than all others, the unit was moved '
+            'there, or the bag is of another unit.',
             'The area of a red ring is proportional to the RMS residual of its position in a fit '
             'to the other positions, which is the error expected in a new attitude.'
             if evidence.left_out

@@ -68,7 +68,7 @@ _WIDTH = 7.1
 
 
 def drawing() -> AbstractContextManager[None]:
-    """Return a context in which matplotlib uses the report's style instead of its settings."""
+    """Return a context in which matplotlib uses the style of the report, not of the user."""
     return style.context(_RC, after_reset=True)
 
 

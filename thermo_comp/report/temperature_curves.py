@@ -19,7 +19,7 @@ _MOST_TEMPERATURES = 8
 
 
 class Program(NamedTuple):
-    """A soak, or a ramp from a soak at an end of a set's range to the other end of the range."""
+    """A soak, or a ramp from a soak at one end of a set's temperatures to the other end."""
 
     name: str  # soak, heating or cooling
     regime: RegimeSet
@@ -27,13 +27,13 @@ class Program(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The name of the program and, for a ramp, the rate."""
+        """The name of the soak or ramp and, for a ramp, the rate."""
         return f'{self.name} at {abs(self.rate_k_min):g} K/min' if self.rate_k_min else self.name
 
 
 class Curve(NamedTuple):
     """
-    Bias [micro-g] and scale [ppm] of x, y, z in one program, shape (n, 6), and their sd.
+    Bias [micro-g] and scale [ppm] of x, y, z in a soak or ramp, shape (n, 6), and their sd.
 
     `value` is the difference from a soak at the reference temperature; `sd` is the sd of bias and
     scale, not of the difference.
@@ -57,7 +57,7 @@ def programs(calibration: Calibration) -> list[Program]:
 
 
 def evaluate(calibration: Calibration, program: Program, temperature: Floats) -> Curve:
-    """Evaluate bias and scale in a program at board temperatures, shape (n,)."""
+    """Evaluate bias and scale in a soak or ramp at board temperatures, shape (n,)."""
     rate = program.rate_k_min / 60.0
     lower, upper = program.regime.temperature_range_c
     begun = lower if rate > 0.0 else upper
@@ -71,7 +71,7 @@ def evaluate(calibration: Calibration, program: Program, temperature: Floats) ->
 
 
 def curves(calibration: Calibration) -> list[Curve]:
-    """Evaluate each program over the whole range of its set."""
+    """Evaluate soak and ramps over the temperature range of their sets."""
     return [
         evaluate(calibration, program, np.linspace(*program.regime.temperature_range_c, _N_CURVE))
         for program in programs(calibration)
