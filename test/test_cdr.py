@@ -103,7 +103,7 @@ def test_the_byte_swap_keeps_the_bits_of_a_signalling_nan():
 
 
 def test_messages_with_frame_ids_of_different_lengths_are_converted():
-    # WHY: the positions of the numbers in a message depend on the length of the frame_id before.
+    # WHY: the place of the numbers in a message depends on the length of its frame_id.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))

@@ -107,7 +107,7 @@ def test_the_proposed_directions_are_nearly_as_good_as_spread_positions():
     assert farthest(up)[1] < 36.0
 
 
-def test_the_largest_angle_to_the_nearest_direction():
+def test_farthest_returns_the_direction_farthest_from_all_given_directions():
     # The corners of a cube are the directions farthest from all six faces.
     up, angle = farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))

@@ -208,7 +208,8 @@ def test_the_message_on_a_wrong_gyroscope_names_the_key():
 
 
 def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
-    # At the reference temperature the rate gets its constant bias, the force no correction.
+    # At the reference temperature the bias of the rate is a constant; a gyroscope in the
+    # calibration does not change the force.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node's input, output and diagnostics over DDS."""
+"""The node corrects samples, publishes the regime and reports faults over DDS."""
 
 import math
 import time

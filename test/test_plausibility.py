@@ -178,7 +178,7 @@ def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# The other preset is left out: its board follows the case in seconds and would lead by below 1 K.
+# The preset 'mems' is left out: its board follows the case in seconds, so it leads by below 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [

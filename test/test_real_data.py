@@ -85,7 +85,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
 
 
 def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
-    # |a| jumps by 20 mg at 366 s and by 17 mg at 468 s; a third jump is mostly across gravity.
+    # |a| jumps by some 20 mg at 367 s and at 467 s; a third jump is mostly across gravity.
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)

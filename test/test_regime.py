@@ -45,7 +45,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return the switches after each onset, and the number of static starts."""
+    """Run n ramps; return the switches after each onset, and the number of runs static before."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -291,7 +291,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # With `end_condition: case` the board has no effect; without case readings it has no effect.
+    # The end condition `case` acts like a missing board; without a case it acts like `board`.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)

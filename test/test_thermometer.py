@@ -226,8 +226,9 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
     assert thermometer.n_in_row == 600
 
 
-def test_a_jump_of_15_sigma_has_the_effect_of_6_sigma():
-    # A jump of 6 to 30 sigma is limited to 6 sigma; a jump above 30 sigma is left out.
+def test_a_reading_15_sd_from_its_prediction_is_down_weighted():
+    # A reading at 6 to 30 sd from its prediction gets the noise with which it is at 6 sd; a
+    # reading beyond 30 sd is left out.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004
