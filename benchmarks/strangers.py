@@ -325,7 +325,7 @@ def run_case(
     path: Path | None,
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Run all studies of a case or, with a label, the study with this label and its prior's."""
+    """Run all studies of a case or, with a label, this study and that of its prior."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}

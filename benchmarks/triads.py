@@ -168,7 +168,7 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
 
 def sibling(unit: UnitModel, seed: int, spread: float = 0.15) -> UnitModel:
     """
-    Return a unit of the type of `unit` with other constants and misalignment; thermal
+    Return a unit of the type of `unit` whose constants and misalignment differ from it; thermal
     coefficients, widths and heat capacities each differ by a factor of 1 +- `spread` at most.
     """
     rng = generator(seed, Stream.SIBLING)

@@ -157,7 +157,7 @@ def columns_from_events(events):
 
 
 def stream(compensator, events):
-    """Process events singly, with 1e-3 * sample as angular rate; return rows and sample numbers."""
+    """Process events singly, with 1e-3 * sample as angular rate; return rows, sample numbers."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other programs are read by headings; units follow from |f| at rest and rates."""
+"""Tables of other programs are read by headings; |f| at rest and rates show the units."""
 
 from datetime import datetime, timedelta, timezone
 from itertools import takewhile

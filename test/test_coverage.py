@@ -88,7 +88,7 @@ def test_the_next_direction_reduces_the_mean_variance(n, rng):
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
-    # Faces are preferred, as they are easy to hold, if they have at least half the best benefit.
+    # A face, which is easy to hold, is preferred if its gain is at least half of the largest gain.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 

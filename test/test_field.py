@@ -355,7 +355,7 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     # The date in the new calibration file is that of its last rest, not that of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # The old calibration is judged on the log: it has no rest of the log in it.
+    # The old calibration is judged on the log, because no rest of the log was used to make it.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'

@@ -110,8 +110,8 @@ def test_a_forced_group_stays_in_the_model(calm):
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen):
-    # The evidence favours the group 'idle' in all cases; the left-out error favours it only if it
-    # has an effect in all bags and sections.
+    # The evidence favours the group 'idle' in all cases; the left-out error favours this group
+    # only if its effect is in all bags and sections.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {

@@ -33,7 +33,7 @@ K = 300.0
 
 
 def of_bias(counts, **keys):
-    """Make a calibration with a bias of x [counts], by which a test recognises it."""
+    """Make a calibration that a test recognises by its bias of the x axis [counts]."""
     axes = Axes(AxisReference(K, counts), AxisReference(K, 0.0), AxisReference(K, 0.0))
     return calibration(axes=axes, **keys)
 

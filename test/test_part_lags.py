@@ -139,7 +139,8 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # A lag of both thermometers acts like one share of (case - board) in all part inputs.
+        # A lag of both thermometers acts like an equal share of (case - board) in each part's
+        # input.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
@@ -155,7 +156,7 @@ def test_slow_tilts_of_a_support_are_not_fitted_by_a_second_stage_of_a_lag():
     calibration = strangers.fitted(study)
     parts = {part.part for part in calibration.response if part.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
-    # The tilts of one position are a drift of 40 ug RMS; twelve positions average it.
+    # The tilts of one position cause a drift of 40 ug RMS; a mean over 12 positions has less.
     tests = {'': [minutes(bag) for bag in study.tests['']]}
     assert strangers.scored(study, calibration, tests)[''].vector < 40.0
 

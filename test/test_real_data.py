@@ -58,7 +58,7 @@ def test_fits_of_handheld_units_agree_with_a_least_squares_solution_by_scipy(uni
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = calibration.axes
-    # The fit weights positions by their length, this solution does not.
+    # The fit weights positions by their length, the solution by scipy does not.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)
@@ -115,7 +115,8 @@ def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_plot(
 def test_the_error_of_the_freezer_run_on_held_out_minutes(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # The 1420 s after the last jump are cut into parts; each is corrected by a fit to other parts.
+    # The 1420 s after the last jump are cut into parts; each held-out part is corrected by a fit
+    # to other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [BagPart(start, start + length) for start in starts]

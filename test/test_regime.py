@@ -271,9 +271,9 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
 @pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
 def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     # The case lags the chamber by 3 min, the board lags the case by 15 min. After the ramp the
-    # case's rate falls as exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): they reach
-    # the relaxed rate, 0.1 of the ramp's, after 7 and 38 min. Readings with steps of 62.5 mK do
-    # not show the last 5 min of the case's change.
+    # case's rate falls as exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): case and
+    # board reach the relaxed rate, 0.1 of the ramp's, after 7 and 38 min. Readings with steps of
+    # 62.5 mK do not show the last 5 min of the case's change.
     noise, quantum = SENSORS[sensor]
     lag, behind = 180.0, 900.0
     board_too = DetectorSettings(
