@@ -201,8 +201,7 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
         # Other programs on the cores slow two workers more than one worker. `free` is the speed-up
-        # if each worker had a free core; it is below 2, as workers wait and share caches and
-        # memory.
+        # if each worker had a free core, below 2 as workers wait and share memory.
         free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
         collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(

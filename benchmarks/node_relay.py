@@ -29,9 +29,9 @@ processes have discovered each other.
 An idle core sleeps and needs time to wake up, and the host may use an idle virtual core for other
 machines. If the system allows this (Linux, as root), all cores are kept awake for all relays, by a
 request for a wake-up time of 0 us in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the
-cores may sleep. The host may stop a virtual machine with all its processes. The percentage of time
-for which the machine was stopped ends each row ("stolen"): latencies are meaningful if it is
-small.
+cores may sleep. The host may stop a virtual machine with all its processes. "stolen" at the end of
+each row is the percentage of time for which the machine was stopped; latencies mean little if it
+is large.
 """
 
 from __future__ import annotations

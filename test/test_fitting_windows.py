@@ -269,7 +269,6 @@ def test_a_calibration_file_corrects_windows_like_the_regression(fitted):
 
 
 def test_the_posterior_of_a_file_has_the_sd_of_the_regression(fitted):
-    # The posterior in the file must have the sd of bias, K and M that the regression claims.
     result, claim = fitted
     calibration = result.calibration
     layout = parameter_layout(calibration)

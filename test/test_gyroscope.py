@@ -208,8 +208,7 @@ def test_the_message_on_a_wrong_gyroscope_names_the_key():
 
 
 def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
-    # At the reference temperature the bias of the rate is a constant; a gyroscope in the
-    # calibration does not change the force.
+    # At the reference temperature only the constant bias of the rate is corrected, not the force.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))

@@ -266,8 +266,7 @@ class TestVerdict:
         assert 'limit 100 ug' in judgement.reason
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
-        # WHY: the verdict stated 61 ug, the error in fitted attitudes; in new attitudes it was
-        # 1091 ug.
+        # WHY: the verdict stated 61 ug, the error in fitted attitudes; that in others was 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -327,8 +326,7 @@ class TestVerdict:
         assert found.sections['all'].n == 30
         assert found.sections['outside'].n == 10
         assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
-        # Only windows inside the ranges decide the verdict; without such windows there is no
-        # verdict.
+        # Only windows inside the ranges are judged; without such windows there is no verdict.
         bad = windows.force.copy()
         bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
         found = judge(dataclasses.replace(windows, force=bad), CLAIMING)

@@ -139,8 +139,7 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # A lag of both thermometers acts like an equal share of (case - board) in each part's
-        # input.
+        # A lag of both thermometers acts like equal shares of (case - board) in all part inputs.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)

@@ -115,8 +115,7 @@ def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_plot(
 def test_the_error_of_the_freezer_run_on_held_out_minutes(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # The 1420 s after the last jump are cut into parts; each held-out part is corrected by a fit
-    # to other parts.
+    # Held-out parts of the 1420 s after the last jump are corrected by a fit to the other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [BagPart(start, start + length) for start in starts]
@@ -163,7 +162,6 @@ def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, wor
 
 
 def test_no_recording_is_in_the_project():
-    # The project shows plots and numbers of the recordings, and must not contain their files.
     tracked = ran('git', 'ls-files').stdout.split()
     names = ('temp-calibration.csv', 'mk_imu', 'annotated_session.csv')
     assert not [path for path in tracked if path.rsplit('/', 1)[-1].startswith(names)]

@@ -379,7 +379,6 @@ def test_switches_are_equal_in_heating_and_cooling(quantum):
 
 
 def test_switches_do_not_depend_on_the_origin_of_time():
-    # The switches must be equal to the bit if all stamps are shifted.
     rng = np.random.default_rng(8)
     t = np.arange(0.0, 3000.0)
     settings = detector_settings(0.001)
