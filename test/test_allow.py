@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit refuses wrong data with a name; `allow` of this name lets the fit give a calibration."""
+"""A fit refuses wrong data by named refusals; a refusal that is allowed does not stop the fit."""
 
 import re
 from contextlib import suppress

@@ -95,7 +95,8 @@ def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
 #: Calibration of all examples; no example changes it.
 RICH = rich_calibration()
 
-#: Values of a few samples: not finite, limits of a 16-bit converter, zero, the smallest number.
+#: Values of a few samples: not finite, limits of a 16-bit converter, zeros, the smallest positive
+#: number.
 STRANGE = (math.nan, math.inf, -math.inf, 32767.0, -32768.0, 0.0, -0.0, 5e-324)
 
 

@@ -186,7 +186,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     # and y between half and all of the variance of the random walk.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The sd of z is the change of z that the rests show, within two turn-on offsets (sd 20 ug).
+    # The present sd of z must be the size of its change, within two turn-on offsets (sd 20 ug).
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 

@@ -167,7 +167,7 @@ class TestDrift:
         assert worst.worst.sd == pytest.approx(2.0 * np.sqrt(2.0))
         assert (worst.earlier, worst.later) == ('/u003@0', '/u003@30')
 
-    def test_a_scale_factor_drifts_in_ppm(self, rng):
+    def test_the_drift_of_a_scale_factor_is_reported_in_ppm(self, rng):
         first = fleet_of(2, rng)
         second = fleet_of(2, rng, day=7.0, like=first)
         second[0] = {**second[0], 'scale_z': float(first[0]['scale_z']) * (1.0 + 90e-6)}

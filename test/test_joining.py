@@ -173,7 +173,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
 
 
 @pytest.mark.slow
-def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng, cli):
+def test_evaluate_and_report_take_the_parts_as_one_recording(tmp_path, rng, cli):
     paths, topics = [], Topics()
     for number, part in enumerate(cut(recorded(rng, 900.0), (450.0,))):
         paths.append(tmp_path / f'part{number}.mcap')

@@ -207,7 +207,7 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
         status_with(peer, heard, text)
 
 
-def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path):
+def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
     # WHY: with a diagnostics_period below the sample interval, reports without samples were ERROR.
     from thermo_comp.unit.calibration import Unit
 
