@@ -24,8 +24,8 @@ def score(drift, norms=(), by_thermometer=0.0):
 
 def test_few_norms_that_both_models_predict_do_not_select_the_model():
     # WHY: a MEMS was recorded in six faces at three temperatures. Only four left-out values of |f|
-    # could be predicted both with and without a curve over temperature. Their log ratio of errors
-    # was below two standard errors, so the fit had no curve and an error of 7 mg.
+    # could be predicted both with and without a curve over temperature. The curve reduced their
+    # errors by less than two standard errors, so the fit left it out: an error of 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Temperature functions, predicted sd and residual statistics agree with hand numbers, scipy."""
+"""Temperature functions, predicted sd and statistics agree with hand numbers and with scipy."""
 
 from dataclasses import replace
 

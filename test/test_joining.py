@@ -188,7 +188,6 @@ def test_evaluate_and_report_take_the_parts_as_one_recording(tmp_path, rng, cli)
     assert bag.source.name == 'part0.mcap .. part1.mcap'
     # 900 s have 15 windows of 60 s, of which two may be lost at the cut.
     assert len(result.judgements['unit'].windows) >= 13
-    # The command prints which bags it has joined.
     thermo_comp.save(calibration, tmp_path / 'unit.yaml')
     errors = cli('evaluate', *paths, '-c', tmp_path / 'unit.yaml').stderr
     assert 'part0.mcap .. part1.mcap: 2 bags of one recording, joined' in errors

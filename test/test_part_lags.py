@@ -255,7 +255,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 
 @pytest.mark.slow
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
-    # In two means over 60 s the unit passes the bump, which must not be taken for motion.
+    # The bump lasts for two means over 60 s, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
     # A fit of all groups chooses these three groups, too, but takes three times as long.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))
