@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the measurement of reading a bag into columns, by thermo_comp, rosbags and mcap in one run.
+Owns the measured speed of reading a bag, by thermo_comp, rosbags and mcap in one run.
 
 All bags hold counts at 400 Hz and two temperatures at 10 Hz; rosbags and mcap get shorter bags
 (`--peer-samples`). `rosbags` reads and deserializes each message; `mcap` only reads each message.
-Rates are messages with counts per second of wall time, from the fastest of the repeats; on another
-machine the ratios of the rates hold, the rates do not.
+A rate is the number of counts messages read per second of wall time, in the fastest of the
+repeats. From machine to machine the ratios of the rates change less than the rates.
 
     python benchmarks/bag_read.py --samples 1000000
 """

@@ -29,7 +29,7 @@ def damaged(
 
 
 def flip(file: Path, place: float = 0.5) -> None:
-    """Flip a bit of a file."""
+    """Flip a bit of the byte at the fraction `place` of a file."""
     data = bytearray(file.read_bytes())
     data[int(len(data) * place)] ^= 4
     file.write_bytes(data)
@@ -56,7 +56,7 @@ def delete_rows(file: Path) -> None:
 
 
 def flip_message(file: Path) -> None:
-    """Add 64 to the number of the first topic in each message, so that no topic has the number."""
+    """In each message of topic 1 add 64 to the topic number; no topic has this number."""
     with sqlite3.connect(file) as database:
         database.execute('update messages set topic_id = topic_id + 64 where topic_id = 1')
 

@@ -109,7 +109,7 @@ def imu(
 
 
 def _by_turns(force: np.ndarray) -> np.ndarray:
-    """Set every second sample to zero, as drivers do whose rows alternate with gyroscope rows."""
+    """Set every second sample to zero, as in a log in which rows of the gyroscope alternate."""
     return force * (np.arange(len(force)) % 2)[:, None]
 
 
@@ -131,12 +131,12 @@ def _worn(sd: float, longest_s: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _leaning(force: np.ndarray) -> np.ndarray:
-    """Add 0.6 of axis x to 0.9 of axis y: a misalignment that no real triad has."""
+    """Set y to 0.6 x + 0.9 y: a misalignment that no real triad has."""
     return force @ np.array([[1.0, 0.6, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
-    """Add a clock jump [ns] in the middle of a recording or, if given, every `every` messages."""
+    """Add a jump [ns] to the stamps: once in the middle or, with `every`, at every such stamp."""
 
     def change(stamp_ns: np.ndarray) -> np.ndarray:
         row = np.arange(len(stamp_ns))

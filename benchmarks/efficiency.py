@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the efficiency in docs/accuracy.md: errors of bias and scale against the Cramer-Rao bound.
+Owns the errors of bias and scale divided by the Cramer-Rao bound, for docs/accuracy.md.
 
 Run ``python benchmarks/efficiency.py``, or with fewer units: ``--units 10``.
 """
@@ -28,8 +28,8 @@ def exact_unit(seed: int) -> UnitModel:
     """
     Make a unit whose bias and scale are quadratics of the board's temperature alone.
 
-    The constants are those at the reference temperature without heat flow. The unit has no
-    self-heating, so that its bags contain this state, and the bound is not an extrapolation.
+    The constants hold at the reference temperature without heat flow. The unit has no
+    self-heating, so its bags contain this state, and the bound needs no extrapolation.
     """
     rng = np.random.default_rng(seed)
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measures updates in the field against an optimal filter, on units that age (`field_units.py`).
+Compares updates in the field with an optimal filter, for units that age (`field_units.py`).
 
     python benchmarks/field.py [--units 10] [--days 60] [--recordings ../shared/data]
 
@@ -9,9 +9,9 @@ Half of the units are in vehicles, level within 10 deg, half are carried in any 
 for 60 days: random walks of the bias (15 ug per root day) and scale (10 ppm per root day), bias
 offsets at turn-on (sd 20 ug) and one shock (sd 300 ug). On six days the calibration is updated
 with all earlier rests, as in `thermo_comp update`, and judged on the rests of the next day. After
-the last day its errors are compared with those of a Kalman filter that is given these sd and the
-time of the shock. With --recordings FOLDER, the real recordings in FOLDER are cut into parts, and
-an update with all earlier parts is judged on the next part.
+the last day the errors of the updated calibration are compared with those of a Kalman filter that
+is given these sd and the time of the shock. With --recordings FOLDER, the real recordings in
+FOLDER are cut into parts, and an update with all earlier parts is judged on the next part.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def filtered(history: History, process: Process, days: int) -> Floats:
 
 
 def best(history: History, process: Process, days: int) -> BestFilter:
-    """Run the Kalman filter over all rests of the first `days` days; a rest is a measurement."""
+    """Run the Kalman filter over the rests of the first `days` days; a rest is one measurement."""
     found = BestFilter(process)
     rests: dict[tuple, list[Rest]] = defaultdict(list)
     for (_, rest), day, start in zip(history.rests, history.day, history.start, strict=True):

@@ -43,14 +43,14 @@ from thermo_comp.unit.gravity import STANDARD_GRAVITY
 
 #: Program over 35 K with a sample per second, so that hundreds of units are simulated in minutes.
 PROGRAM, RATE_HZ, TEMPERATURE_HZ = '15 6min, 40@2 12min, 5@2 15min', 1.0, 0.2
-#: The shortest thermal test that can be fitted: with short fits the scheduler's load is highest.
+#: A thermal test that is short to fit: the shorter the fits, the higher the scheduler's load.
 SMALL_PROGRAM, SMALL_BAGS = '20 2min, 45@5 8min, 5@5 10min', 6
 N_LOTS = 4
 _REST_S = 4.0
 
 
 def write_fleet(folder: Path, n_units: int, n_bags: int, program: str) -> Path:
-    """Simulate units and write a bag per position; units whose bags exist are left out."""
+    """Simulate units, except those whose bags exist, and write a bag per position."""
     chamber = parse_cyclogram(program)
     for seed in range(1, n_units + 1):
         unit = unit_preset('mems', seed)
@@ -201,7 +201,7 @@ def scaling(folder: Path, n_units: int, repeats: int, model: str) -> None:
             for units, workers in ((n_units, 1), (n_units, 2), (n_units // 2, 1))
         )
         # Other programs on the cores slow two workers more than one worker. `free` is the speed-up
-        # if each worker had a free core: less than 2 by waiting and by shared caches and memory.
+        # if each worker had a free core, below 2 as workers wait and share memory.
         free = 2.0 * pair.busy(2) / solo.busy(1) * solo.cpu_s / pair.cpu_s
         collected.append((solo.seconds / pair.seconds, free, 2.0 * half.seconds / pair.seconds))
         print(

@@ -4,8 +4,8 @@
 Runs the live node in this process, without loss of messages, and records its output.
 
 The demonstration, tests and benchmarks use this module. As in a bag written by `replay`, the log
-time of an Imu message is its stamp, and the log time of any other message the newest Imu stamp
-before this message.
+time of an Imu message is its stamp; the log time of any other message is the stamp of the last Imu
+message before it.
 """
 
 from __future__ import annotations

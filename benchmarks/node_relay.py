@@ -10,12 +10,12 @@ temperatures at 10 Hz, and a sink process receives the Imu messages. Between sou
 either the node, with all functions, or the naive relay: an rclpy node that copies Vector3Stamped
 to Imu in a callback. The CPU time is that of all threads of the relay process, from the first
 sample to the last. The latency is the time from the source's publish call to the arrival in the
-sink's middleware, before any Python code of the sink runs. Ratios of the node to the naive relay
-hold on other machines, times do not. The node uses its profile for Fast DDS; source, sink and
-naive relay use the default profile. At the last rate the node is measured once more while the
-parameter `calibration_file` is set twice a second. `--core` binds each relay to a core. `--floor`
-also measures a third relay, which copies the bytes of each message to Imu in a loop over a wait
-set, with the node's profile, and computes nothing.
+sink's middleware, before any Python code of the sink runs. From machine to machine the ratios of
+node to naive relay change less than the times. The node uses its profile for Fast DDS; source,
+sink and naive relay use the default profile. At the last rate the node is measured once more while
+the parameter `calibration_file` is set twice a second. `--core` binds each relay to a core.
+`--floor` also measures a third relay, which copies the bytes of each message to Imu in a loop over
+a wait set, with the node's profile, and computes nothing.
 
 The source keeps `--depth` samples to send lost samples again. With a reliable relay Fast DDS
 removes samples from the source's store 859 at a time; with 2000 kept samples the removal delays
@@ -29,8 +29,9 @@ processes have discovered each other.
 An idle core sleeps and needs time to wake up, and the host may use an idle virtual core for other
 machines. If the system allows this (Linux, as root), all cores are kept awake for all relays, by a
 request for a wake-up time of 0 us in /dev/cpu_dma_latency, as in cyclictest; with `--sleep` the
-cores may sleep. The host may stop a virtual machine with all its processes. The percentage of this
-stolen time is at the end of each row ("stolen"): latencies are meaningful if it is small.
+cores may sleep. The host may stop a virtual machine with all its processes. "stolen" at the end of
+each row is the percentage of time for which the machine was stopped; latencies mean little if it
+is large.
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _ratio(runs: list[dict[str, Any]], naive: list[dict[str, Any]]) -> float:
     """
-    Return the median ratio of CPU times: a run of a relay / the neighbouring run of the naive one.
+    Return the median of CPU time of a run / CPU time of the neighbouring run of the naive relay.
 
     Neighbouring runs are compared, because the speed of a shared machine changes over minutes.
     """

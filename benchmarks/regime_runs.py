@@ -65,7 +65,7 @@ def ours(scene: Scene, case: Floats, board: Floats) -> npt.NDArray[np.int8]:
 
 
 def judge(flags: Iterable[tuple[Floats, Bools]], duration: float) -> Outcome:
-    """Return onset delays, counts of ramps and flagged share, for ramps from 0 to `duration` s."""
+    """Return onset delays, counts and dynamic fraction of the time in ramps of `duration` s."""
     outcome = Outcome([], 0, 0, 0, 0.0, 0)
     for t, flag in flags:
         outcome.n += 1
@@ -89,7 +89,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
     """Run the detector over ramps of a scene."""
     scene, n, seed, is_rippled = job
     rng = rng_of(seed, 5, scene)
-    # A ramp lasts 40 min to 2 h: until it has changed by four quanta of the sensor, plus two lags.
+    # A ramp lasts 40 min to 2 h: the time of a change by four quanta of the sensor, plus two lags.
     edges_s = 60.0 * 4.0 * scene.quantum / scene.ramp_k_min + 2.0 * scene.lag_s
     duration = min(max(edges_s, 2400.0), 7200.0)
     t = np.arange(-2700.0, duration, 1.0 / scene.rate_hz)
@@ -102,7 +102,7 @@ def run_ramps(job: Job) -> tuple[Scene, Outcome]:
 
 
 def run_soak(job: tuple[Scene, float, int]) -> tuple[str, int, int, float]:
-    """Return for a soak: switches to dynamic, all switches, share of readings with a flag."""
+    """Return for a soak: sensor, switches to dynamic, all switches, fraction of known flags."""
     scene, hours, seed = job
     rng = rng_of(seed, 7, scene)
     t = np.arange(0.0, 3600.0 * hours, 1.0 / scene.rate_hz)

@@ -79,11 +79,12 @@ def known_signature_delays(
     scene: Scene, per_hour: float, hours: float, n: int, seed: int
 ) -> tuple[float, float]:
     """
-    Return median and 95 % delay [s] of a CUSUM with known ramp, baseline and noise.
+    Return median and 95 % quantile of the delays [s] of a CUSUM test that is given the true ramp,
+    baseline and noise.
 
     The test is Page's: the largest log likelihood ratio over the onset times, with the true ramp
-    as signature. The threshold for `per_hour` false alarms is found in noise without a ramp: the
-    logarithm of the number of exceedances falls linearly with the threshold.
+    as signature. The threshold for `per_hour` false alarms is extrapolated by a line in the
+    logarithm of the number of exceedances over the threshold, counted in noise without a ramp.
     """
     rng = np.random.default_rng([seed, 9])
     dt = 1.0 / scene.rate_hz

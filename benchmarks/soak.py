@@ -66,7 +66,7 @@ class Temperatures:
 
 
 class Soak:
-    """Plays driver, INS and operator for the node, and counts messages."""
+    """Acts as driver, INS and operator of the node, and counts messages."""
 
     def __init__(self, node: Any, context: Any, rate: int) -> None:
         import rclpy

@@ -10,7 +10,7 @@ selects one study of a case: ``--cases 'turn-on:9 at 30 ug'``.
 
 Units and recordings come from `strangers_units.py` and `strangers_cases.py`, which share no code
 with the package; the package is used only through `thermo_comp.fit` and `Calibration.correct`.
-Every row is measured on held-out recordings, unless the row states otherwise. Errors are RMS of
+Errors are those on held-out recordings, unless the row states otherwise. An error is the RMS of
 means over 60 s in ug: of the norm, ``|f| - g``, and of the vector against the true force. A ratio
 is the RMS of error / claimed sd. Figures are RMS over the units. MISS marks a limit of
 `strangers_limits.py` that a row violates; the exit code is then 1. The baselines fitted by the
@@ -325,7 +325,7 @@ def run_case(
     path: Path | None,
     earlier: Mapping[tuple[str, int], Mapping[str, Score]],
 ) -> list[Result]:
-    """Run all studies of a case or, with a label, the study with this label and its prior's."""
+    """Run all studies of a case or, with a label, this study and that of its prior."""
     results = []
     for unit in range(1, (1 if case in RECORDED else units or CASES[case][1]) + 1):
         done: dict[str, thermo_comp.Calibration] = {}

@@ -130,8 +130,8 @@ LIMITS = {
     # A single recording does not show how well turn-ons repeat: error / claimed sd has no limit.
     'sessions one': Limit(high=np.inf),
     'sessions two': Limit(low=0.7, high=1.4),
-    # The error after an update may exceed that of the joint fit by 5 %, as the sd of turn-ons is
-    # estimated from other data.
+    # The error after an update may exceed that of the joint fit by 5 %, as the two fits estimate
+    # the sd of turn-ons from different recordings.
     'sessions update': Limit(than='two', times=1.05),
     'ageing': Limit(),
     'kink': Limit(norm=12.0),

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns simulated units for tests and benchmarks: triads of several kinds (docs/accuracy.md describes
-them), each with a thermal effect besides temperature coefficients, and siblings of a unit.
+them), which differ in their thermal effects, and siblings of a unit.
 """
 
 from __future__ import annotations
@@ -81,8 +81,9 @@ def _only(axis: int, value: float) -> Triple:
 
 def triad(kind: str, seed: int = 0) -> UnitModel:
     """
-    Return a triad of sensor heads that lag the board; bias and scale depend on the temperatures of
-    the heads (of the board in the kind 'paper') and on the effect of the kind.
+    Return a triad of sensor heads that lag the board. Bias and scale are constant in the kind
+    'plain', else they depend on the heads' temperatures (kind 'paper': on the board's) and on the
+    effects of the kind.
     """
     draw = Specimen(kind, seed, FIRST_KIND + TRIAD_NAMES.index(kind))
     heads = ['head-x', 'head-y', 'head-z'] if kind in _OWN_HEADS else ['head']
@@ -97,7 +98,7 @@ def triad(kind: str, seed: int = 0) -> UnitModel:
         if to_case:
             links.append(Link('case', head, 0.02 * to_case))
     if kind == 'convection':
-        # Part of the heat between case and board flows by convection: exponent 1.25.
+        # Part of the heat between case and board flows by convection, as (T_case - T_board)^1.25.
         links[1] = Link('case', 'board', 0.15)
         links.append(Link('case', 'board', draw.between(0.15, 0.35), exponent=1.25))
     network = ThermalNetwork(capacity, tuple(links), power={'board': draw.between(0.05, 0.15)})
@@ -151,13 +152,13 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
         )
     ],
     'hysteresis': _slips,
-    # A heat pump between case and board: effects of load, losses and convection.
+    # Powers of |T_case - T_board|: load (1) and losses (2) of a heat pump, convection (1.25).
     'even': lambda draw: [
         FlowEffect('case', 'board', 1.0, bias=draw.signed(3.0, 12.0), scale=draw.normal(10.0)),
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
         FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ],
-    # Leakage doubles every 7 to 10 K, and is a few ug at the reference temperature.
+    # Leakage doubles every 7 to 10 K; at the reference temperature it is 1 to 5 ug.
     'convection': lambda draw: [
         LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))
     ],
@@ -167,7 +168,7 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
 
 def sibling(unit: UnitModel, seed: int, spread: float = 0.15) -> UnitModel:
     """
-    Return a unit of the type of `unit` with other constants and misalignment; thermal
+    Return a unit of the type of `unit` whose constants and misalignment differ from it; thermal
     coefficients, widths and heat capacities each differ by a factor of 1 +- `spread` at most.
     """
     rng = generator(seed, Stream.SIBLING)

@@ -86,7 +86,7 @@ the static set, free coefficients of its Fs, level of the dynamic set, free coef
 weights of the response in the order of the file); then the parameters of the relative scale in the
 same order. A `nonlinearity` adds, for each axis, the coefficients of its terms, then their changes
 per kelvin. The last three parameters of a posterior are `M[1][0]`, `M[2][0]` and `M[2][1]`. The
-covariance of all parameters is `factor @ factor.T + diag(rest)`. The posterior of a `gyroscope`
+covariance of all parameters is `factor @ factor.T + diag(diagonal)`. The posterior of a `gyroscope`
 has only the parameters of the bias, in rad/s and in the order of the accelerometer's bias. The
 `gyroscope` uses the ranges, the reference temperature and the thermometers of the unit.
 """
@@ -162,16 +162,16 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | input | what happens |
 |---|---|
 | NaN or infinite counts | dropped, counted, WARN |
-| counts at full scale | dropped, counted, ERROR while it lasts |
+| counts at full scale | dropped, counted, ERROR while such counts arrive |
 | no board temperature yet | nothing is published, ERROR |
-| no board temperature, and a calibration without temperature correction | the constants are applied; the covariance includes a temperature sd of 10 K |
-| board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN before) |
+| no board temperature, and a calibration without temperature correction | the constants are applied; the covariance includes the effect of an unknown temperature, with an sd of 10 K |
+| board temperature older than `temperature_timeout` | nothing is published, ERROR (WARN from half of the time-out on, or earlier) |
 | case temperature older than `case_timeout` | the board decides the regime, the covariance is increased, WARN |
 | board temperature outside the calibrated range | curves continue along their tangent for a quarter of the range, and are constant beyond; the covariance is increased, WARN with the distance |
 | gradient or rate outside the calibrated range | the value is limited to the range, the covariance is increased, WARN with the distance |
 | a temperature that is NaN, below -273.15 or above 1000 degC | dropped, counted |
-| a temperature that jumps faster than any part can | the readings are not used until they are plausible again or the thermometer counts as lost |
-| a temperature that is constant while the other temperature changes | the constant readings are not used: the last value is held, then the thermometer counts as lost |
+| a temperature that changes faster than that of any part can | the readings are not used until they are plausible again or the thermometer counts as lost |
+| a temperature that is constant while that of the second thermometer changes | the constant readings are not used: the last used value is held, then the thermometer counts as lost |
 | both temperatures constant over at least 20 readings and 5 s | the temperatures are used with a growing covariance, WARN |
 | a board temperature that leads the case temperature in ramps (swapped topics) | the covariance is increased, ERROR |
 | counts constant for `stuck_timeout`, on all axes or on one axis while the other two change; three zeros | dropped, counted, ERROR |
@@ -182,7 +182,7 @@ $ ros2 param set /thermo_comp calibration_file /new/unit42.yaml
 | a message of more than 1 kB (a very long `frame_id`) | dropped, counted |
 | a temperature stamped more than 5 s after the next reading of the same thermometer | the reading is not used |
 | a sample whose stamp repeats, or goes back by less than a second | dropped, counted |
-| a sample stamped more than 15 s (or ten cycles, if longer) ahead, until a reading or a second sample confirms the time | dropped, counted |
+| a sample stamped more than 15 s (or ten cycles, if longer) after the last sample, until a reading or a second sample confirms the time | dropped, counted |
 | a sample whose stamp goes back by a second or more | all estimators restart, which is reported once |
 
 [Faults](faults.md) lists every fault with its test.

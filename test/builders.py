@@ -50,7 +50,7 @@ def thermal_calibration():
 
 
 def term(kind, bias=(0.0, 0.0, 0.0), scale=(0.0, 0.0, 0.0), **keys):
-    """Make a response term; defaults: the group of its kind, a wide range."""
+    """Make a response term; by default its group is that of `kind`, and its range is wide."""
     values = {'group': kind, 'range': (-50.0, 50.0), **keys}
     return ResponseTerm(kind=kind, bias=tuple(bias), scale=tuple(scale), **values)
 
@@ -157,7 +157,7 @@ def columns_from_events(events):
 
 
 def stream(compensator, events):
-    """Process events one by one, with 1e-3 * sample as angular rate; return rows and indices."""
+    """Process events singly, with 1e-3 * sample as angular rate; return rows, sample numbers."""
     rows, index = [], []
     position = 0
     for kind, stamp, value in events:

@@ -42,7 +42,7 @@ BIAS_SLOPE, BIAS_CURVE = 300.0, 4.0  # counts/K, counts/K^2: 100 ug/K, 1.4 ug/K^
 SCALE_SLOPE = 7e-5
 BY_GRADIENT, BY_MEMORY = 150.0, 60.0  # counts/K
 
-#: Residual sd of the static set [m/s^2]: it includes the error before a ramp is detected.
+#: Residual sd of the static set [m/s^2], which covers the error until a ramp is detected.
 STATIC_RESIDUAL = 1.5e-4
 DYNAMIC_RESIDUAL = 3e-5
 
@@ -108,7 +108,7 @@ class Truth:
 
 
 def truth(ramp_s=RAMP_S, duration_s=DURATION_S):
-    """Compute temperatures: case lags air, board lags case; memory is board less its lag [K]."""
+    """Compute temperatures: case lags air, board lags case; memory: board - lagged board [K]."""
     step = 0.01
     time = np.arange(0.0, duration_s + 1.0, step)
     air = 15.0 + RAMP_K_S * (np.clip(time, *ramp_s) - ramp_s[0])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fit refuses wrong data by a named refusal; if it is allowed, the fit gives a calibration."""
+"""A fit refuses wrong data by named refusals; a refusal that is allowed does not stop the fit."""
 
 import re
 from contextlib import suppress
@@ -38,7 +38,7 @@ as_it_is = id  # a function that leaves a rest unchanged
 
 
 def swapped(source, rest):
-    """Replace the readings: the board follows the chamber, the case lags it by 2 min."""
+    """Replace the readings: the board follows the chamber, the case lags the board by 2 min."""
     (block,) = source.blocks()
     time = (block.board_stamp_ns - block.board_stamp_ns[0]) * 1e-9
     late = np.empty_like(block.board)

@@ -37,7 +37,6 @@ def arrays(rng):
 
 
 def test_importing_the_package_loads_no_large_library():
-    # `import thermo_comp` must load neither numpy nor other large libraries.
     heavy = ('numpy', 'scipy', 'yaml', 'rosbags', 'mcap', 'matplotlib')
     assert loaded_after('import thermo_comp', *heavy) == []
     assert all(getattr(tc, name) is not None for name in tc.__all__)

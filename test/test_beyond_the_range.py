@@ -176,7 +176,8 @@ def test_with_lags_the_sd_in_a_ramp_does_not_grow_with_the_distance_from_the_rat
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # The ramp of 2 K/min exceeds the range by 19 half ranges, which only a unit without lags adds.
+    # The ramp is 19 half ranges beyond the calibrated rates, which adds variance without lags
+    # only.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 

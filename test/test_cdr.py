@@ -103,7 +103,7 @@ def test_the_byte_swap_keeps_the_bits_of_a_signalling_nan():
 
 
 def test_messages_with_frame_ids_of_different_lengths_are_converted():
-    # WHY: the positions of the numbers in a message depend on the length of the frame_id before.
+    # WHY: the place of the numbers in a message depends on the length of its frame_id.
     converter = SampleConverter(Vector3Stamped)
     names = ['a', 'imu_link', '', 'a', 'x' * 40, 'imu_link']
     written = convert(converter, *(cdr('<', (1, k), f, [k, 0, 0]) for k, f in enumerate(names)))
@@ -119,7 +119,7 @@ def test_messages_with_extra_bytes_are_converted_by_rclpy(kind, override):
     values = [float(k) for k in range(37 if kind is Imu else 3)]
     good = cdr('<', (3, 4), 'imu', values)
     fast, slow = SampleConverter(kind, override), SampleConverter(kind, override)
-    # Only rclpy converts messages with extra bytes at the end; both results must be equal.
+    # Only rclpy converts messages with extra bytes at the end; the two outputs must be equal.
     (expected,), (written,) = convert(fast, good), convert(slow, good + bytes(8))
     assert (fast.traffic.n_fallback, slow.traffic.n_fallback) == (0, 1)
     assert deserialize_message(written, Imu) == deserialize_message(expected, Imu)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of the thermal response: their number, their lags, values computed by hand."""
+"""The columns of the thermal response have the right number, lags, values and slopes."""
 
 import math
 

@@ -62,7 +62,7 @@ def assert_same(blocks, rows, index):
     np.testing.assert_array_equal(matrices, matrices.transpose(0, 2, 1))
 
 
-def test_signed_counts_and_the_printed_equations():
+def test_the_offset_is_half_the_sum_of_signed_counts():
     # From counts at +g and -g: offset = sum / 2, scale = difference / 2. The paper prints Eq. (3)
     # and (4) with sum and difference exchanged.
     plus, minus = 300.0 * GRAVITY + 12.0, -300.0 * GRAVITY + 12.0
@@ -95,7 +95,8 @@ def test_a_corrected_sample_agrees_with_the_formula_of_the_static_set():
 #: Calibration of all examples; no example changes it.
 RICH = rich_calibration()
 
-#: Values of a few samples: not finite, limits of a 16-bit converter, zero, the smallest number.
+#: Values of a few samples: not finite, limits of a 16-bit converter, zeros, the smallest positive
+#: number.
 STRANGE = (math.nan, math.inf, -math.inf, 32767.0, -32768.0, 0.0, -0.0, 5e-324)
 
 
@@ -136,8 +137,8 @@ def at_seconds(*events):
     ]
 
 
-# In the examples a reading that was applied, or a reading one day later, shows that stored
-# readings have stamps of another clock.
+# In the explicit examples the compensator must find that stored readings have stamps of another
+# clock: by a reading that it has applied, or by a reading one day later.
 @given(event_lists, st.integers(3, 30), st.sampled_from([0.0, 5.0]))
 @example(at_seconds('A', 3, 'A', 0, 'B', 2, 'B', 86_400, 'C', 0, 'A', 0), 5, 0.0)
 @example(at_seconds('B', 26, 'B', 21, 'A', 23, 'B', 16.5), 1, 0.0)
@@ -245,8 +246,8 @@ def test_at_most_4096_readings_of_another_clock_are_stored():
 
 @pytest.mark.parametrize('n_before', [0, 3])
 @pytest.mark.parametrize('ahead_s', [0, 2])
-def test_all_readings_of_102_s_without_samples_are_applied(n_before, ahead_s):
-    """Readings at 20 Hz over 120 s, which precede the samples, are applied in order."""
+def test_all_readings_of_two_minutes_without_samples_are_applied(n_before, ahead_s):
+    """Readings at 20 Hz over 120 s, between which there is no sample, are applied in order."""
     first = [('accel', k * SECOND_NS // 100, (1.0, 2.0, 2930.0)) for k in range(1, 1 + n_before)]
     readings = [
         (name, k * SECOND_NS // 20, 20.0 + 1e-4 * k + 1e-3 * (k % 7))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other programs are read by headings; units follow from |f| at rest and rates."""
+"""Tables of other programs are read by headings; |f| at rest and rates show the units."""
 
 from datetime import datetime, timedelta, timezone
 from itertools import takewhile
@@ -388,7 +388,7 @@ def test_the_speed_of_a_turn_by_hand_shows_the_unit_of_times(tmp_path, rng):
 
 @pytest.mark.parametrize(('rest_s', 'gap_s'), [(30, 0), (30, 670), (60, 1), (45, 3)])
 def test_times_of_short_rests_at_1_hz_are_seconds(tmp_path, rng, rest_s, gap_s):
-    # WHY: samples were averaged over 30 and more, so over two attitudes, and |f| was below g.
+    # WHY: means over 30 and more samples contained two attitudes, so their |f| was below g.
     ups = positions(18, 1)
     accel = np.repeat(ups, rest_s, axis=0) + 2e-5 * rng.standard_normal((18 * rest_s, 3))
     times = (np.arange(18)[:, None] * (rest_s + gap_s) + np.arange(rest_s)).ravel()

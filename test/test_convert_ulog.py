@@ -232,7 +232,7 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     read = read_autopilot(path)
     assert 'TC_A_ENABLE was 1 for 50 % of the samples' in read.chosen
     # In a log a changed parameter has the stamp of the message before it, so the sample at the
-    # change may be on the wrong side; `- 1` leaves it out of the comparison.
+    # change may be on the wrong side; `- 1` leaves this sample out of the comparison.
     n = min(len(read.accel), N // 2) - 1
     part = slice(-n, None) if begin else slice(n)
     np.testing.assert_array_equal(read.accel[part], force[part])

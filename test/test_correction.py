@@ -135,7 +135,6 @@ def states_of(unit, rng, n=5):
 
 @pytest.mark.slow
 def test_corrections_drawn_from_the_posterior_scatter_by_the_claimed_sd(rng):
-    # Corrections with randomly drawn parameters must scatter as `SlowUncertainty` claims.
     unit = replace(full_bank(rng), noise_density_m_s2_sqrt_hz=(1e-4,) * 3)
     layout = parameter_layout(unit)
     n = layout.n_parameters

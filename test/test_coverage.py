@@ -88,7 +88,7 @@ def test_the_next_direction_reduces_the_mean_variance(n, rng):
     before = mean_variance(up, at)
     gain = before - mean_variance(np.vstack([up, proposed]), at)
     others = [before - mean_variance(np.vstack([up, unit]), at) for unit in units(rng, 300)]
-    # Faces are preferred, as they are easy to hold, if they have at least half the best benefit.
+    # A face, which is easy to hold, is preferred if its gain is at least half of the largest gain.
     assert gain > 0.45 * max(others)
     assert np.max(up @ proposed, initial=-1.0) < np.cos(np.radians(20.0))
 
@@ -107,7 +107,7 @@ def test_the_proposed_directions_are_nearly_as_good_as_spread_positions():
     assert farthest(up)[1] < 36.0
 
 
-def test_the_largest_angle_to_the_nearest_direction():
+def test_farthest_returns_the_direction_farthest_from_all_given_directions():
     # The corners of a cube are the directions farthest from all six faces.
     up, angle = farthest(FACES)
     assert np.abs(up) == pytest.approx(1.0 / np.sqrt(3.0))

@@ -132,6 +132,6 @@ def test_messages_quoted_on_the_pages_are_in_the_source():
     # Join adjacent string literals, which form one message.
     plain = re.sub(r"'\s+f?'", '', sources)
     for sentence in quoted:
-        # A number or '...' stands for a value at run time: compare the longest text between them.
+        # Numbers and '...' stand for values at run time: compare the longest text between values.
         words = max(re.split(r'\d+(?:\.\d+)?|\.\.\.', sentence), key=len).strip(' ,;')
         assert words in plain, sentence

@@ -66,7 +66,7 @@ def settling_s():
 
 
 def ended_s(row):
-    """Return the time [s] from which the messages of a row equal the undisturbed bag again."""
+    """Return the time [s] from which a row's messages equal those of the bag without the fault."""
     at, _ = row.shift
     if math.isfinite(at):
         return at

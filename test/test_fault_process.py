@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Restarts, signals, reloads and wrong calibration files of a node process."""
+"""A node process publishes no wrong output at restarts, signals, reloads and wrong files."""
 
 import os
 import signal

@@ -186,7 +186,7 @@ def test_the_sd_of_an_old_calibration_aged_to_the_last_rest_includes_the_random_
     # and y between half and all of the variance of the random walk.
     for axis in (x, y):
         assert 0.5 < axis.present_sd / (329.0 * MICRO_G) < 1.5
-    # The sd of z is the change of z that the rests show, within two turn-on offsets (sd 20 ug).
+    # The present sd of z must be the size of its change, within two turn-on offsets (sd 20 ug).
     assert z.present_sd == pytest.approx(abs(walk[-1, 2]), abs=40.0 * MICRO_G)
 
 
@@ -355,7 +355,7 @@ def test_the_command_update_writes_a_better_calibration(tmp_path, unit_file, cli
     # The date in the new calibration file is that of its last rest, not that of the command.
     assert written.provenance.date == '2030-01-20T23:12:40Z'
     assert 'from 0 bags and 1 rest log, ' in cli('info', new).stdout
-    # The old calibration is judged on the log: it has no rest of the log in it.
+    # The old calibration is judged on the log, because no rest of the log was used to make it.
     assert parsed(cli('evaluate', log, '-c', unit_file, '--json', code=1).stdout)['left']
     history = cli('report', '-c', unit_file, '-c', new, '-o', tmp_path / 'page.html', '--json')
     assert [change['constant'] for change in parsed(history.stdout)['history']][2] == 'bias z'

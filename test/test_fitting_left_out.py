@@ -24,8 +24,8 @@ def score(drift, norms=(), by_thermometer=0.0):
 
 def test_few_norms_that_both_models_predict_do_not_select_the_model():
     # WHY: a MEMS was recorded in six faces at three temperatures. Only four left-out values of |f|
-    # could be predicted both with and without a curve over temperature. Their gain was below two
-    # standard errors, so the fit had no curve, and an error of 7 mg instead of 0.3 mg.
+    # could be predicted both with and without a curve over temperature. The curve reduced their
+    # errors by less than two standard errors, so the fit left it out: an error of 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
@@ -41,7 +41,7 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
     curve, parts, bends = (score(drift, (), by_thermometer) for drift in (120.0, 46.0, 20.0))
     assert is_better(curve, parts)
     assert not is_better(parts, bends)
-    # If the errors of |f| are larger than the error of the thermometer, they select the curve.
+    # Errors of |f| that are larger than the error of the thermometer decide for the curve.
     flat, curved = (score(46.0, size * np.ones(9), by_thermometer) for size in (3000.0, 60.0))
     assert is_better(flat, curved)
     assert not is_better(curved, score(20.0, 30.0 * np.ones(9), by_thermometer))

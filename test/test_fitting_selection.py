@@ -110,8 +110,8 @@ def test_a_forced_group_stays_in_the_model(calm):
     ('where', 'is_chosen'), [('one bag', False), ('one section', False), ('all', True)]
 )
 def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen):
-    # The evidence favours the group 'idle' in all cases; the left-out error favours it only if it
-    # has an effect in all bags and sections.
+    # The evidence favours the group 'idle' in all cases; the left-out error favours this group
+    # only if its effect is in all bags and sections.
     truth = Truth()
     windows, up = table_of(truth, 10, np.random.default_rng(5), n_windows=30)
     rows = {
@@ -127,7 +127,7 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
 def test_a_lag_is_found_although_a_curve_without_it_does_not_help(n_positions, step_s):
-    # WHY: a bias that depends on a lagged temperature only needs the groups 'curve' and 'board'
+    # WHY: a bias that depends only on a lagged temperature needs the groups 'curve' and 'board'
     # together; the group 'curve' without 'board' was rejected, and so the lag was not found.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
     on_bias = np.outer(slope, [1.0, 0.0, 0.0, -1.0, 0.0, 0.0])

@@ -124,7 +124,7 @@ def test_columns_of_sets_and_of_initial_lag_states_agree_with_formulas(bags):
     np.testing.assert_allclose(data.columns[:, 3], w, atol=1e-9)
     assert data.in_scale[:6].tolist() == [True, True, True, False, True, True]
     # An initial state of a lag decays with the time constant of the lag; the column of a product
-    # with t is t times this.
+    # with t decays as t times the same function.
     taus = [lag.tau_s for lag in memory_of(bank()).lags]
     for k, column in enumerate(bank(), start=6):
         lag = data.lag[k]
@@ -269,7 +269,6 @@ def test_a_calibration_file_corrects_windows_like_the_regression(fitted):
 
 
 def test_the_posterior_of_a_file_has_the_sd_of_the_regression(fitted):
-    # The posterior in the file must have the sd of bias, K and M that the regression claims.
     result, claim = fitted
     calibration = result.calibration
     layout = parameter_layout(calibration)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bags of a fleet are found and read on a disk and in other storage."""
+"""The bags of a fleet are found and read on a disk and in a storage of fsspec."""
 
 import shutil
 import tempfile

@@ -20,7 +20,7 @@ MONDAY = datetime(2026, 1, 5)
 
 
 def fleet_of(n, rng, *, lots=('',), day=0.0, like=()):
-    """Draw n units: normal or, if compared by logarithm, log-normal; or `like` plus noise."""
+    """Draw values of n units, log-normal if compared by logarithm, or add noise to `like`."""
     rows = []
     for i in range(n):
         cells = {}
@@ -70,7 +70,7 @@ class TestOutliers:
     @pytest.mark.parametrize('n', [10, pytest.param(40, marks=pytest.mark.slow)])
     def test_fleets_without_outliers_give_a_false_alarm_in_5_percent(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
-        # With a rate of 5 %, 60 fleets give 3 false alarms on average; 12 have p < 1e-4.
+        # With a rate of 5 %, 60 fleets give 3 false alarms on average, and 12 with p < 1e-4.
         assert n_alarms < 12
 
     def test_no_outlier_is_reported_in_a_fleet_of_six(self, rng):
@@ -167,7 +167,7 @@ class TestDrift:
         assert worst.worst.sd == pytest.approx(2.0 * np.sqrt(2.0))
         assert (worst.earlier, worst.later) == ('/u003@0', '/u003@30')
 
-    def test_a_scale_factor_drifts_in_ppm(self, rng):
+    def test_the_drift_of_a_scale_factor_is_reported_in_ppm(self, rng):
         first = fleet_of(2, rng)
         second = fleet_of(2, rng, day=7.0, like=first)
         second[0] = {**second[0], 'scale_z': float(first[0]['scale_z']) * (1.0 + 90e-6)}

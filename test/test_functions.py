@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Temperature functions, predicted sd and residual statistics agree with hand numbers, scipy."""
+"""Temperature functions, predicted sd and statistics agree with hand numbers and with scipy."""
 
 from dataclasses import replace
 
@@ -217,7 +217,7 @@ def test_ramp_states_equal_those_of_the_memory_of_the_fit(rate):
             # The gradient rises within 1 s in the memory, and in a step in `ramp_states`.
             assert state[place] == pytest.approx(lived[place - first], rel=2e-3), quantity
         elif isinstance(quantity, Play) and not quantity.tau_s:
-            # Plays on lags are left out: they need half an hour to reach their half-width.
+            # Plays on lags are left out: a lag needs half an hour to change by their half-width.
             assert state[place] == pytest.approx(-quantity.width_k * np.sign(rate))
             assert state[place] == pytest.approx(lived[place - first])
 

@@ -208,7 +208,7 @@ def test_the_message_on_a_wrong_gyroscope_names_the_key():
 
 
 def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
-    # At the reference temperature the rate gets its constant bias, the force no correction.
+    # At the reference temperature only the constant bias of the rate is corrected, not the force.
     triad = replace(rich_calibration().gyroscope, response=(), posterior=None)
     for gyroscope in (triad, None):
         compensator = Compensator(replace(calibration(), gyroscope=gyroscope))
@@ -224,7 +224,7 @@ def test_the_rate_at_the_reference_temperature_is_corrected_by_its_bias():
     assert compensator.process(0, 300.0, 600.0, 2900.0) is not None
     x, y, z, *variances = compensator.correct_rate(0, 1.0, 1.0, 1.0)
     assert (x, y, z) == pytest.approx((0.98 - 1e-5, 1.03, 0.99 - 1e-5), abs=1e-12)
-    # In an unknown regime the variance is noise, residual, and the difference of the sets.
+    # In an unknown regime the variance is the sum of noise, residual and difference of the sets.
     least = np.square((1e-4, 2e-4, 1e-4)) / 0.01 + np.square((1e-5, 2e-5, 1e-5))
     assert (np.array(variances) >= least).all()
     assert variances == pytest.approx(least, rel=0.05)

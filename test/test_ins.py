@@ -53,7 +53,7 @@ def test_the_sd_of_the_filter_equals_the_closed_form_for_white_noise(rng):
     by_noise = density**2 * (T / 2.0 - np.sin(2.0 * omega * T) / (4.0 * omega)) / omega**2
     expected = np.sqrt(2.0 * (by_levelling + by_noise))
     assert free.sigma[-1, 0] == pytest.approx(expected, rel=0.01)
-    # The RMS of the 298 flights is uncertain, as they overlap: about eight are independent.
+    # The 298 flights overlap, so their RMS is as uncertain as that of about eight flights.
     assert 0.5 < np.sqrt(np.mean(free.position[-1] ** 2)) / expected < 1.5
 
 

@@ -114,7 +114,7 @@ def test_recordings_that_are_not_parts_of_one_are_not_joined(rng):
     # Recordings of 2 s that begin at equal times are not parts of one recording.
     short = recorded(rng, 2.0)
     assert len(joined(reduced([short, short]))) == 2
-    # Of two recordings with equal stamps, each is joined with its second part.
+    # Of two recordings with equal stamps each is joined only with its own second part.
     other = replace(whole, accel=-whole.accel)
     parts = [*cut(whole, (200.0,)), *cut(other, (200.0,))[::-1]]
     first, second = joined(reduced(parts))
@@ -141,8 +141,8 @@ def test_a_part_in_which_the_unit_never_rests_is_joined(rng):
 
 def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
     # WHY: each part of a split recording was fitted with a separate turn-on and separate initial
-    # lag states. For 18 recordings of 9 h, split every hour, the fit took 30 times as long and
-    # claimed 6 times the sd.
+    # lag states. For 18 recordings of 9 h, split every hour, the fit took 30 times as long as that
+    # of the whole recordings, and claimed 6 times its sd.
     bag = thermo_comp.read(ROOT / 'bags/fit/01.mcap')
     parts = []
     for begin_s in np.arange(0.0, bag.time_s[-1], 1800.0):
@@ -173,7 +173,7 @@ def test_a_split_recording_gives_the_calibration_of_the_whole_recording():
 
 
 @pytest.mark.slow
-def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng, cli):
+def test_evaluate_and_report_take_the_parts_as_one_recording(tmp_path, rng, cli):
     paths, topics = [], Topics()
     for number, part in enumerate(cut(recorded(rng, 900.0), (450.0,))):
         paths.append(tmp_path / f'part{number}.mcap')
@@ -188,7 +188,6 @@ def test_the_judge_takes_the_parts_as_one_recording(tmp_path, rng, cli):
     assert bag.source.name == 'part0.mcap .. part1.mcap'
     # 900 s have 15 windows of 60 s, of which two may be lost at the cut.
     assert len(result.judgements['unit'].windows) >= 13
-    # The command prints which bags it has joined.
     thermo_comp.save(calibration, tmp_path / 'unit.yaml')
     errors = cli('evaluate', *paths, '-c', tmp_path / 'unit.yaml').stderr
     assert 'part0.mcap .. part1.mcap: 2 bags of one recording, joined' in errors

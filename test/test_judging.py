@@ -266,7 +266,7 @@ class TestVerdict:
         assert 'limit 100 ug' in judgement.reason
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
-        # WHY: the verdict stated 61 ug, the error in fitted attitudes; in others it was 1091 ug.
+        # WHY: the verdict stated 61 ug, the error in fitted attitudes; that in others was 1091 ug.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)
@@ -326,7 +326,7 @@ class TestVerdict:
         assert found.sections['all'].n == 30
         assert found.sections['outside'].n == 10
         assert '10 windows of 60 s outside the calibrated ranges not judged: 5 mg' in found.reason
-        # Only windows inside the ranges decide the verdict; without them there is no verdict.
+        # Only windows inside the ranges are judged; without such windows there is no verdict.
         bad = windows.force.copy()
         bad[10:, 2] = GRAVITY + 500.0 * MICRO_G
         found = judge(dataclasses.replace(windows, force=bad), CLAIMING)
@@ -420,7 +420,7 @@ def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
     noisy = dataclasses.replace(noisy, unit=dataclasses.replace(noisy.unit, cycle_time_s=0.1))
     with pytest.raises(RecordingError, match=r'dead\.mcap: y reads exactly 0 for 0\.'):
         judged(bag, noisy)
-    # An axis whose noise is below the step of the converter may repeat values: it is not reported.
+    # An axis with less noise than a step of the converter may repeat values and is not reported.
     assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))
 
 

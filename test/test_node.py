@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node's input, output and diagnostics over DDS."""
+"""The node corrects samples, publishes the regime and reports faults over DDS."""
 
 import math
 import time
@@ -92,7 +92,6 @@ def test_the_node_takes_imu_input_and_can_switch_to_counts(peer, saved):
         assert heard[0].orientation == sent.orientation
         assert heard[0].orientation_covariance.tolist() == sent.orientation_covariance.tolist()
         assert heard[0].linear_acceleration.z == pytest.approx(0.4, rel=1e-12)
-        # The running node changes its input from Imu messages in m/s^2 to vectors of counts.
         assert 'unit.input: must be' in peer.set_atomically(input='counts').reason
         file = saved(calibration())[1].removeprefix('calibration_file:=')
         both = peer.set_atomically(input='counts', frame_id='', calibration_file=file)

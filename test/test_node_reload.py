@@ -33,7 +33,7 @@ K = 300.0
 
 
 def of_bias(counts, **keys):
-    """Make a calibration with a bias of x [counts], by which a test recognises it."""
+    """Make a calibration that a test recognises by its bias of the x axis [counts]."""
     axes = Axes(AxisReference(K, counts), AxisReference(K, 0.0), AxisReference(K, 0.0))
     return calibration(axes=axes, **keys)
 
@@ -118,7 +118,6 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         values = peer.call(GetParameters, 'thermo_comp/get_parameters', request).values
         assert values[0].double_value == 5.0
 
-        # Parameter `serial` and the serial in the calibration file must agree.
         save_calibration(of_bias(4.0, unit=Unit('T-2', 'counts', 32767.0, 0.01)), third)
         (result,) = peer.set_parameters(serial='T-9')
         assert "unit.serial: must be 'T-9'" in result.reason

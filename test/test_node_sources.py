@@ -207,7 +207,7 @@ def test_a_driver_with_incompatible_qos_or_type_is_named(peer, unit):
         status_with(peer, heard, text)
 
 
-def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path):
+def test_reports_more_frequent_than_samples_report_no_missing_samples(peer, tmp_path):
     # WHY: with a diagnostics_period below the sample interval, reports without samples were ERROR.
     from thermo_comp.unit.calibration import Unit
 
@@ -232,7 +232,7 @@ def test_reports_more_frequent_than_samples_do_not_report_silence(peer, tmp_path
         status_with(peer, heard, 'no samples are coming in')
 
 
-def test_a_reading_far_ahead_is_forgotten(peer, unit):
+def test_the_warning_of_a_reading_a_day_ahead_ends(peer, unit):
     # WHY: after a temperature with a stamp one day ahead, the status stayed WARN for a day.
     with node_in_thread(*node_arguments(unit)) as node:
         samples = Samples(peer, node)

@@ -139,7 +139,7 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     parts = {term.part for term in calibration.response if term.kind == 'board'}
     taus, _, shares, leads = np.array(sorted(parts)).T
     if 'case' in sensors:
-        # A lag of both thermometers acts like one share of (case - board) in all part inputs.
+        # A lag of both thermometers acts like equal shares of (case - board) in all part inputs.
         assert shares == pytest.approx([np.mean(shares)] * 3, abs=0.02)
     else:
         assert taus == pytest.approx(unit.part_s, rel=0.02)
@@ -155,7 +155,7 @@ def test_slow_tilts_of_a_support_are_not_fitted_by_a_second_stage_of_a_lag():
     calibration = strangers.fitted(study)
     parts = {part.part for part in calibration.response if part.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
-    # The tilts of one position are a drift of 40 ug RMS; twelve positions average it.
+    # The tilts of one position cause a drift of 40 ug RMS; a mean over 12 positions has less.
     tests = {'': [minutes(bag) for bag in study.tests['']]}
     assert strangers.scored(study, calibration, tests)[''].vector < 40.0
 
@@ -167,9 +167,9 @@ def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_sci
     ours = judged(strangers.fitted(study), study)
     bags = [minutes(bag) for bag in study.tests['']]
     correct = strangers.scipy_baselines(study)['cubic']
-    by_hand = strangers.error_of([correct(bag) for bag in bags], bags, is_drift=False)
+    by_cubic = strangers.error_of([correct(bag) for bag in bags], bags, is_drift=False)
     # For a single unit the ratio of the two errors scatters by some 20 %.
-    assert ours.vector < 1.2 * by_hand.vector
+    assert ours.vector < 1.2 * by_cubic.vector
     assert ours.ratio < 1.5
 
 
@@ -255,7 +255,7 @@ def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
 
 @pytest.mark.slow
 def test_a_bump_of_the_bias_over_temperature_is_fitted_by_knees():
-    # In two means over 60 s the unit passes the bump, which must not be taken for motion.
+    # The bump lasts for two means over 60 s, and must not be taken for motion.
     _, study = study_of('bump', bump=np.array([450.0, -400.0, 500.0]), bump_c=17.0)
     # A fit of all groups chooses these three groups, too, but takes three times as long.
     calibration = strangers.fitted(study, groups=('curve', 'part', 'bend'))

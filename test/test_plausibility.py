@@ -178,7 +178,7 @@ def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# The other preset is left out: its board follows the case in seconds and would lead by below 1 K.
+# The preset 'mems' is left out: its board follows the case in seconds, so it leads by below 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [
@@ -200,7 +200,7 @@ def test_swapped_topics_are_reported(preset, sensor):
 def test_the_warm_up_after_power_on_is_not_taken_for_swapped_topics():
     # WHY: in the warm-up after power-on the board leads the case, which was taken for exchanged
     # topics; the claimed sd was 20 times too large. WHAT: the board warms up by 4 K, the case by
-    # 1.3 K; in the ramp after it the case leads.
+    # 1.3 K; in the ramp after the warm-up the case leads.
     tracker = tracker_of(memory=LAG)
     for second in range(3 * 3600):
         warm = 4.0 * (1.0 - math.exp(-second / 500.0))

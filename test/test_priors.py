@@ -264,7 +264,7 @@ def after(change, ups):
 def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
     # WHY: one unchanged face had increased the claimed sd of bias and scale from 0.2 to 424 ug.
     bias, bias_sd, scale, scale_sd = after(lambda counts, _: counts, np.eye(3)[:n_faces])
-    # A tenth of the usual repeatability of turn-ons, 300 ug.
+    # The limit is a tenth of the usual repeatability of turn-ons, 300 ug.
     assert max(bias_sd.max(), scale_sd.max() * STANDARD_GRAVITY) < 30e-6 * STANDARD_GRAVITY
     assert np.abs(bias).max() < 2.0 * bias_sd.max()
     assert np.abs(scale).max() < 2.0 * scale_sd.max()
@@ -272,7 +272,7 @@ def test_one_to_three_faces_of_an_unchanged_unit_keep_the_calibration(n_faces):
 
 @pytest.mark.parametrize('kind', ['bias', 'scale'])
 def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
-    # WHY: an update with three faces ascribed a change of 100 ug to the mountings, and left it.
+    # WHY: an update with three faces took a change of 100 ug for mounting offsets.
     # WHAT: in each face one count, 300 ug, is added by a change of the bias or of the scale.
     K = np.array([axis.scale_factor for axis in fitted(9).calibration.axes])
     change = np.array([1.0, -1.0, 1.0]) / (K * STANDARD_GRAVITY)
@@ -286,8 +286,8 @@ def test_three_faces_halve_the_error_of_a_change_of_bias_or_scale(kind):
     bias, bias_sd, scale, scale_sd = after(changed, np.eye(3))
     wrong = np.array([bias / STANDARD_GRAVITY, scale])
     wrong[('bias', 'scale').index(kind)] -= change
-    # The rests show the sum of both errors; nothing separates bias and scale, so each gets half of
-    # the change. The noise of 10 min and the lags of an unknown start leave some ug.
+    # The rests determine only the sum of the errors of bias and scale, so each gets half of the
+    # change. Noise of 10 min and unknown initial lag states leave an error of some ug.
     assert np.abs(wrong.sum(axis=0)).max() < 10e-6
     assert np.abs(np.abs(wrong) / np.abs(change) - 0.5).max() < 0.1
     assert (np.abs(wrong) < 2.0 * np.array([bias_sd / STANDARD_GRAVITY, scale_sd])).all()

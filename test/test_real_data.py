@@ -58,7 +58,7 @@ def test_fits_of_handheld_units_agree_with_a_least_squares_solution_by_scipy(uni
     direct = least_squares(residual, [0, 0, 0, 1, 1, 1, 0, 0, 0], x_scale='jac').x
     calibration = unit.calibration
     axes = calibration.axes
-    # The fit weights positions by their length, this solution does not.
+    # The fit weights positions by their length, the solution by scipy does not.
     np.testing.assert_allclose([axis.bias for axis in axes], direct[:3], atol=1.0 * MG)
     np.testing.assert_allclose([axis.scale_factor for axis in axes], direct[3:6], atol=1e-3)
     M = np.array(calibration.misalignment)
@@ -85,7 +85,7 @@ def test_six_faces_leave_the_misalignment_at_its_prior(real_data, work):
 
 
 def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
-    # |a| jumps by 20 mg at 366 s and by 17 mg at 468 s; a third jump is mostly across gravity.
+    # |a| jumps by some 20 mg at 367 s and at 467 s; a third jump is mostly across gravity.
     sources, _ = fit_sources([freezer_bag(real_data, work)])
     with pytest.raises(FitError, match='not a function of temperature') as refused:
         fit(sources, OPTIONS)
@@ -115,7 +115,7 @@ def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_plot(
 def test_the_error_of_the_freezer_run_on_held_out_minutes(
     real_data, work, length, n_sets, sets, drift, mg
 ):
-    # The 1420 s after the last jump are cut into parts; each is corrected by a fit to other parts.
+    # Held-out parts of the 1420 s after the last jump are corrected by a fit to the other parts.
     bag = freezer_bag(real_data, work)
     starts = np.arange(518.5, 1938.5, length).tolist()
     parts = [BagPart(start, start + length) for start in starts]
@@ -162,7 +162,6 @@ def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, wor
 
 
 def test_no_recording_is_in_the_project():
-    # The project shows plots and numbers of the recordings, and must not contain their files.
     tracked = ran('git', 'ls-files').stdout.split()
     names = ('temp-calibration.csv', 'mk_imu', 'annotated_session.csv')
     assert not [path for path in tracked if path.rsplit('/', 1)[-1].startswith(names)]

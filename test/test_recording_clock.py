@@ -39,7 +39,7 @@ def joined(blocks, name):
 
 
 @pytest.mark.parametrize('jump_ns', [YEAR_NS, -YEAR_NS, -START_NS + 5, 2 * LONGEST_PAUSE_NS])
-def test_a_jump_becomes_an_hour_and_the_rest_stays(tmp_path, jump_ns):
+def test_a_jump_becomes_an_hour_and_other_intervals_stay(tmp_path, jump_ns):
     true_ns = START_NS + STEP_NS * np.arange(1000)
     after = np.arange(1000) >= 500
     blocks = blocks_of(

@@ -62,7 +62,7 @@ def every_cut(content, position, length):
     return [*range(position, end), *range(end, len(content), 17), len(content) - 1]
 
 
-def test_cut_at_every_byte_of_the_last_chunk(tmp_path):
+def test_a_bag_cut_in_its_last_chunk_is_read_up_to_the_cut(tmp_path):
     content, position, length = small_bag('none')
     messages = regular_messages(24)
     # `last`: the position in the file at which each message of the last chunk ends.

@@ -103,7 +103,7 @@ def test_a_compressed_file_is_read_up_to_its_damage(tmp_path):
         read_recording(bag)
 
 
-def test_a_compressed_file_expands_within_limits_and_leaves_nothing(tmp_path, monkeypatch):
+def test_a_compressed_file_expands_within_limits_and_leaves_no_file(tmp_path, monkeypatch):
     bag = whole(tmp_path, 'mcap', 'FILE')
     temporary = tmp_path / 'temporary'
     temporary.mkdir()

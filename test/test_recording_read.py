@@ -172,7 +172,7 @@ def test_raw_messages_have_the_bytes_of_the_bag(tmp_path, accel):
             assert raw.log_ns.tolist() == [m.log_ns for m in wanted]
 
 
-def test_blocks_end_where_the_frame_changes_and_join_to_the_whole(tmp_path):
+def test_blocks_end_where_the_frame_changes_and_together_have_all_messages(tmp_path):
     messages = regular_messages(60)
     for row, message in enumerate(messages):
         message.frame_id = 'front' if row % 30 < 11 else 'a_longer_name'

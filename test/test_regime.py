@@ -45,7 +45,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return the switches after each onset, and the number of static starts."""
+    """Run n ramps; return the switches after each onset, and the number of runs static before."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -271,9 +271,9 @@ def test_the_relaxed_rate_sets_the_end_of_the_dynamic_regime():
 @pytest.mark.parametrize('sensor', ['1 mK', '1 mK, 62.5 mK steps', '10 mK, 62.5 mK steps'])
 def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     # The case lags the chamber by 3 min, the board lags the case by 15 min. After the ramp the
-    # case's rate falls as exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): they reach
-    # the relaxed rate, 0.1 of the ramp's, after 7 and 38 min. Readings with steps of 62.5 mK do
-    # not show the last 5 min of the case's change.
+    # case's rate falls as exp(-t / 180 s), the board's as 900 / 720 exp(-t / 900 s): case and
+    # board reach the relaxed rate, 0.1 of the ramp's, after 7 and 38 min. Readings with steps of
+    # 62.5 mK do not show the last 5 min of the case's change.
     noise, quantum = SENSORS[sensor]
     lag, behind = 180.0, 900.0
     board_too = DetectorSettings(
@@ -291,7 +291,7 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # With `end_condition: case` the board has no effect; without case readings it has no effect.
+    # The end condition `case` acts like a missing board; without a case it acts like `board`.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)
@@ -379,7 +379,6 @@ def test_switches_are_equal_in_heating_and_cooling(quantum):
 
 
 def test_switches_do_not_depend_on_the_origin_of_time():
-    # The switches must be equal to the bit if all stamps are shifted.
     rng = np.random.default_rng(8)
     t = np.arange(0.0, 3000.0)
     settings = detector_settings(0.001)

@@ -168,7 +168,6 @@ def test_a_page_of_a_bag_alone_shows_temperatures_derivatives_and_flag(opened, t
 
 
 def test_texts_of_a_bag_or_a_calibration_are_escaped_in_the_page(tmp_path):
-    # Names, serials, notes and hashes in a certificate must be text, not HTML.
     evil = '<script>alert("x")</script>'
     bag = write_bag(
         tmp_path / "a'b<img src=x onerror=alert(1)>$\\frac{.mcap", frame_id=evil, serial=evil

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate: statements of the laboratory, uncertainty budget, rounding of values."""
+"""The certificate prints statements of the laboratory, and right budgets and rounded values."""
 
 import math
 from dataclasses import replace

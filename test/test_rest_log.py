@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rest log of the node: content, size, and damage by a killed node or a full disk."""
+"""The rest log has the right content and size, also after a killed node or a full disk."""
 
 import json
 import signal
@@ -168,7 +168,7 @@ def test_a_damaged_rest_log_loses_only_the_damaged_lines(place, value):
     changed = bytearray(content)
     changed[place % len(content)] = value
     left = [row for _, row in decode(bytes(changed))[0]]
-    # A wrong byte loses one rest; a wrong newline loses two; a wrong start line loses all.
+    # A wrong byte loses one rest, a wrong newline two rests, and a wrong start line all rests.
     assert all(row in [rest(k) for k in range(9)] for row in left)
     assert len(left) >= 7 or place % len(content) < len(encode(START))
 
@@ -217,7 +217,7 @@ def test_the_size_of_a_rest_log_is_limited_per_day_and_in_total(tmp_path, monkey
     assert len(sizes) == 6
     assert max(sizes) <= 2000
     assert sum(sizes) <= 5000 + 2000
-    # Old files lost more rests than new files, and no file was removed.
+    # The oldest file was thinned to less than half of the newest file, and no file was removed.
     assert sizes[0] < sizes[-1] / 2
     assert log.n_rests == len(logged(tmp_path))
     assert (log.n_days, log.n_lost, log.reason) == (6, 0, '')

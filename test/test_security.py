@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Data from outside cannot fill the memory or open other files; the node obeys its policy."""
+"""Data from outside cannot fill the memory or open files; the security policy fits the node."""
 
 import xml.etree.ElementTree as ET
 

@@ -118,7 +118,7 @@ def test_a_saturated_effect_of_heat_flow_has_two_values():
 
 
 def test_a_switched_load_warms_its_part_by_the_steady_heat_balance():
-    """Before the load the warming is zero; at the end it is that of the steady heat balance."""
+    """Before the load the warming is zero, at the end that of the steady heat balance."""
     unit = triad('own-lags', 1)
     spell = 30_000.0
     load = SwitchedLoad('board', 0.5, (spell, 1.0001 * spell))

@@ -107,7 +107,7 @@ def test_a_transition_time_of_zero_switches_the_sets_at_once():
     assert set(ramp(tracker).tolist()) == {0.0, 1.0}
 
 
-def test_without_a_lost_case_sensor_the_rate_of_the_board_is_used():
+def test_the_gradient_follows_from_the_board_rate_if_the_case_sensor_is_lost():
     tracker = ThermalTracker(DetectorSettings(), None, ThermalConfig(case_timeout_s=10.0), 600.0)
     t = np.arange(0, 1000)
     board = 20.0 + 0.01 * t
@@ -120,7 +120,7 @@ def test_without_a_lost_case_sensor_the_rate_of_the_board_is_used():
     assert math.sqrt(state[VAR_GRADIENT]) >= LOST_GRADIENT_RELATIVE_SD * 5.9
 
 
-def test_rate_of_a_sensor_is_the_slope_of_its_readings_or_that_of_the_board():
+def test_the_rate_of_a_lost_sensor_is_that_of_the_board():
     spec = MemorySpec(rates=('case',))
     tracker = ThermalTracker(DetectorSettings(), spec, ThermalConfig(case_timeout_s=10.0))
     t = np.arange(0, 1000)

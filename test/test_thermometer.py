@@ -78,7 +78,7 @@ PARTS = {
 
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
-def test_claimed_variances_match_squared_errors(errors, sensor, part):
+def test_claimed_variances_are_within_a_factor_of_10_of_squared_errors(errors, sensor, part):
     # In soaks and ramps the claimed variance is a few times the mean squared error, because it
     # allows for the onset or end of a ramp at any time. Sensors with steps have few independent
     # errors, whose mean square is uncertain by a factor of 2.
@@ -226,8 +226,8 @@ def test_readings_that_are_not_finite_or_not_newer_do_not_change_the_state(stamp
     assert thermometer.n_in_row == 600
 
 
-def test_a_jump_of_15_sigma_has_the_effect_of_6_sigma():
-    # A jump of 6 to 30 sigma is limited to 6 sigma; a jump above 30 sigma is left out.
+def test_a_reading_15_sd_from_its_prediction_is_down_weighted():
+    # A reading 6 to 30 sd off gets a larger sd, and is then 6 sd off; beyond 30 sd it is not used.
     thermometer = settled()
     assert thermometer.update(600 * SECOND_NS, 20.015)
     assert abs(thermometer.temperature - 20.0) < 0.004

@@ -15,7 +15,7 @@ FACES = np.concatenate((np.eye(3), -np.eye(3)))
 NOISE = 2.5e-3
 #: Lag of the part that determines the bias of each axis behind the board [s].
 LAGS_S = 180.0, 300.0, 120.0
-#: Time from one turn to the next, and the part of it that a turn takes [s].
+#: Time from the begin of a turn to that of the next turn, and duration of a turn [s].
 DWELL_S, TURN_S = 400, 8
 
 
@@ -83,7 +83,7 @@ def test_the_claimed_sd_of_a_single_turn_on_is_that_of_its_grade():
     bag, *_ = turned(rng, ((0.0, 20.0), (9000.0, 20.0)), 'one')
     unit = tc.fit([bag], gravity=GRAVITY, input='m/s^2')
     # The bias of a MEMS of this noise changes by 0.1 to 1 mg at a turn-on. The claimed sd must be
-    # at least the geometric mean of both, 0.3 mg, and at most 1.5 mg.
+    # at least the geometric mean of 0.1 and 1 mg, 0.3 mg, and at most 1.5 mg.
     assert 0.3 * 1e-3 * GRAVITY < unit.static.x.residual_sd_m_s2 < 1.5e-3 * GRAVITY
 
 

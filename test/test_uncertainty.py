@@ -18,9 +18,9 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
-    # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start the node
-    # does not know how far a part lags the board: 1 K (rate times time constant) in this ramp, an
-    # sd of 0.4 K at rest. The error is the same if the ramp ends soon after the start.
+    # WHY: after a restart in a ramp the claimed sd was a third of the error. At the start the lag
+    # of a part is unknown: it is 1 K (rate times time constant) in this ramp, and has an sd of 0.4
+    # K at rest. The claimed sd must not change if the ramp ends 40 s after the start.
     unit = calibration(response=(term('board', (30.0, 0.0, 0.0), tau_s=60.0),))
     sd = {}
     for rate, end in ((0.0, 60), (1.0 / 60.0, 60), (1.0 / 60.0, 40)):
@@ -40,8 +40,8 @@ def test_the_claimed_sd_covers_a_start_in_a_ramp():
     assert [*sd.values()] == pytest.approx([math.hypot(1.0, 0.387) * left] * 2, rel=0.2)
 
 
-def test_without_a_lost_sensor_the_gradient_is_the_last_one_at_rest():
-    # WHY: the board is 1 K warmer than the case, but without the case sensor 0 K was assumed.
+def test_if_the_case_sensor_is_lost_the_gradient_is_its_last_value_at_rest():
+    # WHY: the board is 1 K warmer than the case, but after a loss of the case 0 K was assumed.
     unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0)),))
     compensator = Compensator(unit, UNCHECKED)
     corrected = []
@@ -56,7 +56,7 @@ def test_without_a_lost_sensor_the_gradient_is_the_last_one_at_rest():
     assert corrected[-1][0] == pytest.approx(corrected[1499][0], abs=0.01)
 
 
-def test_if_a_sensor_is_missing_from_the_start_the_gradient_is_that_of_the_fit():
+def test_if_the_case_sensor_never_reads_the_gradient_is_that_of_the_fit_at_rest():
     of_gradient = (term('gradient', (30.0, 0.0, 0.0)),)
     unit = calibration(response=of_gradient, rest_gradient_range_k=(-1.1, -0.9))
     compensator = Compensator(unit, UNCHECKED)

@@ -94,7 +94,7 @@ def kinked(bag, unit):
 @pytest.mark.parametrize('number', [1, 2])
 @pytest.mark.parametrize('is_prior', [False, True])
 def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(number, is_prior):
-    # WHY: after a cold bag of one position the error was 138 ug with a claimed sd of 14 ug.
+    # WHY: after a cold bag of one position the vector error was 138 ug, its claimed sd 14 ug.
     rng = rng_of('unseen axes', number)
     unit = navigation(rng)
     warm = positions(unit, WARM, spread(12, rng), rng)

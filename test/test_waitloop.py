@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of waitloop.py works with this rclpy, of which it uses undocumented parts."""
+"""The loop of waitloop.py uses undocumented parts of rclpy; the installed rclpy has them."""
 
 import threading
 import time
