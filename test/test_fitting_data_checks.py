@@ -168,7 +168,9 @@ def test_a_refusal_stops_the_fit_unless_it_is_allowed():
     assert (allowed.level, allowed.message) == ('advice', 'allowed: the board leads')
 
 
-def judged(raw, fitted, slow, left_out=None, span=30.0, drift=500.0, noise=0.1, **options):
+def judged(
+    raw, fitted, slow, left_out=None, span=30.0, drift=500.0, noise=0.1, sigma=0.1, **options
+):
     steps = [
         residual_statistics(np.full(0 if rms is None else 9, (rms or 0.0) * MICRO_G))
         for rms in (raw, raw, raw, fitted, left_out)
@@ -176,9 +178,18 @@ def judged(raw, fitted, slow, left_out=None, span=30.0, drift=500.0, noise=0.1, 
     findings = judge_result(
         np.full(3, 990.0), [ResidualRow('all', *steps)], slow * MICRO_G,
         FitOptions(gravity=9.81, **options), span=span, drift=drift * MICRO_G,
-        noise=noise * MICRO_G, is_changed=False,
+        noise=noise * MICRO_G, sigma=sigma * MICRO_G, is_changed=False,
     )  # fmt: skip
     return {finding.name: finding for finding in findings}
+
+
+def test_only_a_residual_that_no_initial_lag_state_explains_contradicts_the_prior():
+    # WHY: rests that began before the unit had settled gave the advice to check the prior.
+    prior = calibration()
+    assert 'prior' not in judged(10.0, 50.0, 1.0, prior=prior, sigma=10.0)
+    assert (
+        'contradict the prior' in judged(10.0, 50.0, 1.0, prior=prior, sigma=40.0)['prior'].message
+    )
 
 
 def test_the_residual_of_the_fit_is_reported():

@@ -121,7 +121,7 @@ def edited(draw):
             value = branch[last]
         except (KeyError, IndexError, TypeError):
             continue  # an earlier change has removed this key
-        if isinstance(value, str) and last in ('factor', 'rest'):
+        if isinstance(value, str) and last in ('factor', 'diagonal'):
             shape = np.frombuffer(base64.b64decode(value), '<f4')
             factor = draw(factors)
             with np.errstate(over='ignore'):

@@ -333,6 +333,7 @@ def judge_result(
     span: float,
     drift: float,
     noise: float,
+    sigma: float,
     is_changed: bool,
 ) -> Iterator[Finding]:
     """
@@ -343,6 +344,7 @@ def judge_result(
     span: span of the board temperature [K]
     drift: RMS of ``|f| - g`` about the means of the positions [m/s^2]
     noise: white noise of a window [m/s^2]
+    sigma: RMS error of a window that the fit does not explain [m/s^2]
     is_changed: whether a prior far wider than the given calibration has more evidence
     """
     overall = rows[-1]
@@ -374,9 +376,9 @@ def judge_result(
         yield Finding('residual', 'good', text)
     alone = overall.two_sets.rms
     # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior, nor
-    # does any residual if the white noise is at most 1.5 times the residual of two sets.
+    # does a residual that the initial lag states explain: then `sigma` is about the noise.
     contradiction = ''
-    is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and noise > 1.5 * alone
+    is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:
         contradiction = (
             f'|f| - g is {ug_text(overall.fitted.rms)} RMS with the prior, {ug_text(alone)} with '

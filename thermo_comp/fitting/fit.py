@@ -316,6 +316,7 @@ def _fit(
         span=float(np.ptp(fit.windows.temperature)),
         drift=float(np.sqrt(np.mean(drift**2))),
         noise=fit.selected.score.noise,
+        sigma=float(np.mean(fit.posterior.prior.sigma)),
         is_changed=bool(informative and informative.is_changed),
     )
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
