@@ -148,7 +148,7 @@ def _calibration(out: Output, path: Path) -> None:
 
 
 def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
-    """Print the nonlinear terms of a calibration, if the fit had rests at other |f| than 1 g."""
+    """Print the nonlinear terms of a calibration, if the fit estimated nonlinearity."""
     from ..unit.prediction import nonlinear_coefficients
 
     if calibration.nonlinearity is None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the command ``simulate``: writes bags of a thermal test with known truth."""
+"""Owns the command ``simulate``: writes bags of a thermal test of a unit with known parameters."""
 
 import json
 from collections import Counter
@@ -71,7 +71,7 @@ def simulate(
     out: Output = options.out,
 ) -> None:
     """
-    Simulate bags of a thermal test with known truth.
+    Simulate bags of a thermal test of a unit with known parameters.
 
     The unit is simulated from its physics (heat flow, parts with
     temperature coefficients, noise, converter); the metadata of each bag
