@@ -3,8 +3,8 @@
 """
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
-Blocks of samples are added as they arrive. A rest with the specific force in another direction
-than in the present position begins the next position; handling between them counts to the earlier.
+Blocks of samples are added in the order of arrival. A rest whose force direction differs from that
+of the present position begins the next position; handling before this rest is part of the present.
 """
 
 import math

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..field.ageing import Ageing
     from ..field.update import Update
 
-#: Exit code of an update that does not correct left-out days better by a standard error or more.
+#: Exit code of an update that decreases the error on left-out days by a standard error at most.
 NOTHING_GAINED = 3
 
 
@@ -113,7 +113,7 @@ def _overrides(allow: list[str] | None, names: tuple[str, ...]) -> list[str]:
 
 
 def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
-    """Return the ageing for JSON: sds [m/s^2], and the sd of lags at a start over its prior."""
+    """Return the attributes of `Ageing` for JSON: sds [m/s^2], and the ratio `lags` of two sds."""
     values = vars(ageing).copy() if ageing else {}
     share = values.pop('lags', None)
     return {'ageing_m_s2': values or None, 'lags_at_start': share}

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..simulation.spin import Spin
     from ..simulation.unit import UnitModel
 
-#: Topic of a table's rotation rate, interval between two messages [s], sd of the radius [m].
+#: Rate table: topic of the rotation rate, interval between two messages [s], sd of the radius [m].
 _RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
 

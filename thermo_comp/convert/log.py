@@ -71,7 +71,7 @@ class ForeignLog:
     serial: str = ''
     n_short: int = 0  # number of rows dropped for missing cells
     not_used: tuple[str, ...] = ()  # columns of a table that are not written to the bag
-    continued: tuple[int, ...] = ()  # lines after an overflow of a 32-bit counter of time
+    continued: tuple[int, ...] = ()  # numbers of the lines after an overflow of a 32-bit time
     metadata: Mapping[str, str] = field(default_factory=dict)
     missing: str | None = None  # description of unreadable parts
     chosen: str | None = None  # note on topics chosen by type, or on samples left out

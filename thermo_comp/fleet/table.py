@@ -46,7 +46,7 @@ class TableColumn(NamedTuple):
     meaning: str
     label: str = ''  # name of a compared quantity, '' if not compared; see `_COMPARED`
     unit: str = ''
-    by: str = 'value'
+    by: str = 'value'  # comparison of units: value, ppm or logarithm
     sd: str = ''  # name of the column with the standard deviation of a compared quantity
 
 

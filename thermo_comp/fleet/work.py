@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Make workers started in the context ignore Ctrl-C; raise a pressed Ctrl-C at its end."""
+    """Let workers started in the context ignore Ctrl-C; then raise KeyboardInterrupt for it."""
     heard: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

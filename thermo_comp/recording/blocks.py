@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns blocks of columns on one clock, and the description of a bag.
+Owns blocks, the columns of consecutive messages of a bag, and the description of a bag.
 
 A column is a numpy array with one row per message. All times are integer nanoseconds: ``stamp`` is
 the stamp in a message's header, ``log`` the time when the recorder received the message.
@@ -184,7 +184,7 @@ class Block:
         return {'accel': self.accel_stamp_ns, **stamps}
 
     def take(self, rows: Mapping[Role, Bools]) -> Block:
-        """Select the messages for which `rows`, by ``accel`` and thermometer, is true."""
+        """Select messages; `rows` has a mask for ``accel`` and for each thermometer."""
         is_taken = rows['accel']
         n_before = np.concatenate(([0], np.cumsum(is_taken)))
         temperatures = {}

@@ -56,7 +56,7 @@ class CauseCounter:
         return self._unit_of(cells, still_sd) if self._is_imu else ''
 
     def _unit_of(self, cells: Cells, still_sd: float) -> str:
-        """Describe the fault if |a| at rest is 1 (g), 1000 (mg) or near 0 (no gravity), or ''."""
+        """Name the fault if |a| at rest is near 1 (g), 1000 (mg) or 0 (no gravity); '' if not."""
         scatter = cells.variance.max(axis=1, initial=0.0)
         quiet = (cells.count > 1) & (scatter <= np.quantile(scatter, 0.5) if len(scatter) else 0)
         if not quiet.any():

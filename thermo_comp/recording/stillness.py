@@ -42,7 +42,7 @@ _DRIFT_STEPS, _DRIFT = 9, 5e-5
 # Number of samples searched for a quantum; smallest number of changes that show the quantum if all
 # are whole multiples of the smallest change.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that one cell may fill at low rates
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows a cell may fill at low sample rates
 _LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
 MIN_SAMPLES = 30  # smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow

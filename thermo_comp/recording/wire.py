@@ -40,7 +40,7 @@ _NS = 1_000_000_000
 
 
 class Feed(NamedTuple):
-    """A channel of a bag, the role of its messages, its topic, and the field to read, if any."""
+    """A channel of a bag, its role (``accel`` or a thermometer), its topic, the field to read."""
 
     channel: int
     role: Role
