@@ -51,9 +51,7 @@ def fit(
     groups: str | None = option(
         'Groups of regression columns from which the fit selects; default: all.', metavar='A,B'
     ),
-    force_groups: str = option(
-        'Groups that the fit keeps even if they do not improve it.', '', metavar='A,B'
-    ),
+    force_groups: str = option('Groups that the fit keeps without a test.', '', metavar='A,B'),
     prior: Path | None = option(
         'Prior: the output of thermo_comp prior for this type of unit, or an old calibration of '
         'this unit.',

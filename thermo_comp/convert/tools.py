@@ -148,8 +148,7 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
     number = _choose(numbers, number, lambda n: values.get(f'INS_TCAL{n}_ENABLE') == 1.0)
     prefix = f'INS_TCAL{number}_'
     if values[f'{prefix}ENABLE'] != 1.0:
-        reason = f'is not 1: ArduPilot does not use the parameters {prefix}*'
-        raise CalibrationError(reason, key=f'{prefix}ENABLE')
+        raise CalibrationError('is not 1: ArduPilot ignores this set', key=f'{prefix}ENABLE')
 
     def cubics(sensor: str) -> Floats:
         names = [[f'{prefix}{sensor}{power}_{axis}' for power in (1, 2, 3)] for axis in _AXES]

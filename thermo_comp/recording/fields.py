@@ -146,11 +146,8 @@ class Field:
         return cursor.number(_KINDS[description[1][0]])
 
 
-_BASE, _NAME, _ARRAY = (
-    1,
-    2,
-    3,
-)  # kinds of a field's description in `rosbags`: basic type, message, array, sequence
+# Kinds of a field's description in `rosbags`: basic type, message, array (4: sequence).
+_BASE, _NAME, _ARRAY = 1, 2, 3
 
 
 class _Cursor:
