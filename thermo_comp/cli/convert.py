@@ -228,7 +228,7 @@ def import_(
     rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
     full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),
     noise_ug: float = option(
-        'Noise density in ug/sqrt(Hz), stated by the covariance.', 200.0, min=0.01
+        'Noise density in ug/sqrt(Hz), for the covariance of samples.', 200.0, min=0.01
     ),
     force: bool = options.FORCE,
     out: Output = options.out,

@@ -25,7 +25,7 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days after the last rest whose ageing the claimed sd covers.', 1.0, min=0.0, max=3650.0
+        'Days of ageing after the last rest that the claimed sd covers.', 1.0, min=0.0, max=3650.0
     ),
     allow: list[str] | None = option(
         'gravity: take local gravity as exact; unit: accept an |f| like that of another unit.'

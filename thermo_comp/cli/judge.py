@@ -111,7 +111,7 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
     title = 'thermal drift of each axis at rest (RMS of its windows)'
     if judged.shifts:
         columns += ['bias ug', '+-', 'scale ppm', '+-']
-        title += '; shift since the fit'
+        title += '; shifts of bias and scale since the fit'
     axes = [[name, *map(micro_g, rms)] for name, rms in zip('xyz', judged.axis_rms.T, strict=True)]
     for row, shift in zip(axes, judged.shifts, strict=False):
         row += [micro_g(shift.bias), micro_g(shift.bias_sd)]

@@ -287,8 +287,7 @@ def force(
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
-        'response: static and dynamic coefficients, and thermal response; golovach: static and '
-        "dynamic coefficients alone, as in Golovach's paper.",
+        'response: two sets of coefficients and thermal response; golovach: the two sets alone.',
         'response',
         metavar='MODEL',
     ),
