@@ -4,7 +4,7 @@
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
 Blocks of samples are added in the order of arrival. A rest whose force direction differs from that
-of the present position begins the next position; handling before this rest is part of the present.
+of the present position begins a new position; handling between the two belongs to the older one.
 """
 
 import math
@@ -23,14 +23,14 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Minimum length of a cell of averaged samples [s]; number of first samples that show their rate.
+# Minimum length of a cell of averaged samples [s]; number of samples that give the sample rate.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
 # Sd of the mean force in a position due to hysteresis, mounting and drift, at any rest length [g].
 _FLOOR_SD = 2e-5
 # A position whose noise is above `_RESTLESS` times the median of all positions is 'restless'. A
-# still interval after the last rest is a rest if its noise is below `_LOUDEST` times the rests'.
+# still interval after the last rest is a rest below `_LOUDEST` times the noise of the rests.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -164,7 +164,7 @@ class Acquisition:
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest again, with the largest variance from these alone.
+        # Search the cells after the last rest again; the variance limit follows from these alone.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [

@@ -212,7 +212,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate rates to the accelerometer's stamps; None if too few (half), or not finite."""
+    """Interpolate rates to the n accelerometer stamps; None if fewer than n / 2, or not finite."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)

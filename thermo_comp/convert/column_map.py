@@ -330,7 +330,7 @@ def _stamp(
     accel: Floats,
     span: float,
 ) -> Stamp:
-    """Guess the unit of times by heading, or size and interval; `span`: range of degC values."""
+    """Guess the unit of times by heading, or size and interval; `span`: temperature range [K]."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     if rate_hz is not None:

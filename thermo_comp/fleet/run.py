@@ -258,7 +258,7 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """Store an outcome, return its row; a failed fit does not replace a calibration."""
+        """Store an outcome, return its row; a failed fit leaves an earlier calibration."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):

@@ -74,7 +74,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Retest:
-    """Changes of bias, scale and misalignment between two tests of a unit; is any significant?"""
+    """Changes of bias, scale, misalignment between two tests; whether any is significant."""
 
     serial: str
     earlier: str

@@ -254,7 +254,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
     Give a reading without a stamp the newest stamp of the samples before the reading, and not the
     log time, which depends on the speed of a playback; `last_ns` is the newest stamp before the
-    block. Return block and newest stamp. Readings without a stamp before any sample are dropped.
+    block. Return block and newest stamp. Readings without a stamp before all samples are dropped.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1

@@ -395,7 +395,7 @@ def is_under(cells: Cells, still_sd: float) -> Bools:
 
 
 def _is_turning(cells: Cells) -> Bools:
-    """Whether the unit shakes or turns in a cell: rates scatter, or differ from their level."""
+    """Whether the unit turns in a cell: angular rates scatter, or differ from their level."""
     shakes = (cells.rate_variance > _STILL_RATE_SD**2).any(axis=1)
     calm = np.flatnonzero(~shakes)
     if not len(calm) or not cells.rate.any():

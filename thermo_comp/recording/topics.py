@@ -138,7 +138,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Topics and fields by role (``accel``, thermometers), kind of samples, note on choices."""
+    """Topics and fields by role (``accel``, thermometers), counts or imu, note on topics."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]
