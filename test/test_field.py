@@ -374,7 +374,7 @@ def test_an_update_without_gain_writes_no_file(tmp_path, unit_file, cli):
     assert data['is_better'] is False
     assert all(axis['present_sd'] >= axis['claimed_sd'] > 0.0 for axis in data['moved'][:2])
     printed = cli('update', unit_file, log, '-o', tmp_path / 'new.yaml', code=3).stdout
-    assert 'sd of bias plus scale at the last rest, with ageing: x ' in printed
+    assert 'sd of the correction at the last rest, with ageing: x ' in printed
     assert not (tmp_path / 'new.yaml').exists()
     text = cli('evaluate', log, '-c', unit_file).stdout
     assert 'recalibration interval' in text

@@ -3,8 +3,8 @@
 """
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
-Blocks of samples are added as they arrive. A rest in another direction than that of the present
-position begins the next position; knocks and handling between two positions belong to the first.
+Blocks of samples are added in the order of arrival. A rest whose force direction differs from that
+of the present position begins a new position; handling between the two belongs to the older one.
 """
 
 import math
@@ -23,14 +23,14 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Minimum length of a cell of averaged samples [s]; number of samples that decide the length.
+# Minimum length of a cell of averaged samples [s]; number of samples that give the sample rate.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
 # Sd of the mean force in a position due to hysteresis, mounting and drift, at any rest length [g].
 _FLOOR_SD = 2e-5
-# First: a position with more than this multiple of the positions' median noise is 'restless'.
-# Second: a still interval after the last rest is a rest below this multiple of the rests' noise.
+# A position whose noise is above `_RESTLESS` times the median of all positions is 'restless'. A
+# still interval after the last rest is a rest below `_LOUDEST` times the noise of the rests.
 _RESTLESS, _LOUDEST = 3.0, 10.0
 # Smallest backward step of the stamps that shows a restart of the driver [ns].
 _STEP_BACK_NS = 10**9
@@ -43,8 +43,8 @@ Surveys = Mapping[str, ThermometerSurvey]
 @dataclass(frozen=True)
 class Position:
     """
-    A position: direction of the force (NaN before a rest), duration and number of rests, sd of the
-    mean force [g], temperatures, and the reason why the position is not good ('' if it is good).
+    A position: direction of the specific force (NaN before a rest), total time at rest, number of
+    rests, sd of the mean force [g], temperatures, reason why the position is not good, or ''.
     """
 
     up: Floats
@@ -60,10 +60,10 @@ class Account:
     """
     State of a test, and the missing data.
     The last of `positions` is unfinished. `worst_sd_g` is the sd of the corrected force in the
-    attitude with the largest sd, `constants_sd` the sd of bias [g], relative scale and M [rad].
+    attitude with the largest sd, `constants_sd` the sds of bias [g], scale and misalignment [rad].
     `next_up` is the direction recommended for the next position, at an angle of `next_deg` to
     `now`, the direction of the newest sample (NaN without samples); `farthest_up` is the direction
-    farthest from all positions. `findings` are texts about missing data.
+    farthest (by `farthest_deg`) from all positions. `findings` are texts about missing data.
     """
 
     positions: tuple[Position, ...]
@@ -106,14 +106,14 @@ class Acquisition:
     def _start(self) -> None:
         """Restart the search for rests; the stamps of the next samples may be of another clock."""
         self._accumulator = CellAccumulator(_CELL_S, None)
-        # Stamps and samples before `_SAMPLES_TO_BEGIN` samples have arrived; then None.
+        # Stamps and samples until `_SAMPLES_TO_BEGIN` samples have arrived, None afterwards.
         self._held: list[tuple[Ints, Floats]] | None = []
         self._readings: dict[str, list[Readings]] = {}
         #: Earliest stamp at which the next position can begin [ns].
         self.settled_ns = self._newest_ns = self._begin_ns = _FIRST_NS
         self._n_looked = 0
-        # Mean sample of the first rest of a position. A later search may miss the first rest,
-        # because the limit of the variance at rest follows from the quietest tenth of the cells.
+        # Mean sample of the first rest of the position. A later search may miss the first rest,
+        # because the largest variance at rest is computed from the quietest tenth of the cells.
         self._first: Floats | None = None
 
     def add(self, block: Block) -> list[int]:
@@ -164,7 +164,7 @@ class Acquisition:
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest once more, with a limit from their own noise.
+        # Search the cells after the last rest again; the variance limit follows from these alone.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [
@@ -292,7 +292,7 @@ class Acquisition:
             return np.full(3, np.nan), False
         cells = cells.part(slice(-_LOOKED_BACK, None))
         ranges = still_intervals(cells, 0.0)
-        # The last cell may have few samples, so rest and direction are those of the cell before.
+        # The last cell may have few samples: take rest and direction from the cell before it.
         is_still = bool(ranges) and ranges[-1][1] >= len(cells.count) - 1
         last = cells.mean[-2:-1] if len(cells.count) > 1 else cells.mean
         return self._directions(last)[0], is_still

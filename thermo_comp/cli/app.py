@@ -3,9 +3,9 @@
 """
 Owns the entry point of the command line: its commands and exit codes.
 
-Exit code 0: done; 1: the data or the result is bad; 2: the command line is wrong; 3: `update` does
-not improve the calibration; 70: a bug of thermo_comp, whose traceback is saved in a file. An error
-is printed as a line on stderr.
+Exit code 0: done; 1: error in the data, or the result is not valid; 2: the command line is wrong;
+3: `update` does not improve the calibration; 70: a bug of thermo_comp, whose traceback is saved in
+a file. The text of an error is printed on one line of stderr.
 
 Heavy libraries are imported by the commands when they run, so that ``--help`` is fast.
 """
@@ -28,10 +28,10 @@ from .shared_options import expanded, option
 # Base class of all errors of a command line; typer does not export this class.
 _UsageMistake: Any = typer.BadParameter.__mro__[2]
 
-#: Matches typer's message for a value that is not a number; groups: two option names, the kind.
+#: Matches typer's message for a value that is no number; groups: two names of the option, type.
 _NO_NUMBER = re.compile(r"'(-[\w-]+)'(?: / '(-[\w-]+)')?: .*\b(?:a )?valid (number|float|integer)")
 
-# Print the bounds of an option's number on a separate line, or `--help` cuts long option names.
+# `--help` prints the range of an option's value on its own line, to leave room for the name.
 rich_utils.RANGE_STRING = '\n[{}]'
 
 app = typer.Typer(
@@ -73,14 +73,14 @@ app.add_typer(_fleet)
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and end the process with the command's exit code."""
     hold_standard_streams()
-    # Use one BLAS thread: several threads make small matrices 16 times slower on busy cores.
+    # With several BLAS threads, operations on small matrices take 16 times longer on busy cores.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line without the program's name and return its exit code."""
+    """Run the command with these arguments (without the program's name); return the exit code."""
     arguments, ros_arguments = split_arguments(arguments)
     if not arguments:
         app(['--help'], prog_name='thermo_comp', standalone_mode=False)
@@ -91,7 +91,7 @@ def run(arguments: list[str]) -> int:
     except _UsageMistake as mistake:
         context = getattr(mistake, 'ctx', None)
         command = 'thermo_comp' if context is None else context.command_path
-        if message := mistake.format_message():  # no message: typer printed the help
+        if message := mistake.format_message():  # if it is empty, typer has printed the help
             output.error(f'{_plain(message, arguments)} (see: {command} --help)')
         return int(mistake.exit_code)
     except typer.Abort:
@@ -116,7 +116,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _plain(message: str, arguments: list[str]) -> str:
-    """Rewrite a message of typer in plain words; name the value that is not a number."""
+    """Rewrite a message of typer in plain words; quote a given value that is not a number."""
     message = message.replace('Value error, ', '').replace('Input should be', 'must be')
     message = message.removeprefix('Invalid value: ')  # the rest of the message names the option
     option = _NO_NUMBER.search(message)
@@ -133,7 +133,7 @@ def _plain(message: str, arguments: list[str]) -> str:
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Split arguments into those of the command and of ROS (from ``--ros-args`` up to ``--``)."""
+    """Return the command's arguments, and those for ROS (from ``--ros-args`` up to ``--``)."""
     for_command: list[str] = []
     for_ros: list[str] = []
     target = for_command

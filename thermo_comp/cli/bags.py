@@ -148,7 +148,7 @@ def _calibration(out: Output, path: Path) -> None:
 
 
 def print_nonlinearity(out: Output, calibration: 'Calibration') -> None:
-    """Print the nonlinear terms of a calibration, if the fit had rests at other |f| than 1 g."""
+    """Print the nonlinear terms of a calibration, if the fit estimated nonlinearity."""
     from ..unit.prediction import nonlinear_coefficients
 
     if calibration.nonlinearity is None:
@@ -178,8 +178,8 @@ def replay(
         '--output',
         '-o',
     ),
-    keep_inputs: bool = option('Also copy the input messages.', False, '--keep-inputs'),
-    all_topics: bool = option('Also copy inputs and all further topics.', False, '--all-topics'),
+    keep_inputs: bool = option('Also copy the inputs to the output.', False, '--keep-inputs'),
+    all_topics: bool = option('Also copy all topics to the output.', False, '--all-topics'),
     serial: str | None = options.SERIAL,
     frame_id: str = option('frame_id of the output messages; default: that of the input.', ''),
     transition_time: float = option(

@@ -29,7 +29,7 @@ _FINDINGS = {
     'backwards': 'rows with an earlier time than the row before, kept',
     'repeated': 'rows with the same time as the row before, kept',
 }
-# Largest parameter file [bytes]; all parameters of a vehicle are about 60 kB.
+# Largest accepted parameter file [bytes]; a file of all parameters of a vehicle has about 60 kB.
 _LIMIT = 4 << 20
 
 
@@ -64,7 +64,7 @@ def convert(
     table with the columns t ax ay az wx wy wz, in this order, or without t or
     wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
     is that of the IMU, and the case temperature that of the barometer; in a bag
-    the board thermometer has the namespace of the Imu topic.
+    the thermometer in the namespace of the Imu topic is the board thermometer.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -164,7 +164,7 @@ def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
             out.line(f'  {line}')
     else:
         text = column_map_text(log.guessed)
-        out.line(f'{log.path}: guessed {text}; if this is wrong, give --columns')
+        out.line(f'{log.path}: guessed {text}; if this guess is wrong, give --columns')
 
 
 def export(
@@ -180,8 +180,8 @@ def export(
         'Device id of the sensor (TC_An_ID), by which PX4 assigns the parameters.', 0
     ),
     up: tuple[float, float, float] | None = option(
-        'Unit vector of the specific force at rest in the sensor frame; the error of the scale in '
-        'this attitude is added to the offset.',
+        'Unit vector of the specific force at rest in the sensor frame; the scale error times '
+        'gravity in this attitude is added to the offset.',
         metavar='X Y Z',
     ),
     force: bool = options.FORCE,
@@ -228,7 +228,7 @@ def import_(
     rate_hz: float = option('Samples per second of the unit.', 200, min=0.1),
     full_scale_g: float = option('Full scale in g.', 16.0, min=0.1),
     noise_ug: float = option(
-        'Noise density in ug/sqrt(Hz), from which the covariance follows.', 200.0, min=0.01
+        'Noise density in ug/sqrt(Hz), for the covariance of samples.', 200.0, min=0.01
     ),
     force: bool = options.FORCE,
     out: Output = options.out,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..field.ageing import Ageing
     from ..field.update import Update
 
-#: Exit code of an update whose gain on days left out of the update is at most its standard error.
+#: Exit code of an update that decreases the error on left-out days by a standard error at most.
 NOTHING_GAINED = 3
 
 
@@ -25,9 +25,11 @@ def update(
     output: Path = options.NEW_CALIBRATION,
     where: tuple[float | None, float] = options.place,
     ahead: float = option(
-        'Days of ageing after the last rest in the claimed sd.', 1.0, min=0.0, max=3650.0
+        'Days of ageing after the last rest that the claimed sd covers.', 1.0, min=0.0, max=3650.0
     ),
-    allow: list[str] | None = option('Conclusion of the update to override: gravity or unit.'),
+    allow: list[str] | None = option(
+        'gravity: take local gravity as exact; unit: accept an |f| like that of another unit.'
+    ),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:
@@ -37,8 +39,8 @@ def update(
     The calibration is the prior; the ageing since the fit is estimated from
     the rests, which may be in any attitude. Old and new calibration are
     compared on days left out of the update. The new calibration is written only
-    if its mean gain is larger than the standard error of the gain; otherwise
-    the exit code is 3, and the present uncertainty of each axis is printed.
+    if the mean square of |f| - g decreases by more than the standard error of
+    this decrease; else the exit code is 3, and the present sds are printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -72,7 +74,7 @@ def update(
             f'{row.axis} {micro_g(row.present_sd)} ug ({micro_g(row.claimed_sd)} ug in the file)'
             for row in result.axis_changes
         ]
-        out.line(f'sd of bias plus scale at the last rest, with ageing: {", ".join(sds)}')
+        out.line(f'sd of the correction at the last rest, with ageing: {", ".join(sds)}')
     out.end(
         0 if is_better else NOTHING_GAINED,
         output=output if is_better else None,
@@ -99,7 +101,7 @@ def _show_axis_changes(result: 'Update', out: Output) -> None:
             for axis in result.axis_changes
         ],
         title=f'changes shown by {len(result.series)} rests in {result.series.start.max() + 1} '
-        'starts of the node (at rest: bias plus scale at the mean force; sds: at rest / +-)',
+        'starts of the node (at rest: change of the reading at the mean force; sds: at rest / +-)',
     )
 
 
@@ -111,7 +113,7 @@ def _overrides(allow: list[str] | None, names: tuple[str, ...]) -> list[str]:
 
 
 def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
-    """Return the ageing for JSON: standard deviations [m/s^2], and the relative sd of the lags."""
+    """Return the attributes of `Ageing` for JSON: sds [m/s^2], and the ratio `lags` of two sds."""
     values = vars(ageing).copy() if ageing else {}
     share = values.pop('lags', None)
     return {'ageing_m_s2': values or None, 'lags_at_start': share}
@@ -124,7 +126,7 @@ def evaluate_rests(
     tolerance: float | None,
     out: Output,
 ) -> None:
-    """Print |f| - g over a rest log; exit with 1 if the unit's error exceeds its limit."""
+    """Print |f| - g over a rest log; exit with 1 if it exceeds the limit (tolerance or claim)."""
     from ..field.series import read_rests, series_of
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration

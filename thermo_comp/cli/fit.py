@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 #: Largest width of a model's name in a table [characters].
 _MODEL_WIDTH = 46
-#: Attributes of a gyroscope that are printed.
+#: Attributes of `Gyroscope` that `fit` prints.
 _RATES = 'bias_rad_s noise_density_rad_s_sqrt_hz slow_noise_rad_s_sqrt_h'
 Curve = Literal['linear', 'quadratic', 'cubic', 'spline', 'exponential']
 
 
 def fit(
     context: typer.Context,
-    bags: list[Path] = argument('Bags of one unit, or tables and logs.', metavar='BAG...'),
+    bags: list[Path] = argument('Bags, tables or logs of one unit.', metavar='BAG...'),
     output: Path = options.NEW_CALIBRATION,
     settings: dict[str, Any] = options.fitting,
     static_curve: Curve | None = option(
@@ -44,14 +44,14 @@ def fit(
         metavar='CURVE',
     ),
     dynamic_curve: Curve | None = option(
-        'Curve of the dynamic set, as for --static-curve; default: the static curve plus a '
-        'quadratic, or quadratic for --model golovach.',
+        'Curve of bias and scale over temperature in the dynamic set; default: the static curve '
+        'plus a quadratic; for --model golovach: quadratic.',
         metavar='CURVE',
     ),
     groups: str | None = option(
-        'Groups of columns from which the fit selects; default: all.', metavar='A,B'
+        'Groups of regression columns from which the fit selects; default: all.', metavar='A,B'
     ),
-    force_groups: str = option('Groups kept without a selection.', '', metavar='A,B'),
+    force_groups: str = option('Groups that the fit keeps without a test.', '', metavar='A,B'),
     prior: Path | None = option(
         'Prior: the output of thermo_comp prior for this type of unit, or an old calibration of '
         'this unit.',
@@ -90,10 +90,10 @@ def fit(
     the misalignment. Parameters that the bags do not determine keep the value
     and the uncertainty of the prior. Local gravity must be given.
 
-    Groups: curve, set, part, gradient, board, gradient_lag, product,
-    gradient_x_temperature, square, gradient_even, gradient_even_about_rest,
-    play, bend. A group is kept if it improves the correction of data left
-    out of the fit.
+    Groups of regression columns: curve, set, part, gradient, board,
+    gradient_lag, product, gradient_x_temperature, square, gradient_even,
+    gradient_even_about_rest, play, bend. A group is kept if it improves the
+    correction of data left out of the fit.
 
     Example:
       thermo_comp fit bags/unit42/* -o unit42.yaml --gravity 9.8154
@@ -240,12 +240,12 @@ def _print_fit(
 
 
 def _behind_s(parts: Sequence['Part']) -> list[float]:
-    """Return the delay of each part behind the temperature that it lags, in a steady ramp [s]."""
+    """Return how far each part's temperature lags its surroundings in a steady ramp [s]."""
     return [part.tau_s + part.second_tau_s for part in parts]
 
 
 def _text_of(parts: Sequence['Part']) -> str:
-    """Describe the lags of the parts of the axes, and the temperature that the parts lag."""
+    """Describe the lag of each axis' part of the unit, and the temperature that the part lags."""
     lags = ', '.join(f'{behind_s:.0f}' for behind_s in _behind_s(parts))
     text = f'lags the board by {lags} s (x, y, z)'
     if any(part.sensor_share for part in parts):
@@ -256,7 +256,7 @@ def _text_of(parts: Sequence['Part']) -> str:
         leads = ', '.join(f'{part.lead_s:.0f}' for part in parts)
         source = f'a temperature that leads the board thermometer by {leads} s'
         text = f'lags by {lags} s (x, y, z) {source}'
-    return f'bias and scale of an axis are curves over the temperature of its part, which {text}'
+    return f'bias and scale of each axis depend on the temperature of one part, which {text}'
 
 
 def _print_positions(out: Output, result: 'FitResult') -> None:
@@ -272,7 +272,7 @@ def _print_positions(out: Output, result: 'FitResult') -> None:
             )
             for position in result.positions
         ],
-        title='positions at rest',
+        title='positions at rest; |f| - g, RMS, in the fit and in a fit without the position',
     )
 
 
@@ -288,7 +288,7 @@ def _print_groups(out: Output, calibration: 'Calibration', has_prior: bool) -> N
                 )
                 for group in calibration.evidence
             ],
-            title=f'groups kept; log evidence: loss if the group {instead}',
+            title=f'groups kept; explains: RMS effect; log evidence: loss if the group {instead}',
         )
     white = _of_axes(calibration.noise_density_m_s2_sqrt_hz, micro_g)
     walk = _of_axes(calibration.slow_noise_m_s2_sqrt_h, micro_g)
@@ -306,11 +306,11 @@ def _print_residuals(out: Output, result: 'FitResult', n_positions: int) -> None
     if not result.residuals[-1].left_out.n:
         out.line('left out: not computed, because the fit needs all of the data')
     elif n_positions == 1:
-        out.line('left out: drift of an axis in parts of the program that took no part in the fit')
+        out.line('left out: RMS drift of an axis in sections of the program left out of the fit')
     else:
         out.line(
-            'left out: error of fits without the corrected data; RMS drift of the axes where the '
-            'other positions do not determine |f|'
+            'left out: |f| - g in positions left out of the fit; if the other positions do not '
+            'determine |f|: RMS drift of the axes'
         )
 
 
@@ -333,7 +333,7 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     """Print a table of the error of each model on data left out of the fit, and its legend."""
     columns = {
         'positions': 'drift of an axis in a position left out',
-        'sections': 'drift of an axis in a part of the program left out',
+        'sections': 'drift of an axis in a section of the program left out',
         'norm': '|f| - g in a position left out',
     }
     left = [[micro_g(folds.rms) for folds in trial.score.kinds] for trial in trials]
@@ -352,7 +352,7 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')
-    out.line('*: chosen model; ~: as good as * within the noise; +: groups besides the curve')
+    out.line('*: chosen model; ~: at most one standard error worse; +: groups besides the curve')
 
 
 def _named(groups: tuple[str, ...]) -> str:
@@ -385,7 +385,7 @@ def _of_axes(values: Iterable[float], shown: Callable[[float], str | None]) -> s
 def _steps(
     rows: Iterable[Any], steps: Iterable[str], shown: Callable[[float], str | None], axes: int = 1
 ) -> list[tuple[Cell, ...]]:
-    """Return a table row for each section: number of windows, RMS residual of each step."""
+    """Return a row per section: number of windows (`axes` values each), RMS residual per step."""
     return [
         (row.section, row.fitted.n // axes, *(shown(getattr(row, x).rms) for x in steps))
         for row in rows

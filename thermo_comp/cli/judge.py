@@ -106,12 +106,12 @@ def evaluate(
 
 
 def _print_axes(out: Output, judged: 'Judgement') -> None:
-    """Print the thermal drift of each axis and, if determined, its shift since the fit."""
+    """Print the thermal drift of each axis; if determined, also the shifts of bias and scale."""
     columns = ['axis', 'static ug', 'dynamic ug']
     title = 'thermal drift of each axis at rest (RMS of its windows)'
     if judged.shifts:
         columns += ['bias ug', '+-', 'scale ppm', '+-']
-        title += '; shift since the fit'
+        title += '; shifts of bias and scale since the fit'
     axes = [[name, *map(micro_g, rms)] for name, rms in zip('xyz', judged.axis_rms.T, strict=True)]
     for row, shift in zip(axes, judged.shifts, strict=False):
         row += [micro_g(shift.bias), micro_g(shift.bias_sd)]
@@ -120,7 +120,7 @@ def _print_axes(out: Output, judged: 'Judgement') -> None:
 
 
 def _print_levels(out: Output, judged: 'Judgement') -> None:
-    """Print the residuals for each value of |f|, if |f| was not gravity in all windows."""
+    """Print the residuals for each value of |f|, if |f| differed from gravity in any window."""
     if judged.by_force:
         out.table(
             ('|f| g', 'windows', 'raw ug', 'RMS ug', 'mean ug', 'claimed ug'),
@@ -146,7 +146,7 @@ def _print_drifts(out: Output, drifts: Sequence['Drift']) -> None:
                 )
                 for diff in drifts
             ],
-            title='changes of the constants, in a soak at the reference temperature',
+            title='changes of bias and scale, in a soak at the reference temperature',
         )
 
 

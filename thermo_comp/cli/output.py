@@ -104,8 +104,7 @@ class Output:
             def show(
                 columns: Sequence[str], rows: Sequence[Sequence[Cell]], lines: Sequence[str]
             ) -> None:
-                # If the terminal is too short, show all lines, and as many of the newest rows as
-                # fit.
+                # In a short terminal, show all lines below the table, and the newest rows.
                 newest = rows[-max(1, console.height - len(lines) - 3) :]
                 shown = [*aligned(columns, newest), '', *lines]
                 view.update(Text('\n'.join(_shown(x, sys.stderr) for x in shown)), refresh=True)
@@ -138,7 +137,7 @@ def _print(text: str, stream: TextIO) -> None:
 
 
 def _shown(text: str, file: TextIO) -> str:
-    """Replace characters that a stream cannot encode."""
+    """Escape control characters, and characters that the stream cannot encode."""
     encoding = file.encoding or 'utf-8'
     return one_line(text).encode(encoding, 'backslashreplace').decode(encoding)
 
@@ -186,7 +185,7 @@ def aligned(head: Sequence[str], rows: Iterable[Sequence[Cell]], title: str = ''
 
 
 def picked(value: object, names: str) -> dict[str, Any]:
-    """Return attributes of an object by their names, for JSON."""
+    """Return the attributes of an object whose names `names` lists, separated by blanks."""
     return {name: getattr(value, name) for name in names.split()}
 
 

@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks until the test is complete; yield its state in each pause between blocks."""
+    """Write blocks until the test is complete; yield the test's state in pauses between blocks."""
     chosen: str | None = None
     for new in news:
         if new is not None:
@@ -199,7 +199,7 @@ def _duration(text: str) -> float:
 def _print_account(
     out: Output, account: 'Account', problems: Sequence[str], last: dict[str, str]
 ) -> None:
-    """Print a line for each text of the account that is not yet in `last`, and put it there."""
+    """Print each text of the account that differs from that printed before (`last`, by name)."""
     news = {'problem': ', '.join(problems)} if problems else {}
     if not problems:
         last.pop('problem', None)

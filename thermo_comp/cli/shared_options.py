@@ -51,12 +51,12 @@ usage = typer.BadParameter  # error in the command line, exit code 2
 
 
 def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:
-    """Return a typer option: help text, default, flags (default: from the parameter), rules."""
+    """Return a typer option; `flags`: its names (default: the parameter's), `rules`: for typer."""
     return typer.Option(default, *flags, help=text, **rules)
 
 
 def argument(text: str, default: Any = ..., **rules: Any) -> Any:
-    """Return a typer argument, which has no flag: help text, default and rules."""
+    """Return a typer argument, a value without a flag; `rules`: further settings of typer."""
     return typer.Argument(default, help=text, **rules)
 
 
@@ -120,7 +120,7 @@ def check_rate(rate_hz: float | None) -> float | None:
     return rate_hz
 
 
-FORCE = option('Overwrite an output of the same kind.', False, '--force', '-f')
+FORCE = option('Overwrite an existing output of the same kind.', False, '--force', '-f')
 QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
 JUDGED_BAGS = argument('Bags to judge the calibration on.', None, metavar='[BAG]...')
@@ -137,7 +137,7 @@ OFFSET = option(
     metavar='COUNTS',
 )
 INPUT = option(
-    'Input to read from the bag: counts, imu, or auto (counts, else imu).',
+    'Samples to read from the bag: counts, imu, or auto (counts if present, else imu).',
     'auto',
     '--input',
     metavar='KIND',
@@ -244,9 +244,9 @@ def site(
 def judging(
     where: tuple[float | None, float] = place,
     window_s: float = option(
-        'Length of a window at rest, in s.', 60.0, '--window', metavar='S', min=1e-3, max=86400.0
+        'Averaging time at rest, in s.', 60.0, '--window', metavar='S', min=1e-3, max=86400.0
     ),
-    tolerance: str | None = option('Largest accepted RMS of |f| - g: 100ug, 0.5mg, 1e-3m/s^2.'),
+    tolerance: str | None = option('Largest accepted RMS of |f| - g, e.g. 100ug, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
 ) -> dict[str, Any]:
     """Return the keywords of `evaluation.evaluate`, which judges a calibration."""
@@ -287,7 +287,7 @@ def force(
 def fitting(
     where: dict[str, float] = site,
     model: Literal['response', 'golovach'] = option(
-        "response: two sets and thermal response; golovach: two sets, as in Golovach's paper.",
+        'response: two sets of coefficients and thermal response; golovach: the two sets alone.',
         'response',
         metavar='MODEL',
     ),
@@ -295,7 +295,7 @@ def fitting(
         'Magnitude of a saturated sample, in the unit of the input.', metavar='VALUE'
     ),
     reference_temperature: float = option(
-        'Temperature at which the constants are stated, in degC.', 20.0, metavar='DEGC'
+        'Temperature at which bias and scale are stated, in degC.', 20.0, metavar='DEGC'
     ),
     min_rest_s: float | None = option(
         'Shortest rest used, in s; default: 3, or less if shorter rests give more information.',
@@ -321,7 +321,7 @@ def fitting(
         'or if some rests are not at 1 g, else no nonlinearity.',
         min=1e-6,
     ),
-    allow: list[str] | None = option('Name of a refusal to override, stated in its message.'),
+    allow: list[str] | None = option('Refusal to override, by the name in its message.'),
 ) -> dict[str, Any]:
     """Return keywords of `FitOptions`."""
     given = locals()

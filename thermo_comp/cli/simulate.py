@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the command ``simulate``: writes bags of a thermal test with known truth."""
+"""Owns the command ``simulate``: writes bags of a thermal test of a unit with known parameters."""
 
 import json
 from collections import Counter
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..simulation.spin import Spin
     from ..simulation.unit import UnitModel
 
-#: Topic of a table's rotation rate, interval between two messages [s], sd of the radius [m].
+#: Rate table: topic of the rotation rate, interval between two messages [s], sd of the radius [m].
 _RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
 
@@ -71,7 +71,7 @@ def simulate(
     out: Output = options.out,
 ) -> None:
     """
-    Simulate bags of a thermal test with known truth.
+    Simulate bags of a thermal test of a unit with known parameters.
 
     The unit is simulated from its physics (heat flow, parts with
     temperature coefficients, noise, converter); the metadata of each bag

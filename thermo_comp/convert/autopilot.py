@@ -45,7 +45,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while thermal drift is corrected, its values by time, and advice."""
+    """A parameter that is 1 while thermal drift is corrected: name, times, values, advice."""
 
     parameter: str
     since_ns: Sequence[int]
@@ -185,7 +185,7 @@ def _combined(columns: _Columns) -> list[_Columns]:
     relative = _column(columns, 'accelerometer_timestamp_relative')
     rows = np.flatnonzero(np.isfinite(relative) & (relative != _NOT_THERE))
     stamp_us = columns['timestamp'][rows].astype(np.int64) + relative[rows].astype(np.int64)
-    # A message with a new angular rate only repeats the last accelerometer sample and its stamp.
+    # A message that has no new sample repeats the last accelerometer sample and its stamp.
     is_new = np.diff(stamp_us, prepend=stamp_us[:1] - 1) != 0
     names = [f'{name}[{i}]' for name in ('accelerometer_m_s2', 'gyro_rad') for i in range(3)]
     parts = _vectors(columns, names)[rows[is_new]].T.reshape(2, 3, -1)
@@ -194,7 +194,7 @@ def _combined(columns: _Columns) -> list[_Columns]:
 
 
 def _stamps(columns: _Columns) -> Ints:
-    """Return stamps from times since boot [us]; `NO_STAMP` for times < 0 or over a century."""
+    """Return times since boot as stamps [ns]; `NO_STAMP` for times below 0 or over a century."""
     # New logs have the time of the sample, old logs only the time of its publication.
     micros = columns['timestamp_sample' if 'timestamp_sample' in columns else 'timestamp']
     size = micros.astype(np.float64)
@@ -212,7 +212,7 @@ def _vectors(columns: _Columns, names: Sequence[str]) -> Floats:
 
 
 def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
-    """Interpolate the angular rate to the accelerometer's stamps; None if sparse or not finite."""
+    """Interpolate rates to the n accelerometer stamps; None if fewer than n / 2, or not finite."""
     if columns is None:
         return None
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
@@ -283,7 +283,7 @@ def _dataflash(path: Path) -> _Held:
 
 
 def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
-    """Read a message type: its columns, and the number of truncated messages."""
+    """Return the columns of a message type, and the number of its truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
     codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes of module `struct`

@@ -32,7 +32,7 @@ def bag_log(
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
-    """Read a bag; search for topics that are None; `unit`: unit of acceleration of the Imu."""
+    """Read a bag; search it for topics that are None; `unit`: unit of the Imu's acceleration."""
     present = inspect_recording(path).topics
     with translated(path):
         inputs = find_topics(present, imu, board, case)
@@ -94,7 +94,7 @@ def _of_type(present: Present, kind: str) -> list[str]:
 
 
 def _shared(name: str, others: list[str]) -> int:
-    """Return the largest number of leading namespaces that a topic shares with another topic."""
+    """Return the largest number of leading namespaces that `name` shares with one of `others`."""
     namespaces, *theirs = (
         {*PurePosixPath('/', topic.strip('/')).parents} for topic in (name, *others)
     )

@@ -5,9 +5,9 @@ Owns column maps of tables: the content and unit of each column, and the message
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table without headings, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: times rise from row to row, and the norm of samples at rest is
-gravity, from which the unit follows. An angular rate is taken to be in deg/s if its numbers, as
-rad/s, would be faster than a turn by hand.
+wz]`` as for imu_tk, is guessed: the times must rise from row to row, and the unit of acceleration
+is that in which the norm of samples at rest is gravity. An angular rate is taken to be in deg/s if
+its numbers, as rad/s, would be faster than a turn by hand.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
 #: A turn by over `_TURN` rad within two blocks of `_BLOCK` samples, between still blocks (sd below
-#: `_QUIET` g), is too fast for times in ms; intervals of up to `_SLOW_S` s are then plausible.
+#: `_QUIET` g), would be too fast if times were in ms: intervals up to `_SLOW_S` s are plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up,
@@ -45,9 +45,9 @@ _SINCE_1970_S, _SINCE_1970_STEP_S = (946_684_800.0, 2_147_483_648.0), 60.0
 #: dryer warms a board by some 0.1 K/s.
 _FASTEST_K_S = 0.5
 # Largest share of rows in which a temperature in whole degrees changes. The numbers of boards or
-# sensors in a column alternate from row to row, so these numbers change in more of the rows.
+# sensors in a column alternate from row to row, so these numbers change in a larger share of rows.
 _FEW_CHANGES = 0.1
-_RISING = 0.7  # smallest share of rows with a later time than the row before; the rest may repeat
+_RISING = 0.7  # smallest share of rows with a later time than the row before; others may repeat it
 #: A step from the uppermost to the lowest tenth of a counter's range is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
@@ -202,7 +202,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
     """
     Continue the times of a 32-bit counter that overflows, as Arduino's micros() does after
-    71.6 min; return the stamps and the lines after an overflow.
+    71.6 min; return the stamps, and the numbers of the lines that come first after an overflow.
     """
     stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
     if unit not in ('ms', 'us') or not len(rows):
@@ -330,7 +330,7 @@ def _stamp(
     accel: Floats,
     span: float,
 ) -> Stamp:
-    """Guess the unit of the times by the heading, or else by the size and interval of times."""
+    """Guess the unit of times by heading, or size and interval; `span`: temperature range [K]."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
     if rate_hz is not None:
@@ -352,7 +352,7 @@ def _stamp(
     steps = np.diff(times)
     if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
         step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # Shortest possible duration of the log [s], as boards change by at most `_FASTEST_K_S`.
+        # Shortest possible duration of the log [s]: temperatures change by `_FASTEST_K_S` at most.
         shortest_s = span / _FASTEST_K_S
         longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
         # Take the largest unit that gives a plausible interval between samples (5 ms, not 5 s).
@@ -382,7 +382,7 @@ def _no_time(column: Column | None, steps: Floats) -> str:
 
 
 def _turns_at_once(accel: Floats) -> bool:
-    """Whether the unit turns between still blocks faster than by hand, if times were in ms."""
+    """Whether the unit would turn between still blocks faster than by hand if times were in ms."""
     blocks = accel[: len(accel) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, 3)
     mean = blocks.mean(axis=1)
     size = np.linalg.norm(mean, axis=1, keepdims=True)

@@ -3,9 +3,9 @@
 """
 Owns the export of calibrations to the files of other tools, and the import of such files.
 
-All tools correct a reading N by ``a = A (N - b)``. In autopilots b depends on temperature
-and A is 1; in tools for tumble tests b and A are constant. The notes of an export name the parts
-of a calibration that are lost, with the resulting error.
+All tools correct a reading N to a specific force ``a = A (N - b)``. In autopilots b depends on
+temperature and A is 1; in tools for tumble tests b and A are constant. The notes of an export
+name the parts of a calibration that the file cannot hold, with the resulting error.
 """
 
 from dataclasses import replace
@@ -26,10 +26,10 @@ from ..unit.provenance import Provenance
 from ..unit.rate_bias import MILLIDEGREE, Gyroscope, RateCurve, RateSet
 from .tools import TOOLS, Content, ql, rotation_notes
 
-_GRID = 257
+_GRID = 257  # number of temperatures at which a curve is computed
 #: White noise assumed for an imported gyroscope [rad/s/sqrt(Hz)].
 _RATE_NOISE = 1e-4
-#: Readings are in m/s^2 if all scale factors are below this number and above its inverse.
+#: A file is taken to be in m/s^2 if all scale factors are below this number and above its inverse.
 _NEAR_ONE = 2.0
 
 
@@ -42,11 +42,11 @@ def export_calibration(
     up: tuple[float, float, float] | None = None,
 ) -> Content:
     """
-    Write the constants and the static curves in the format of one of `TOOLS`: return `text`, and
-    `notes` on the parts of the calibration that are lost.
+    Write the constants and the static curves in the format of one of `TOOLS`; the result has the
+    file's `text`, and `notes` on the parts of the calibration that the file cannot hold.
     `number` is the number of the parameter set or IMU, if the file numbers them; PX4 matches the
-    sensor by `device_id`. With `up`, the attitude as a unit vector, the error of scale times
-    gravity is added to the offset of an autopilot.
+    sensor by `device_id`. With `up`, the unit vector of the specific force at rest, the scale
+    error times gravity in this attitude is added to the offset of an autopilot.
     """
     if up is not None and not abs(float(np.linalg.norm(up)) - 1.0) < 1e-6:
         raise ValueError(f'`up` must be a unit vector, got {up}')
@@ -84,7 +84,7 @@ def export_calibration(
 
 
 class _Curves(NamedTuple):
-    """K, bias and the curves of bias and scale of each axis in a soak, at n temperatures."""
+    """Scale factor K, bias, and the curves of bias and scale in a soak, of the three axes."""
 
     temperature: Floats
     K: Floats

@@ -86,7 +86,7 @@ def read_headings(
 ) -> Headings | None:
     """
     Recognise columns by their headings; None if no accelerometer is among the columns.
-    `is_plausible`: whether the values of a column, taken in a unit, can be temperatures
+    `is_plausible(heading, unit)`: whether the values of a column can be temperatures in this unit.
     """
     names = {_plain(heading): heading for heading in reversed(headings)}
     times = [text for name, text in names.items() if _TIME.search(name) and not _is_warm(text)]
@@ -118,8 +118,8 @@ def _thermometers(
     headings: Sequence[str], names: Container[str], is_plausible: Callable[[str, str], bool]
 ) -> dict[str, tuple[str, str]]:
     """
-    Return column and unit by thermometer. A heading like `board` alone is taken for a thermometer
-    unless another column is the board thermometer. `names`: all headings, as `_plain` returns them
+    Return column and unit by thermometer. A column whose heading only names a place, like `board`,
+    is used only if no other column is this thermometer. `names`: all headings, as from `_plain`.
     """
     units = {heading: _stated(heading, _DEGREES) or 'degC' for heading in headings}
     warm, places = [], []

@@ -38,9 +38,9 @@ _TOLERANCE = 0.2
 # Usual sensitivities of 16-bit sensors with ranges from +-16 g to +-2 g [counts/g].
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
-_CELL_S, _MIN_SAMPLES = 0.5, 12
-# Ratio of the sd of a cell's samples to the quiet level above which the unit is handled; noise
-# alone gives cells of 12 samples a ratio below 2.
+_CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
+# Ratio of the sd of a cell's samples to the quiet level above which the unit is taken as handled;
+# noise alone gives cells of 12 samples a ratio below 2.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]
 
@@ -48,7 +48,7 @@ NO_STAMP = np.iinfo(np.int64).min  # stands for the stamp of a row without a sta
 #: Range of plausible temperatures [degC]; readings in kelvins or in raw counts are mostly outside.
 PLAUSIBLE_CELSIUS = (-90.0, 200.0)
 _RUN_ROWS = 100_000  # number of rows processed at a time, to limit the memory
-_EXAMPLES = 5
+_EXAMPLES = 5  # largest number of line numbers in a `Finding`
 _RESTART_NS = 10**9  # a larger backward step of stamps is a restart of the clock [ns]
 SLOW_HZ = 5.0  # sample rate below which short rests have too few samples [Hz]
 
@@ -71,7 +71,7 @@ class ForeignLog:
     serial: str = ''
     n_short: int = 0  # number of rows dropped for missing cells
     not_used: tuple[str, ...] = ()  # columns of a table that are not written to the bag
-    continued: tuple[int, ...] = ()  # lines after an overflow of a 32-bit counter of time
+    continued: tuple[int, ...] = ()  # numbers of the lines after an overflow of a 32-bit time
     metadata: Mapping[str, str] = field(default_factory=dict)
     missing: str | None = None  # description of unreadable parts
     chosen: str | None = None  # note on topics chosen by type, or on samples left out

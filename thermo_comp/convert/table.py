@@ -135,7 +135,7 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     for sign in (';', '\t', '|', ',', ' ') if delimiter is None else (delimiter,):
         rows = [row for _, row in _rows(lines, sign)]
         width, n_rows = _most_frequent([_n_cells(row) for row in rows[-_LAYOUT_ROWS:]])
-        # Most rows may lack the last cell, of a slower thermometer: use the width of full rows.
+        # Most rows may lack the last cell, a slow thermometer's: use the width of the full rows.
         whole, _ = _most_frequent([len(row) for row in rows[-_LAYOUT_ROWS:]])
         is_whole = any(len(row) == whole and row[-1].strip() for row in rows)
         candidates.append((n_rows if width > 1 else 0, sign, whole if is_whole else width))

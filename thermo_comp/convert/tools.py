@@ -148,7 +148,7 @@ def _read_ardupilot(text: str, number: int | None) -> Content | None:
     number = _choose(numbers, number, lambda n: values.get(f'INS_TCAL{n}_ENABLE') == 1.0)
     prefix = f'INS_TCAL{number}_'
     if values[f'{prefix}ENABLE'] != 1.0:
-        raise CalibrationError('is not 1: the set is not in use', key=f'{prefix}ENABLE')
+        raise CalibrationError('is not 1: ArduPilot ignores this set', key=f'{prefix}ENABLE')
 
     def cubics(sensor: str) -> Floats:
         names = [[f'{prefix}{sensor}{power}_{axis}' for power in (1, 2, 3)] for axis in _AXES]
@@ -341,7 +341,7 @@ def _array(value: object, key: str, size: int) -> Floats:
 
 @dataclass(frozen=True)
 class Tool:
-    """Functions for the file of a tool, which has a bias over temperature or a constant triad."""
+    """Functions for a tool's file: biases over temperature (`is_thermal`) or a constant triad."""
 
     write: Callable[[Content, int | None, int], str]
     read: Callable[[str, int | None], Content | None]  # returns None for the file of another tool

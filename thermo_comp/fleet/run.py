@@ -30,11 +30,11 @@ from .units import FoundUnit, Storage, find_units, folders_of_tables
 from .work import FleetOptions, UnitOutcome, connected, run, sha256
 
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
-_FORMAT = 3
-_LONGEST_NAME = 100
+_FORMAT = 3  # version of the format of `RESULT`
+_LONGEST_NAME = 100  # longest name of a folder of results [characters]
 # Largest number of units listed on the page; the table lists all units.
 _MOST_ROWS = 60
-# Verdicts of tests whose bags contradict their fit, which more data would not change.
+# Verdicts on tests whose bags contradict their fit: a fit with a prior would hide the fault.
 _CONTRADICTIONS = tuple(
     kind.value for kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER, Verdict.SWAPPED)
 )
@@ -258,7 +258,7 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """Store an outcome and return the row; if the fit failed, keep an earlier calibration."""
+        """Store an outcome, return its row; a failed fit leaves an earlier calibration."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):

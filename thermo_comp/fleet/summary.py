@@ -26,7 +26,7 @@ _MAD_EFFICIENCY = 0.37
 # Largest ratio of the sd of a value by its fit to the spread over the units. With a larger ratio
 # the data do not determine the quantity, and its value is about that of the prior of the fit.
 _LARGEST_SD = 5.0
-# Smaller residuals and noises are replaced by this number, so that their logarithms are finite.
+# Smaller residuals [ug] and noises [ug/sqrt(Hz)] are set to this, so that logarithms are finite.
 _LEAST = 1e-12
 #: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
@@ -74,7 +74,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Retest:
-    """Changes of the constants between two tests of a unit, and whether any is significant."""
+    """Changes of bias, scale, misalignment between two tests; whether any is significant."""
 
     serial: str
     earlier: str

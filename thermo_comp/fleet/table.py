@@ -46,7 +46,7 @@ class TableColumn(NamedTuple):
     meaning: str
     label: str = ''  # name of a compared quantity, '' if not compared; see `_COMPARED`
     unit: str = ''
-    by: str = 'value'
+    by: str = 'value'  # comparison of units: value, ppm or logarithm
     sd: str = ''  # name of the column with the standard deviation of a compared quantity
 
 
@@ -68,7 +68,7 @@ _TABLE = (
     ('n_samples', 'whole', 'number of accelerometer samples'),
     ('n_bytes', 'whole', 'size of the bags in bytes'),
     ('model', 'text', 'model of the fit'),
-    ('is_whole', 'whole', '1 if the bags determine every parameter: then the prior may use them'),
+    ('is_whole', 'whole', '1 if the bags determine all parameters; a prior uses only such units'),
     ('prior', 'text', 'SHA-256 of the prior.yaml used in the fit'),
     ('start', 'text', 'time of the first sample, UTC'),
     ('hours', 'number', 'total duration of the bags'),
@@ -80,11 +80,11 @@ _TABLE = (
     ('heating_k_min', 'number', 'fastest calibrated rise of the board temperature'),
     ('scale_{0}', 'number', '{1}: scale factor at T_ref, input units per m/s^2'),
     ('scale_sd_{0}_ppm', 'number', '{1}: standard deviation of the scale factor'),
-    ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the scale over temperature, static, T_ref'),
+    ('scale_slope_{0}_ppm_k', 'number', '{1}: slope of the static scale curve at T_ref'),
     ('scale_slope_sd_{0}_ppm_k', 'number', '{1}: sd of the scale slope; empty if undetermined'),
     ('bias_{0}_ug', 'number', '{1}: bias in a soak at T_ref'),
     ('bias_sd_{0}_ug', 'number', '{1}: standard deviation of the bias'),
-    ('bias_slope_{0}_ug_k', 'number', '{1}: slope of the bias over temperature, static, T_ref'),
+    ('bias_slope_{0}_ug_k', 'number', '{1}: slope of the static bias curve at T_ref'),
     ('bias_slope_sd_{0}_ug_k', 'number', '{1}: sd of the bias slope; empty if undetermined'),
     ('m_{0}_urad', 'number', 'element `{1}` of the misalignment matrix'),
     ('m_sd_{0}_urad', 'number', 'standard deviation of `{1}`'),
@@ -275,7 +275,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read a table of an earlier run, ThermoCompError if it is none; missing columns are empty."""
+    """Read the table of an earlier run; ThermoCompError for another file; missing cells: empty."""
     from pyarrow import ArrowException, parquet
 
     try:

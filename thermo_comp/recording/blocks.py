@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns blocks of columns on one clock, and the description of a bag.
+Owns blocks, the columns of consecutive messages of a bag, and the description of a bag.
 
 A column is a numpy array with one row per message. All times are integer nanoseconds: ``stamp`` is
 the stamp in a message's header, ``log`` the time when the recorder received the message.
@@ -33,10 +33,10 @@ BLOCK_MESSAGES = 1 << 15
 NO_STAMP_NS = -(2**31) * 10**9
 _JUMP_NS = 10**9  # a larger backward step of the stamps is a jump of time [ns]
 LONGEST_PAUSE_NS = 3600 * 10**9  # longer jumps of the stamps are shortened to this length [ns]
-#: Largest number of jumps in a recording with a valid clock.
+#: Largest number of jumps of the stamps by over an hour in a recording that is read.
 _MOST_JUMPS = 100
-# A thermometer uses another clock than the accelerometer if at least this number of its readings
-# has a median distance from the stamps of the samples around them above the second number [s].
+# A thermometer is taken to use another clock than the accelerometer if `_FEWEST_READINGS` or more
+# of its readings are in the median more than `_APART_S` s before or after the samples around them.
 _FEWEST_READINGS, _APART_S = 10, 10.0
 #: Time between two equal readings that `Readings.thinned` keeps [ns].
 _REPEAT_NS = 10_000_000_000
@@ -156,8 +156,8 @@ class Block:
     """
     Consecutive messages in reading order, as columns; a block ends where `frame_id` changes.
     `accel`, shape (n, 3), is in counts per cycle, or m/s^2 if the input is sensor_msgs/Imu; `imu`
-    holds the other fields of sensor_msgs/Imu. The keys of `temperatures` are thermometers; the
-    keys of `log_ns` and, if requested, of the serialized messages `raw` are roles.
+    holds the other fields of sensor_msgs/Imu. The keys of `temperatures` are thermometers; those
+    of `log_ns` and, if requested, of the serialized messages `raw` also include ``accel``.
     """
 
     accel_stamp_ns: Ints
@@ -179,12 +179,12 @@ class Block:
 
     @property
     def stamp_ns(self) -> dict[Role, Ints]:
-        """The stamps of each role, such as accel, board or case."""
+        """The stamps of the samples (key ``accel``) and of each thermometer's readings."""
         stamps = {name: readings.stamp_ns for name, readings in self.temperatures.items()}
         return {'accel': self.accel_stamp_ns, **stamps}
 
     def take(self, rows: Mapping[Role, Bools]) -> Block:
-        """Select messages of each role."""
+        """Select messages; `rows` has a mask for ``accel`` and for each thermometer."""
         is_taken = rows['accel']
         n_before = np.concatenate(([0], np.cumsum(is_taken)))
         temperatures = {}
@@ -254,7 +254,7 @@ def with_stamps(block: Block, last_ns: int) -> tuple[Block, int]:
     """
     Give a reading without a stamp the newest stamp of the samples before the reading, and not the
     log time, which depends on the speed of a playback; `last_ns` is the newest stamp before the
-    block. Return the block and its newest stamp. Readings before the first sample are dropped.
+    block. Return block and newest stamp. Readings without a stamp before all samples are dropped.
     """
     samples = np.concatenate(([last_ns], block.accel_stamp_ns))
     jumps = np.flatnonzero(np.diff(samples) < -_JUMP_NS) + 1
@@ -308,7 +308,7 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
     A clock that is set during a recording leaves a gap of years, too long for a grid over time. A
     gap of an hour suffices: after it the thermal state is unknown. RecordingError for more than
-    `_MOST_JUMPS` jumps, or, above `_SPARSE_NS`, messages at mean intervals over `_SPARSEST_NS`.
+    `_MOST_JUMPS` jumps, or if the recording is too sparse (`_SPARSE_NS`, `_SPARSEST_NS`).
     """
     last_ns: int | None = None
     offset = 0

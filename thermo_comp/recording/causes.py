@@ -25,7 +25,7 @@ class CauseCounter:
         self._stamps_ns: set[int] = set()
 
     def add(self, block: Block) -> None:
-        """Count the faults of the next block, in file order."""
+        """Count such samples in the next block of the recording."""
         imu = getattr(block, 'imu', None)
         covariance = getattr(imu, 'linear_acceleration_covariance', None)
         self._n += len(block.accel_stamp_ns)
@@ -56,7 +56,7 @@ class CauseCounter:
         return self._unit_of(cells, still_sd) if self._is_imu else ''
 
     def _unit_of(self, cells: Cells, still_sd: float) -> str:
-        """Describe an Imu whose |a| at rest shows g, mg or subtracted gravity; '' otherwise."""
+        """Name the fault if |a| at rest is near 1 (g), 1000 (mg) or 0 (no gravity); '' if not."""
         scatter = cells.variance.max(axis=1, initial=0.0)
         quiet = (cells.count > 1) & (scatter <= np.quantile(scatter, 0.5) if len(scatter) else 0)
         if not quiet.any():

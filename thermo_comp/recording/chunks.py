@@ -46,8 +46,8 @@ MAX_CHUNK_BYTES = 1 << 26  # largest declared content of a chunk [bytes]
 #: A compressed file may expand to `_MAX_GROWTH` times its size plus `_FREE_GROWTH_BYTES` [bytes].
 _MAX_GROWTH = 1024
 _FREE_GROWTH_BYTES = 1 << 26
-_MAX_WINDOW = 1 << 27
-_STEP_BYTES = 1 << 16  # size of a decompressed piece; at most one piece before a damage is lost
+_MAX_WINDOW = 1 << 27  # largest window of zstd [bytes]
+_STEP_BYTES = 1 << 16  # size of a decompressed piece; the piece with the first damage is lost
 _ENGINES: Mapping[str, Callable[[], Any]] = {
     'lz4': lz4.frame.LZ4FrameDecompressor,
     'bz2': bz2.BZ2Decompressor,

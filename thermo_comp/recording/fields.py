@@ -45,7 +45,7 @@ def typestore() -> Any:
 
 
 def definitions_of(kind: str, known: Mapping[str, tuple[str, str]]) -> Definitions:
-    """Return the message types of ROS 2 Jazzy; a definition of `kind` in the bag comes first."""
+    """Return the types of ROS 2 Jazzy, and the bag's definition of `kind` if the bag has one."""
     from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
     defined: dict[str, Any] = {}
@@ -123,7 +123,7 @@ class Field:
         try:
             return self._follow(messages, path)
         except RecursionError as error:
-            raise RecordingError(f'its type {self.kind} has a field of the same type') from error
+            raise RecordingError(f'the message type {self.kind} contains itself') from error
 
     def _follow(self, messages: Messages, path: str) -> Any:
         cursor, kind = _Cursor(messages, self.definitions), self.kind
@@ -146,11 +146,8 @@ class Field:
         return cursor.number(_KINDS[description[1][0]])
 
 
-_BASE, _NAME, _ARRAY = (
-    1,
-    2,
-    3,
-)  # kinds of a field's description in `rosbags`: basic type, message, array, sequence
+# Kinds of a field's description in `rosbags`: basic type, message, array (4: sequence).
+_BASE, _NAME, _ARRAY = 1, 2, 3
 
 
 class _Cursor:
@@ -161,7 +158,7 @@ class _Cursor:
         self._at = np.zeros(len(messages), np.int64)
         heads = number_at(gather(messages.data, messages.start, 2), 0, '>u2')
         if (messages.size < 4).any() or (heads > 1).any():
-            raise RecordingError('only CDR of representation 0 or 1 is read')
+            raise RecordingError('expected plain CDR messages (representation 0x0000 or 0x0001)')
         self._is_big = heads == 0
 
     def number(self, kind: str) -> Any:
@@ -193,7 +190,7 @@ class _Cursor:
         elif content[0] in _KINDS:
             self._leap(np.ones_like(self._at), int(_KINDS[content[0]][1:]))
         else:
-            raise RecordingError(f'a {content[0]} before the field is not supported')
+            raise RecordingError(f'a {content[0]} field before the number is not supported')
 
     def enter(self, description: Any, place: int) -> Any:
         """Advance to an element of an array or a sequence; return the element's description."""

@@ -10,10 +10,10 @@ from ..typing import Bools, Floats
 
 # Smallest distance of a glitch from the mean of its neighbours, in sd of the noise.
 _SDS = 25.0
-# Smallest distance of a glitch from the mean of its neighbours, as a share of the norm of the
-# samples: single samples of a converter that carries its remainder flip by one count.
+# Smallest distance of a glitch from the mean of its neighbours, divided by the samples' norm: the
+# carried remainder of a converter changes single samples by a count, which is no glitch.
 _LEAST = 0.02
-# Smallest number of samples among which glitches are searched, because the noise is estimated.
+# Smallest number of samples from which the noise is estimated; with fewer no glitch is searched.
 _FEWEST = 30
 
 
@@ -38,7 +38,7 @@ def is_glitch(samples: Floats, quantum: Floats) -> Bools:
         far[1:-1] = bend > limit
         if far.any():
             far[1:-1] &= np.abs(x[2:] - x[:-2]) < 0.5 * bend
-    # A glitch has three calm samples on each side, beyond its two neighbours.
+    # The second to fourth sample on each side of a glitch must show no motion.
     at = np.flatnonzero(is_far.any(axis=1))
     beside = np.array([-4, -3, -2, 2, 3, 4])
     around = np.clip(at[:, np.newaxis] + beside, 0, len(samples) - 1)

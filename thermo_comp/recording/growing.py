@@ -25,8 +25,8 @@ from .reader import open_recording
 from .topics import Topics
 from .writer import BagWriter
 
-_CHUNK_BYTES = 1 << 17  # size of a chunk, 17 s of counts at 100 Hz; a killed process loses a chunk
-_PERIOD_S = 1.0
+_CHUNK_BYTES = 1 << 17  # size of a chunk, 17 s of counts at 100 Hz; lost if the process is killed
+_PERIOD_S = 1.0  # shortest pause between two passes over the growing bag [s]
 _NEVER_NS = 2**63 - 1
 #: Hidden name of an unfinished bag: number of the bag, and id of the process that writes the bag.
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
@@ -134,7 +134,7 @@ class PositionBags:
         self._held.append(block)
 
     def release(self, stamp_ns: int) -> None:
-        """Write the held messages that are older than a stamp."""
+        """Write the held messages before the first message stamped `stamp_ns` or later."""
         held, self._held = self._held, []
         try:
             for block in held:

@@ -144,7 +144,7 @@ class McapFile(BagFile):
             for record in reader.records:
                 records_of.setdefault(type(record), []).append(record)
             (text,) = records_of[Statistics]
-        except Exception:  # noqa: BLE001 - damaged bytes surface as nearly any exception type
+        except Exception:  # noqa: BLE001 - damaged bytes may raise any type of exception
             return
         counts, n_messages = text.channel_message_counts, text.message_count
         channels: dict[int, Channel] = {c.id: c for c in records_of.get(Channel, [])}
@@ -176,7 +176,7 @@ class McapFile(BagFile):
             return
         try:
             record = _KINDS[opcode].read(_new_stream(BytesIO(content)))
-        except Exception as error:  # damaged bytes surface as nearly any exception type
+        except Exception as error:  # damaged bytes may raise any type of exception
             raise DamagedError('a record is shorter than the lengths in it') from error
         if opcode == Opcode.SCHEMA:
             self._schemas[record.id] = record

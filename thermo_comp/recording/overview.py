@@ -123,8 +123,7 @@ def survey_recording(
         topic = reader.topics.get('accel')
         total = reader.info.topics[topic][1] if topic else 0
         accumulator, causes = CellAccumulator(_CELL_S, None), CauseCounter()
-        # All temperature readings fit into memory, because a test has far fewer readings than
-        # samples.
+        # All temperature readings fit into memory: a test has far fewer readings than samples.
         readings: dict[str, list[Readings]] = {}
         clock = _Clock()
         for block in reader.blocks():

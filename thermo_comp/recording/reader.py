@@ -54,10 +54,10 @@ _BATCH_BYTES, _BATCH_NS = 1 << 23, 10 * 10**9
 class RecordingReader(ExitStack):
     """
     An open bag: a rosbag2 directory, a bare ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``.
-    The roles in `require` must be in the bag. `info` describes the bag; after all blocks are read,
-    `info.truncated` names the missing messages. `topics` are the bag's topics by role, `fields`
-    the fields that hold the reading of a thermometer, by role, `definitions` encoding and text by
-    message type.
+    A role is ``accel`` or the name of a thermometer; the roles in `require` must be in the bag.
+    `info` describes the bag; after all blocks are read, `info.truncated` names the missing
+    messages. `topics` are topics by role, `fields` the fields with a thermometer's reading by
+    role, `definitions` encoding and text by message type.
     Raises RecordingError if the file is not a bag, is damaged, or a topic is missing or ambiguous.
     """
 
@@ -76,7 +76,7 @@ class RecordingReader(ExitStack):
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
             bare = [role for role, field in self.fields.items() if not field.has_stamp]
-            note = f'no stamps in {", ".join(bare)}: a reading gets the stamp of the last sample'
+            note = f'no stamps in {", ".join(bare)}: a reading gets the stamp of the sample before'
             chosen = '; '.join(filter(None, (selected.chosen, note if bare else '')))
             self.info = replace(self.info, input=selected.input, chosen=chosen or None)
         except BaseException as error:

@@ -30,7 +30,7 @@ VARIANCE_RATIO = 4.0
 #: in most flights.
 STILL_SD = 0.05
 # Largest sd of the angular rate within a cell at rest, and largest distance of a cell's mean rate
-# from the level [rad/s]. The level, interpolated medians of `_LEVEL_S` [s], follows a bias drift.
+# from the level [rad/s]. The level (medians over `_LEVEL_S` [s], interpolated) follows the bias.
 _STILL_RATE_SD, _STILL_RATE = np.radians(2.0), np.radians(1.0)
 _LEVEL_S = 120.0
 # `without_rotation` subtracts from the angular rate its median over this time [s].
@@ -42,7 +42,7 @@ _DRIFT_STEPS, _DRIFT = 9, 5e-5
 # Number of samples searched for a quantum; smallest number of changes that show the quantum if all
 # are whole multiples of the smallest change.
 _QUANTUM_SAMPLES, _STEPS_NEEDED = 20000, 10
-STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows that one cell may fill at low rates
+STRETCHES = (1, 2, 3, 6, 12, 30, 60)  # numbers of windows a cell may fill at low sample rates
 _LONGEST_CELL_NS = 86400e9  # limit of a cell's length, for wrong stamps [ns]
 MIN_SAMPLES = 30  # smallest number of samples in a cell
 _LARGEST = 1e100  # largest valid sample: squares of larger samples may overflow
@@ -277,8 +277,8 @@ def _quantum_of(samples: Floats, few: list[Floats]) -> Floats:
         few[axis] = changes[: 3 * (len(changes) < 3)]
         if len(changes) < 3:
             continue
-        # Changes by the same multiple of the quantum differ by rounding only. A quantum is shown
-        # by few different changes, a single one, or whole multiples of the smallest change only.
+        # Changes by the same multiple of the quantum differ by rounding only. The smallest change
+        # is the quantum if the changes have few values, one value, or whole multiples of it only.
         n_levels = 1 + int(np.sum(np.diff(changes) > 0.1 * changes[0]))
         steps = changes / changes[0]
         is_whole = len(changes) >= _STEPS_NEEDED and (np.abs(steps - np.rint(steps)) < 0.1).all()
@@ -318,8 +318,8 @@ def still_runs(
     colour = spread_of_variances(cells, plausible, level)
     # A sensor that repeats one number does not show its noise; samples that toggle between two
     # adjacent numbers have a variance of a quarter quantum squared. For white noise 1.3 times the
-    # tenth percentile of the variances is the mean variance with 60 samples a cell, and 0.9 of the
-    # mean variance with 32 samples a cell.
+    # tenth percentile of the variances is the mean variance with 60 samples per cell, and 0.9 of
+    # the mean variance with 32 samples per cell.
     noise = np.maximum(1.3 * level * colour, 0.25 * cells.quantum**2)
     # A drift of d within a cell has a variance of d^2 / 12; twice this variance allows for noise.
     within = np.concatenate((drift[:1], (drift[1:] + drift[:-1]) / 2.0, drift[-1:]))
@@ -395,7 +395,7 @@ def is_under(cells: Cells, still_sd: float) -> Bools:
 
 
 def _is_turning(cells: Cells) -> Bools:
-    """Whether the unit shakes or turns in a cell, by the angular rate less its slow level."""
+    """Whether the unit turns in a cell: angular rates scatter, or differ from their level."""
     shakes = (cells.rate_variance > _STILL_RATE_SD**2).any(axis=1)
     calm = np.flatnonzero(~shakes)
     if not len(calm) or not cells.rate.any():
@@ -410,7 +410,7 @@ def _is_turning(cells: Cells) -> Bools:
 
 
 def _drift(cells: Cells, plausible: Bools) -> Floats:
-    """Return the median of the steps around each step between cells, limited, (n - 1, 3)."""
+    """Return the drift at each step between cells: the median of nine steps, with a limit."""
     both = plausible[1:] & plausible[:-1] & (np.diff(cells.index) == 1)
     step = np.where(both[:, None], np.diff(cells.mean, axis=0), 0.0)
     half = _DRIFT_STEPS // 2
@@ -423,7 +423,7 @@ def _drift(cells: Cells, plausible: Bools) -> Floats:
 
 
 def _is_joined(cells: Cells, quiet: Bools, drift: Floats) -> Bools:
-    """Whether cell i + 1 continues the rest of cell i: no gap, no step beyond the drift."""
+    """Whether cell i + 1 continues the rest of cell i: no gap, and no step beyond the drift."""
     step = np.diff(cells.mean, axis=0) - drift
     both = quiet[1:] & quiet[:-1] & (np.diff(cells.index) == 1)
     if not both.any():

@@ -34,8 +34,8 @@ _NAME = re.compile(r'(?!(accel|board|case)$)[a-z][a-z0-9_]{0,63}')
 TWINS = (
     'one topic for both {} and {}: name a single thermometer as the board, not as another input'
 )
-_MAX_LISTED = 20
-_MAX_SHOWN = 80
+_MAX_LISTED = 20  # largest number of topics in a message
+_MAX_SHOWN = 80  # largest length of a name in a message [characters]
 
 _FIRST_STAMP_S = 1e8  # limits of a `BagPart` from this number on are stamps (the year 1973) [s]
 
@@ -138,7 +138,7 @@ _USUAL = Topics()
 
 
 class Selected(NamedTuple):
-    """Topics and fields by role, kind of accelerometer input, note on topics chosen by type."""
+    """Topics and fields by role (``accel``, thermometers), counts or imu, note on topics."""
 
     topics: dict[Role, str]
     fields: dict[Role, str]
@@ -192,9 +192,9 @@ def select_topics(
     metadata: Mapping[str, str] = MappingProxyType({}),
 ) -> Selected:
     """
-    Find the topic of each role among the topics with messages, the kind of accelerometer input,
-    and a note on topics chosen by their type. RecordingError for a topic that is ambiguous, has
-    another type, or is required and missing.
+    Find the topic of each role (``accel`` or a thermometer) among the topics with messages, the
+    input of samples (counts or imu), and a note on topics chosen by their type. RecordingError for
+    a topic that is ambiguous, has a wrong type, or is in `require` and missing.
     """
     if require and not any(count for _, count in present.values()):
         raise RecordingError('the bag holds no messages')
@@ -247,7 +247,7 @@ def _check_twins(topics_of: Mapping[Role, str], fields: Mapping[Role, str]) -> N
 def _candidates(
     present: Present, topics: Topics, keys: Sequence[str], corrected: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield topics for an input by its name, then by REP 145 or type, an Imu before counts."""
+    """Yield input and topic: first by the topic's name, then by REP 145 or the topic's type."""
     for key in keys:
         if (name := _match(present, getattr(topics, key), key)) is not None:
             yield key, name
@@ -306,7 +306,7 @@ def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> st
 def _further(
     present: Present, topics: Topics, topics_of: Mapping[Role, str], *, is_read: bool
 ) -> dict[str, str]:
-    """Find the thermometers `topics.further`, and others in the namespace of board or case."""
+    """Find the thermometers `topics.further`, and those in the namespace of board or case."""
     both = {}
     for sensor, wanted in topics.further.items():
         name = _match(present, wanted, thermometer(sensor))

@@ -40,7 +40,7 @@ _NS = 1_000_000_000
 
 
 class Feed(NamedTuple):
-    """A channel of a bag, the role of its messages, its topic, and the field to read, if any."""
+    """A channel of a bag, its role (``accel`` or a thermometer), its topic, the field to read."""
 
     channel: int
     role: Role
@@ -52,9 +52,9 @@ def decode_blocks(
     messages: Messages, feeds: Collection[Feed], roles: Iterable[Role], *, keep_raw: bool = False
 ) -> list[Block]:
     """
-    Decode messages in their order; a block ends where the frame changes. `roles` lists the inputs
-    found in the whole bag. The number of a field is kept in `raw` as a Temperature message. Raises
-    RecordingError, without a path, if the bytes of a message do not fit its type.
+    Decode messages in their order; a block ends where `frame_id` changes. `roles` lists the inputs
+    found in the whole bag. A temperature in a field of another message type is in `raw` as a
+    Temperature message. RecordingError, without a path, if the bytes do not fit the message type.
     """
     roles = tuple(dict.fromkeys((*ROLES, *roles)))
     topics = {feed.role: feed.topic for feed in feeds}
@@ -116,7 +116,7 @@ def _as_temperatures(messages: Messages, stamp_ns: Ints, values: Floats) -> Mess
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
     """
     Decode messages of `kind`, a key of `N_NUMBERS` (a header and k float64 numbers), to stamps,
-    numbers, shape (n, k), and frames.
+    numbers, shape (n, k), and values of `frame_id`.
     """
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
     if not n:
@@ -139,7 +139,7 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
     if representation > 1:
         raise RecordingError(
             f'serialized with representation {representation:#06x}, '
-            'only plain CDR (0 or 1) is read'
+            'expected plain CDR (0x0000 or 0x0001)'
         )
     endian = '<' if representation else '>'
     frame_size = int(number_at(rows, 12, f'{endian}u4')[0])

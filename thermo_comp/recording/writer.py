@@ -237,7 +237,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
 
 
 def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
-    """Return a column as int64 [ns]; ValueError unless it is `n` integers, none negative."""
+    """Return a column as int64 [ns]; ValueError unless it has `n` integers of 0 or more."""
     times = np.atleast_1d(values if np.size(values) else np.empty(0, np.int64))
     if times.dtype.kind not in 'iu' or times.ndim != 1:
         raise ValueError(f'`{name}` must be one row of integers, got {times.dtype}')
