@@ -222,7 +222,7 @@ def _cores_kept_awake(may_sleep: bool) -> Iterator[bool]:
 @contextmanager
 def _process(role: str, options: list[str]) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, str(ROLES), role, *options]
-    # Give the processes the package imported here, even if the package is not installed.
+    # The process imports the package that this script imports, even if it is not installed.
     environment = {**os.environ, 'PYTHONPATH': str(Path(thermo_comp.__file__).parents[1])}
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment

@@ -279,7 +279,7 @@ def carry(number: int) -> Iterator[Study]:
 
 
 def support(number: int) -> Iterator[Study]:
-    """Tilt the support by 1 urad/K^2 of the case; in held-out bags the support is rigid."""
+    """Tilt the support by 1 urad/K^2 times (T_case - T_ref)^2, but not in held-out bags."""
     rng = rng_of('support', number)
     unit = navigation(rng)
     up = spread(12, rng)

@@ -39,7 +39,7 @@ def brief(fleet):
     return processed(fleet)
 
 
-def test_the_fit_of_a_fleet_equals_that_of_thermo_comp_fit(fleet, brief):
+def test_a_unit_of_a_fleet_gets_the_fit_of_thermo_comp_fit(fleet, brief):
     sources, _ = fit_sources(sorted((fleet / 'lot-A' / 'unit1').iterdir()))
     ours = parse_calibration(brief.calibration.encode())
     theirs = fit(sources, replace(OPTIONS.fit, serial='mems-0001')).calibration

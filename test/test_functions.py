@@ -103,7 +103,7 @@ def test_the_value_of_a_function_is_linear_in_its_free_coefficients(function, t,
     expected = function.value(t) + sum(
         b * d for b, d in zip(function.basis(t), change, strict=True)
     )
-    # The tolerance is the rounding error of t^4 at 15 K with coefficients near 1.
+    # The rounding error of t^4 at 15 K with coefficients near 1 is 1e-11.
     assert other.value(t) == pytest.approx(expected, rel=1e-12, abs=1e-9)
     assert other.value(0.0) == pytest.approx(function.value(0.0), abs=1e-15)
 

@@ -198,7 +198,7 @@ def test_lags_of_a_noisy_sensor_are_fitted_to_bags_of_one_warm_up():
 
 @pytest.mark.slow
 def test_a_fit_to_equal_warm_ups_predicts_a_slower_warm_up():
-    # The bags have equal warm-ups, in which a lag is a function of board temperature.
+    # All bags have the same warm-up: T_board - T_part is a function of T_board.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0))
     given = {'held': program(-15.0, 10.0, (20.0, 20.0, 90.0)), 'part_s': PARTS_S / 4.0}
     _, study = study_of('thaw', up=10, corners=thaw, **given)

@@ -144,7 +144,7 @@ def test_the_page_states_whether_a_bag_was_fitted(opened):
     assert '1 position in bags of the fit' in words_of(seen).text
 
 
-def test_a_page_of_a_bag_alone_shows_temperatures_derivatives_and_flag(opened, tmp_path):
+def test_a_page_without_calibration_shows_temperatures_derivatives_and_regime(opened, tmp_path):
     seen = evidence_of_bags(opened)
     shown = seen.shown
     truth = run(0).truth

@@ -174,7 +174,7 @@ def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
 def _messages_of(
     bag: BagWriter, reader: RecordingReader, serial: str, frame_id: str, all_topics: bool
 ) -> Iterator[WriteBlock]:
-    """Write blocks as the node's messages, with the copied messages in order of time."""
+    """Yield a writer of blocks as the node's messages, and of copied messages, by time."""
     with bag as writer:
         taken = {topic.name for topic in OUTPUTS}
         taken |= {reader.topics[role].strip('/') for role in reader.topics.keys() - reader.fields}

@@ -192,7 +192,7 @@ def export(
 
     PX4 and ArduPilot keep the offset of each axis as a cubic of temperature; imu_tk (.calib),
     imu_calib and Kalibr (YAML) keep bias, scale and misalignment at the reference temperature.
-    Parts of the calibration that the file does not contain are listed with the resulting error.
+    Parts of the calibration that the file lacks are listed, most with the resulting error.
 
     Example:
       thermo_comp export unit42.yaml --to px4 -o unit42.params

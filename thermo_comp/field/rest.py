@@ -184,7 +184,7 @@ def rests_of(
     """
     Decode several files into rests without duplicates, sorted by start, then by stamp.
 
-    The starts are sorted by the stamp of their last rest, because `start_ns` and the first stamps
+    The node's starts are sorted by the stamp of their last rest: `start_ns` and their first stamps
     may be from the time before the computer set its clock.
     """
     everything: dict[tuple[int, int], tuple[Start, Rest]] = {}

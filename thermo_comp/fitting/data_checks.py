@@ -241,7 +241,7 @@ def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator
     Report the assumed sd of mounting and turn-on offsets if the data do not determine this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain the
-    norms of nine positions, whatever the offsets; the drifts determine large offsets only.
+    norms of nine positions, whatever the offsets; drifts of scale factors show large offsets only.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
@@ -370,7 +370,7 @@ def judge_result(
         )
         yield advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
-        why = 'each position is predicted badly by the other positions; record more positions'
+        why = 'the positions predict a left-out position badly; record more positions'
         yield advice('left out', f'{text}: left-out residuals exceed the raw residual: {why}')
     else:
         yield Finding('residual', 'good', text)

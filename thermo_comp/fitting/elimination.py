@@ -204,7 +204,7 @@ class Reduced:
 
     def eliminate_from(self, rows: Floats) -> tuple[Floats, Floats]:
         """
-        Eliminate positions and bags from the normal equations of m new unknowns of each axis.
+        Eliminate the unknowns of positions and bags from the equations of m unknowns per axis.
 
         `rows`: products of the derivatives by the new unknowns with those by the unknowns of the
         fit and with the residual, shape (n_positions, 3, m, k + 1). Returns the reduction of the

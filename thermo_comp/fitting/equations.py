@@ -142,7 +142,7 @@ class Equations(Series):
 
     @last_result_kept
     def effects(self, state: State) -> Effects:
-        """Return the parts of the readings predicted by a state, see `Effects`."""
+        """Return forces, readings and derivatives by a state, at the reference temperature."""
         force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
         along_axes = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
         sizes = np.reshape(self._norm(state), (-1, 1, 1))

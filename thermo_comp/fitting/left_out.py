@@ -313,8 +313,8 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
 
 def _is_determined(by_others: float, by_all: float) -> bool:
     """
-    Whether the variance of a position's norm or drift by a fit without this position (`by_others`)
-    is below ten times the variance by all positions, with mounting offset or noise (`by_all`).
+    Whether `by_others`, the variance of a position's norm or drift by a fit without this position,
+    is below ten times `by_all`, that by all positions plus that of the mounting offset or noise.
     """
     return by_others < 10.0 * by_all
 

@@ -141,7 +141,7 @@ class Whitener:
         return Noise(float(10.0**log_ratio), float(10.0**log_time))
 
     def _deviances(self, residual: Floats, weight: Floats, noises: Sequence[Noise]) -> Floats:
-        """Return -2 times the profile log likelihood of each noise, shape (n_noises,)."""
+        """Return -2 log profile likelihood of each noise, up to a constant, shape (n_noises,)."""
         square, size = np.zeros((len(noises), 3)), np.zeros(len(noises))
         steps = self._innovations(residual, weight, noises)
         for _, is_there, innovation, total in steps:

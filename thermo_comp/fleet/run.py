@@ -151,7 +151,7 @@ def lacks_data(row: Row) -> bool:
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
-    """Build the prior from units for which `_in_prior` holds; or return None and the reason."""
+    """Build the type's prior from the units that may be in it; or return None and the reason."""
     # If a unit was tested several times, only the last test is used.
     tests = sorted((row for row in rows if _in_prior(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}

@@ -94,7 +94,7 @@ class JudgedWindows:
 
     @property
     def is_usual(self) -> Bools:
-        """Whether |f| is gravity in each window."""
+        """Whether the known |f| (`size`) of each window is within 1 % of gravity."""
         return np.asarray(np.abs(self.size / self.gravity - 1.0) < AT_REST - 1.0)
 
 

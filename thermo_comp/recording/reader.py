@@ -180,7 +180,7 @@ class RecordingReader(ExitStack):
                 self.info = replace(self.info, truncated=losses)
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
-        """Read serialized messages of topics (the bag's names) in batches, in reading order."""
+        """Read serialized messages of topics (the bag's names) in batches, each split by topic."""
         for _, channels, messages in self._read(topics, {'cdr'}):
             for number, topic in channels.items():
                 if len(batch := messages.of_channels([number])):

@@ -42,7 +42,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
     Write a bag, ``*.mcap`` or a rosbag2 directory; use the writer as a context manager.
     Messages are buffered until they have 64 MiB or `flush` is called, and then merged in log-time
     order. If `is_precious`, a bag that cannot be finished is kept. A killed process leaves an
-    unfinished bag in a hidden file beside the target. Raises OutputError if the bag may not or
+    unfinished bag under a hidden name beside the target. Raises OutputError if the bag may not or
     cannot be written; ValueError for wrong shapes and for times outside the range of ROS stamps.
     """
 
@@ -144,7 +144,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 self._file.append(batches)
 
     def close(self) -> None:
-        """Finish the bag and rename it to the target; OutputError, and no bag, on failure."""
+        """Finish the bag and rename it to the target; on failure OutputError, and no bag there."""
         if self._file is None:
             return
         try:

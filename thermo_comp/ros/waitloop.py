@@ -34,12 +34,12 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from ..errors import ThermoCompError
 from ..text import one_line
 
-#: Polling period of services and other subscriptions while samples arrive [ns].
+#: Polling period, while samples arrive, of services and of subscriptions without samples [ns].
 OTHERS_PERIOD_NS = 20_000_000
 #: Largest number of messages taken at a time, so that a flood does not block the rest of the node.
 DRAIN_LIMIT = 4096
 
-#: A time that is never reached, and the longest wait of the middleware without overflow [ns].
+#: A time that is never reached; a limit of waits, against overflow in the middleware [ns].
 _NEVER_NS, _LONGEST_WAIT_NS = 1 << 62, 3600 * 10**9
 
 #: Shortest time between two logged failures [ns].

@@ -185,7 +185,7 @@ class GradientEven(Gradient):
     kind, formula = 'gradient_even', 'tanh((q_s / width)^2)'
     groups = (
         ('gradient_even', 'size of the heat flow'),
-        ('gradient_even_about_rest', 'size of a temperature change'),
+        ('gradient_even_about_rest', 'size of the heat flow less that in a soak'),
     )
     form = Form(
         lambda x: by_element(math.tanh, x * x),
