@@ -435,7 +435,7 @@ def test_units_of_a_type_share_the_lags_of_the_bank(parts):
 
 def test_fit_prints_the_fitted_lags_of_the_parts(parts):
     unit, *_, (text, content) = parts
-    (line,) = (line for line in text.splitlines() if 'its part' in line)
+    (line,) = (line for line in text.splitlines() if 'one part, which' in line)
     printed = [float(word) for word in line.split('by ')[1].split(' s')[0].split(', ')]
     content = json.loads(content)
     assert content['part_lags_s'] == pytest.approx(unit.part_s, rel=0.01)
