@@ -5,8 +5,9 @@ Owns the reading of files of limited size, and the writing of all output files.
 
 An output never replaces an input of the same command. Without `overwrite` an output replaces no
 existing file, even if another process writes at the same time; with `overwrite` an output replaces
-only a file of the same kind. An output gets its final name once it is complete. If an output's
-name is a symbolic link, the link stays and the target of the link is written.
+only a file of the same kind, or an empty file. Until an output is complete, its final name has the
+old content or, on a file system without hard links, is an empty file. If an output's name is a
+symbolic link, the link stays and the target of the link is written.
 """
 
 import errno
@@ -123,7 +124,7 @@ def _opened(file: BinaryIO) -> Path:
 def check_output(
     path: str | Path, kind: Kind, *, overwrite: bool = False, others: Iterable[str | Path] = ()
 ) -> None:
-    """Refuse an output that must not be written, or that replaces one of the files `others`."""
+    """Refuse an output that may not be written, or is, contains or lies in one of `others`."""
     target = Path(os.path.realpath(path))
     for other in others:
         if _overlaps(target, Path(os.path.realpath(other))):
@@ -167,7 +168,7 @@ class Draft:
                 self.partial.mkdir()
 
     def publish(self) -> None:
-        """Give the complete output its final name; OutputError if another file has this name."""
+        """Give the output its final name; OutputError if the name exists without `overwrite`."""
         with _output_errors(self._path):
             if self.partial.is_dir():
                 _sync(self.partial)

@@ -92,7 +92,7 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
-    """Return the inputs that the correction of a recording needs: samples, board temperature."""
+    """Return the needed inputs: samples, and board if a calibration depends on temperature."""
     needs_board = any(calibration.needs_temperature for calibration in calibrations)
     return ('accel', 'board') if needs_board else ('accel',)
 
@@ -115,7 +115,7 @@ def replay(
     Correct a recording and write the output of the node, as a bag or (by suffix) a table.
 
     `keep_inputs` also copies the input messages, with their stamps as log times. `all_topics` also
-    copies the inputs and all further topics with their log times, except topics of the outputs.
+    copies all further topics, except those of the outputs, with the log times of the recording.
     """
     compensator = Compensator(calibration, config)
     wanted = topics_for(calibration, topics)

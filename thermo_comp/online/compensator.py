@@ -84,7 +84,7 @@ class CompensatorStatus:
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
     #: Whether |f| at rest differs from gravity by more than the tolerance: nothing is published.
     is_refuted: bool = False
-    #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
+    #: Sd of the corrected angular rate's bias on each axis [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
 
 

@@ -89,7 +89,7 @@ class Relay:
         return self._names.get(name, self._names.get(usual, usual))
 
     def _check_topics(self, output: str) -> None:
-        """Refuse a topic shared by two thermometers, and an output equal to the input."""
+        """Refuse two thermometers in one field of a topic, and an output on the input's topic."""
         roles: dict[tuple[str, str], str] = {}
         for name, raw in self.thermometers.items():
             topic = raw.subscription.topic_name
@@ -158,7 +158,7 @@ class Relay:
         return Running(loaded, config, compensator, samples, converter)
 
     def release(self, samples: RawSubscription) -> None:
-        """Destroy a subscription to samples that is not in use."""
+        """Destroy a subscription to samples, unless it is in use."""
         if samples is not self.samples:
             self._loop.unsubscribe(samples)
 

@@ -153,7 +153,7 @@ class RestKeeper:
     def gather(
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
-        """Sum messages that the compensator has corrected; queue the rests that end in them."""
+        """Sum messages that the compensator has processed; queue the rests that end in them."""
         # All messages are summed with the present calibration, although those that arrived before
         # a reload were corrected with the old calibration.
         self._use(loaded, compensator)
@@ -209,7 +209,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of little-endian messages with the length of the last one."""
+    """Read stamps [ns] and samples of the plain messages that are as long as the last message."""
     size = len(messages[-1]) if messages else 0
     # Shorter messages than those with an empty frame_id are malformed.
     if size < _SHORTEST[is_imu]:

@@ -20,7 +20,7 @@ class Quantity:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The thermometers that the quantity is computed from."""
+        """The thermometers of the quantity; of a gradient, the sensor without the board."""
         return (self.input,)
 
     @property

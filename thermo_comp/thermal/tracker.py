@@ -299,7 +299,7 @@ class ThermalTracker:
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
         Estimate a gradient while its sensor is lost: the gradient of self-heating, from the last
-        static reading or else from the fit, plus the board's lag times the board's rate.
+        static reading, the fit, or else 0, plus the board's lag times the board's rate.
         """
         lag = self._board_lag_s
         lower, upper = self._rest_gradient_range

@@ -35,7 +35,7 @@ TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
 #: Smallest distance between a spline's knots, and largest distance of a knot from the reference
-#: temperature [K]; numbers beyond these limits would make the spline overflow.
+#: temperature [K]; numbers far beyond these limits would make the spline overflow.
 _KNOT_STEP = 1e-3
 _FARTHEST_KNOT = 2000.0
 

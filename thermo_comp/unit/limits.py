@@ -4,8 +4,8 @@
 Owns the limits of a calibration's bias and scale over its temperatures.
 
 The bias at the reference temperature, and its change over temperature, are each at most twice the
-full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, may be a
-million times the limit of bias or scale: far beyond any instrument, but without overflow.
+full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, is at
+most a million times the limit of bias or scale: beyond any instrument, but without overflow.
 """
 
 from __future__ import annotations
