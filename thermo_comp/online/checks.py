@@ -68,8 +68,8 @@ class StuckCheck:
     Counts consecutive equal readings of each axis; `timeout_s` [s]: 0 = nothing is stuck.
 
     After the time-out samples are stuck if all three axes repeat their readings, or if an axis
-    repeats its reading while both other axes change by `motion` [input unit]. One axis alone may
-    repeat its reading at rest, if its noise is below the converter's step.
+    repeats its reading while both other axes change by `motion` [input unit]. At rest one or two
+    axes may repeat their readings, if their noise is below the converter's step.
     """
 
     def __init__(self, timeout_s: float, motion: float) -> None:

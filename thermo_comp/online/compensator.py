@@ -82,7 +82,7 @@ class CompensatorStatus:
     #: Whether the board temperature changes before that of the case in a ramp: topics swapped?
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
-    #: Whether |f| at rest differs from gravity by more than the tolerance: nothing is published.
+    #: Whether |f| at rest misses gravity by over tolerance plus 5 sd: then nothing is published.
     is_refuted: bool = False
     #: Sd of the corrected angular rate's bias on each axis [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
@@ -234,7 +234,7 @@ class Compensator:
         self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
         if self.gravity.is_refuted and not is_too_fast:
-            # The check of |f| uses dropped samples, too, and so can let the output go on.
+            # The check of |f| also uses samples that it drops: later ones may agree with gravity.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1

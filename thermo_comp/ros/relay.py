@@ -101,7 +101,7 @@ class Relay:
             raise ThermoCompError(reason, key=output)
 
     def follow_types(self) -> None:
-        """Subscribe again to thermometers whose publisher sends another type than Temperature."""
+        """Subscribe to a thermometer in its publisher's type, if this is not Temperature."""
         for name, raw in list(self.thermometers.items()):
             if self._fields[name].kind is not Temperature or raw.count_publishers():
                 continue

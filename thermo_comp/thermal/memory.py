@@ -144,7 +144,7 @@ class ThermalMemory:
         ]
         if [lag.first_order_weights for lag in spec.lags] == [{term: 1.0} for term in terms]:
             self._sums = []
-        #: For each play: index of the lag that it follows, -1 for the board; half-width [K].
+        #: For each play: index of the lag of its input, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
         #: Index and weight of the first-order terms of each play's lag; [] without a lag.
         self._followed = [

@@ -35,7 +35,7 @@ CONTINUED_SHARE: Final = 0.25
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
-#: Number of equal readings in a row from which the variance of the temperature is increased.
+#: Number of equal readings in a row from which, without cells, the temperature's variance grows.
 DOUBTFUL_READINGS: Final = 4
 #: Change of the other sensor's temperature, beyond noise and quanta [K], from which a sensor with
 #: constant readings counts as frozen: for a sensor whose readings vary with the noise, and for a

@@ -15,7 +15,7 @@ class Quantity:
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity is computed with the time constants of one part of the unit.
+    #: Whether the quantity is computed with the lag of one part of the unit; the board's lag is 0.
     is_of_part: ClassVar[bool] = True
 
     @property

@@ -125,7 +125,7 @@ class ThermalConfig:
     #: ten times longer if the force would change faster than 1 ug/s; 0 = step, as in the paper.
     transition_time_s: NotNegative = 30.0
     #: Age of the board temperature after which nothing is published, unless the correction is
-    #: constant; also the time for which readings after an impossible step are refused [s].
+    #: constant; also the time for which board readings after an impossible step are refused.
     temperature_timeout_s: Positive = 60.0
     #: Age of the case temperature at which the board temperature decides the regime [s]; also the
     #: time for which the readings of other sensors after an impossible step are refused.

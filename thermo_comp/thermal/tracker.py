@@ -163,7 +163,7 @@ class ThermalTracker:
         n_before = sensor.n_in_row
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # A sensor whose readings are rejected as a step starts again after its time-out.
+            # A sensor starts again if all readings within the time-out were rejected as a step.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             is_board = sensor is self.board
             patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s

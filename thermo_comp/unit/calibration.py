@@ -132,9 +132,9 @@ class LackOfFit:
 @dataclass(frozen=True)
 class RegimeSet:
     """
-    The curves of one regime. Outside `temperature_range_c`, within the range of the other regime,
-    a curve differs from that of the other regime by a constant; outside both ranges a curve is a
-    tangent for a quarter of the range, then constant, and the covariance of the force grows.
+    The curves of one regime. Outside `temperature_range_c` the covariance of the force grows, and
+    a curve differs from that of the other regime by a constant; outside the ranges of both regimes
+    a curve is a tangent for a quarter of the range, then constant.
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated range of T_board [degC].']
@@ -182,7 +182,7 @@ class ResponseTerm(Column):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration of one unit; ValueError if two of its values contradict each other."""
+    """Calibration of one unit; ValueError if a value is impossible or contradicts another."""
 
     format_version: Annotated[int, f'Version of the layout of this file: {FORMAT_VERSION}.']
     unit: Unit

@@ -119,7 +119,7 @@ def dump_calibration(calibration: Calibration) -> str:
             f'the calibration takes {size} bytes, at most {SIZE_LIMIT} are accepted'
         )
     if parse_calibration(text.encode()) != calibration:
-        raise CalibrationError('the written text, read again, gives another calibration')
+        raise CalibrationError('the written text, read again, gives other values')
     return text
 
 

@@ -226,7 +226,7 @@ class Correction:
             states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, slow[:9].reshape(3, 3, n)
         )
         between = grown(slow[9:N_ROWS], growth)
-        # The largest force that each axis can measure [m/s^2], and the error variance at it.
+        # The largest force that each axis can measure [m/s^2], and the error variance there.
         most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
         tilts = misalignment_variances(between).max(axis=0)
         variance = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + tilts))

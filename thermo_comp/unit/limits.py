@@ -82,7 +82,7 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
             if not worst <= WORST * bound:
                 raise ValueError(
                     "`posterior.factor` must keep the effect of each parameter's sd at most "
-                    f'{WORST * bound:g}, got {worst:g}'
+                    f'{WORST * bound:g} (bias: input units; scale: relative), got {worst:g}'
                 )
 
 
@@ -103,7 +103,9 @@ def _check_axes(calibration: Calibration, most: float) -> None:
 
 def _check_bias(key: str, level: float, reached: tuple[float, float], most: float) -> None:
     if abs(level) > most:
-        raise ValueError(f'`{key}.delta` must keep bias plus delta within {most:g}, got {level:g}')
+        raise ValueError(
+            f'`{key}.delta` must keep bias plus delta within {most:g} input units, got {level:g}'
+        )
     least, largest = reached
     if not math.isfinite(largest - least):
         raise ValueError(f'`{key}.bias_function` must be finite over its {_AROUND}')

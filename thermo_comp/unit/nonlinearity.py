@@ -103,7 +103,7 @@ class Nonlinearity:
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
         """
         Raise ValueError if the slope of the terms reaches `LARGEST_SLOPE` at a |f| up to `force`
-        [m/s^2], at one of the temperatures [K from the reference].
+        [m/s^2], at one of the temperatures [K from T_ref].
         """
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
@@ -111,7 +111,7 @@ class Nonlinearity:
             if not slope < LARGEST_SLOPE:
                 raise ValueError(
                     f'`nonlinearity.terms` must have a slope below {LARGEST_SLOPE:g} up to full '
-                    f'scale, got {slope:.3g} at {t:+.3g} K from the reference'
+                    f'scale, got {slope:.3g} at {t:+.3g} K from T_ref'
                 )
 
     def coefficients(self, t: Floats) -> Floats:
