@@ -5,9 +5,8 @@ Owns the reading of files of limited size, and the writing of all output files.
 
 An output never replaces an input of the same command. Without `overwrite` an output replaces no
 existing file, even if another process writes at the same time; with `overwrite` an output replaces
-only a file of the same kind, or an empty file. Until an output is complete, its final name has the
-old content or, on a file system without hard links, is an empty file. If an output's name is a
-symbolic link, the link stays and the target of the link is written.
+only an empty file or a file of the same kind. An output gets its name once it is complete; without
+hard links an empty file reserves the name. A symbolic link stays, and its target is written.
 """
 
 import errno
@@ -101,7 +100,7 @@ def open_regular(path: str | Path) -> BinaryIO:
 def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> bytes:
     """
     Read a regular file of limited size. ValueError if the file is larger than `limit` bytes,
-    PermissionError if the file lies outside `within`, OSError as in `open_regular`.
+    PermissionError if it lies outside `within`, OSError if it is missing or not a regular file.
     """
     with open_regular(path) as file:
         # Check the path of the opened file: a link could be exchanged between a check and the

@@ -67,7 +67,7 @@ class CompensatorStatus:
     faults: Mapping[str, tuple[Fault, float]]
     #: Time from the last sample to the latest queued temperature reading [s].
     pending_ahead_s: float
-    #: Result of `ThermalTracker.sample`; empty until there is a board temperature.
+    #: Thermal state in the order of `StateLayout`; empty until there is a board temperature.
     state: tuple[float, ...] = ()
     regime: Regime = Regime.UNKNOWN
     direction: int = 0  # temperature change: -1 cooling, +1 heating, 0 neither

@@ -186,7 +186,7 @@ def descriptor(name: str) -> ParameterDescriptor:
 
 
 def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
-    """Apply values set together, skipping unknown parameters; ParameterError as in `declare`."""
+    """Apply the values of known parameters together; ParameterError if a value is invalid."""
     values = {new.name: _checked(new.name, new.value) for new in parameters if new.name in _TABLE}
     return replace(config, **values)
 

@@ -39,8 +39,8 @@ _WAITING = 1000
 _EPOCH_NS = 946_684_800 * 10**9
 #: Smallest backward step of the stamps [ns] that begins a new recording.
 _JUMP_NS = 10**9
-# First bytes of a message in plain form (see `conversion`); offsets of counts, force and angular
-# rate from the end of a message [bytes].
+# First bytes of a message in little-endian CDR; offsets of counts, force and angular rate from the
+# end of a message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
 _SHORTEST = {False: 44, True: 316}  # shortest message [bytes]: of counts, and of an Imu (True)
 

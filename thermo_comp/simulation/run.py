@@ -87,7 +87,7 @@ class SimulatedRun:
 
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
-    """Simulate a unit in a chamber program as one block; see `simulate_blocks`."""
+    """Simulate a unit in a chamber program as one block; `options`: of `simulate_blocks`."""
     return next(simulate_blocks(unit, cyclogram, up, block_size=sys.maxsize, **options))
 
 

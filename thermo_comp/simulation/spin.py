@@ -16,8 +16,8 @@ from .drift import ZERO, Triple
 @dataclass(frozen=True)
 class Bend:
     """
-    Nonlinear terms of the axes, as in `unit.nonlinearity`: K2 [ug/g^2] and K3 [ug/g^3] at the
-    reference temperature, and their relative change per kelvin of the board.
+    Nonlinear terms ``K2 f^2 + K3 f^3`` of the axes: K2 [ug/g^2] and K3 [ug/g^3] at the reference
+    temperature, and the relative change of K2 and K3 per kelvin of the board.
     """
 
     square: Triple = ZERO

@@ -201,7 +201,7 @@ class Correction:
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
         segment (1 s), scale and its change, then the coefficients of the covariance with the noise
         of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow` and 21
-        rows to the result, see `ForceCorrection.rows`.
+        to the result: K2, Kq, K3 by axis, coefficients of x^3 to x^6 in the variance by axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size

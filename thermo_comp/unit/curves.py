@@ -3,7 +3,7 @@
 """
 Owns the curves of static and dynamic set over board temperature, within and beyond their ranges.
 
-Thermal states and rows of results are laid out as in `correction`.
+n thermal states are the columns of an array; results have the rows bias x, y, z, scale x, y, z.
 """
 
 from functools import cached_property

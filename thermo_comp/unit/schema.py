@@ -3,10 +3,10 @@
 """
 Owns the conversion of plain values to dataclasses and back: type hints are a file's schema.
 
-Hints are float, int, bool, str, Literal, tuple, dataclass, a union of such hints or with None, and
-``Annotated[hint, Bounds(...), 'what it means']``. A mapping becomes a dataclass, a list a tuple,
-and an integer a float if the hint is float; no other value is converted. Rules between keys are
-checked by the dataclass, which raises a ValueError that starts with the key in backticks.
+Hints are float, int, bool, str, Literal, tuple, dataclass, unions of these and None, and
+``Annotated[hint, Bounds(...), 'what it means']``. The only conversions are those of a mapping to a
+dataclass, a list to a tuple and an integer to a float. Rules between keys are checked by the
+dataclass, which raises a ValueError that starts with the key in backticks.
 """
 
 import dataclasses
