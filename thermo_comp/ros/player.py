@@ -45,7 +45,7 @@ WINDOW: dict[Role, int] = defaultdict(lambda: 50, accel=200)
 CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
 #: Interval of the checks for acknowledgements, which Fast DDS sends within some 5 ms [s].
 ACKNOWLEDGEMENT_NAP = 0.0005
-#: Time for subscribers to discover the player, if the middleware does not report this [s].
+#: Time for subscribers to discover the player, which the middleware does not report [s].
 SETTLING = 0.3
 PATIENCE = 30.0  # longest wait for the acknowledgement of all sent messages of a topic [s]
 

@@ -230,7 +230,7 @@ class WaitLoop:
         others |= {service: partial(self._take_request, service) for service in node.services}
         waking = next((subscription for subscription in self._raw if subscription.wakes), None)
         rest_ns = 0
-        # Pause only with best-effort QoS: with reliable QoS a wake-up takes less than a sleep.
+        # Pause only with best-effort QoS: with reliable QoS a wake-up takes less CPU than a sleep.
         if waking and waking.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             rest_ns = self._rest_ns
         crowd_ns = rest_ns * 3 // 4
