@@ -284,23 +284,23 @@ class Compensator:
         self.event_ns = EVER_NS
 
     def swap(self, calibration: Calibration) -> None:
-        """Use another calibration from the next sample on."""
+        """Use `calibration` instead of the present calibration from the next sample on."""
         vars(self).update(vars(self.successor(Model(calibration), self.config)))
 
     def successor(self, model: Model, config: CompensatorConfig) -> Compensator:
         """
-        Build a compensator that continues from the last sample with another model or settings.
+        Build a compensator that continues from the last sample with `model` and `config`.
 
-        The states of thermometers, regime and memory are kept if the new model has the same
-        detector settings, lags and plays; otherwise only the last temperatures are kept. The
-        present compensator does not change; afterwards only one of the two may continue.
+        The states of thermometers, regime and memory are kept if `model` has the detector
+        settings, lags and plays of the present model; otherwise only the last temperatures are
+        kept. The present compensator does not change, but the two must not both process samples.
         """
         new = copy(self)
         new.take_over(model, config)
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Use another model or settings; if `self` is a copy, the original does not change."""
+        """Use `model` and `config` from now on; an object that `self` copies does not change."""
         gravity, before = copy(self.gravity), self._gravity_settings
         stuck = self.stuck
         self.config, self.thermal = config, copy(self.thermal)

@@ -133,7 +133,7 @@ class ThermalSide:
         return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Use another model or settings; if `self` is a copy, the original does not change."""
+        """Use `model` and `config` from now on; an object that `self` copies does not change."""
         old, self.queue = self.tracker, copy(self.queue)
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)

@@ -138,7 +138,7 @@ class Reporter:
                 log.error(message.message)
 
     def _force_excess(self) -> float:
-        """Return by how much the last sample's |f| exceeds the largest |f| of the fit [m/s^2]."""
+        """Return the excess of the last |f| over that of the fit, or over 1.01 g [m/s^2]."""
         last = self._relay.running.converter.last_result
         if last is None:
             return 0.0

@@ -84,7 +84,7 @@ class Relay:
         self._newest_reading_ns: int | None = None
 
     def _topic(self, name: str) -> str:
-        """Return the topic of a thermometer, with the field of its messages if named."""
+        """Return a thermometer's topic, with the field if the parameter `topics` names one."""
         usual = thermometer(name)
         return self._names.get(name, self._names.get(usual, usual))
 

@@ -63,7 +63,7 @@ class Specimen:
         misalignment_sd: float = 1e-3,
         **others: Any,
     ) -> UnitModel:
-        """Return a unit with random constants."""
+        """Return a unit with random scale factors, biases and misalignment."""
         K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), spread)
         bx, by, bz = self.normal(bias_ug)
         yx, zx, zy = self.normal(misalignment_sd)

@@ -203,6 +203,6 @@ class UnitModel:
         return self.network.equilibrium(air)
 
     def with_thermometers(self, **changes: Any) -> UnitModel:
-        """Return the unit with changed settings of its thermometers on board and case."""
+        """Return the unit with `changes` in the fields of its thermometers on board and case."""
         board, case = (replace(sensor, **changes) for sensor in (self.board, self.case))
         return replace(self, board=board, case=case)

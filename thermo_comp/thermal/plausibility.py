@@ -113,7 +113,7 @@ class SensorCheck:
         self._first: list[tuple[int, float]] | None = []
 
     def forget_other(self) -> None:
-        """Measure the other sensor's change from now on: readings of a sensor were wrong."""
+        """Measure the other sensor's change from now on, as readings of a sensor were wrong."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:

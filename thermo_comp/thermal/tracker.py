@@ -92,7 +92,7 @@ class ThermalTracker:
         rest_gradient_range_k: tuple[float, float],
         stamp_ns: int | None,
     ) -> None:
-        """Use another configuration from a stamp on, without a step in the dynamic weight."""
+        """Use the given settings from a stamp on, without a step in the dynamic weight."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
