@@ -156,7 +156,7 @@ def replay(
 
 
 def _beyond(calibration: Calibration, block: Block) -> float:
-    """Return how far board readings lie outside all calibrated ranges [K], without outliers."""
+    """Return how far the 1 % or 99 % quantile of board readings is outside all ranges [K]."""
     ranges = [regime_set.temperature_range_c for regime_set in calibration.regime_sets()]
     lower, upper = min(bounds[0] for bounds in ranges), max(bounds[1] for bounds in ranges)
     celsius = block.temperatures['board'].celsius
@@ -174,7 +174,7 @@ def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
 def _messages_of(
     bag: BagWriter, reader: RecordingReader, serial: str, frame_id: str, all_topics: bool
 ) -> Iterator[WriteBlock]:
-    """Yield a writer of blocks as the node's messages, and of copied messages, by time."""
+    """Yield a function that writes a block as messages of the node, with the copied messages."""
     with bag as writer:
         taken = {topic.name for topic in OUTPUTS}
         taken |= {reader.topics[role].strip('/') for role in reader.topics.keys() - reader.fields}

@@ -94,7 +94,7 @@ def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: An
 def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
-    """Simulate all positions of a test in memory, with different seeds and stamps from 0."""
+    """Simulate all positions of a test in memory, each with another seed, stamps from 0."""
     return [
         simulate(
             unit,

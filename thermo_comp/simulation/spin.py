@@ -25,7 +25,7 @@ class Bend:
     per_kelvin: float = 0.0
 
     def added(self, force: Floats, t: Floats) -> Floats:
-        """Return the nonlinear terms [m/s^2], shape (n, 3), at t [K] from the reference."""
+        """Return the nonlinear terms [m/s^2], shape (n, 3), t [K] above the reference."""
         f = force / STANDARD_GRAVITY
         terms = np.array(self.square) * f**2 + np.array(self.cube) * f**3
         return np.asarray(MICRO_G * (1.0 + self.per_kelvin * t)[:, None] * terms)

@@ -8,7 +8,7 @@ from ..quantities import QUANTITIES
 
 
 class Quantity:
-    """A quantity of the thermal state, from readings of `input` (a gradient: also of the board)."""
+    """A quantity of the thermal state, from readings of `input` (a gradient: and of the board)."""
 
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
