@@ -134,7 +134,7 @@ def test_hold_limits_values_to_a_range():
 @pytest.mark.parametrize('bad', [float('nan'), float('inf')])
 def test_a_curve_that_is_not_finite_is_refused(bad):
     for function in (Polynomial((0.0, bad)), Exponential(bad, (1.0,), (9.0,))):
-        with pytest.raises(ValueError, match='`bias_function` must be 0 at the reference'):
+        with pytest.raises(ValueError, match='`bias_function` must be 0 at t = 0'):
             check_reference('bias_function', function, 0.0)
 
 

@@ -195,7 +195,7 @@ def test_the_player_ends_if_a_subscriber_takes_no_message(peer, tmp_path, rng, m
     monkeypatch.setattr(player, 'PATIENCE', 0.5)
     try:
         with pytest.raises(
-            ThermoCompError, match='/accel/counts: a subscriber acknowledged nothing'
+            ThermoCompError, match='/accel/counts: a subscriber has not acknowledged'
         ):
             play(tmp_path / 'bag', rate=0.0)
         assert held.is_set()

@@ -27,7 +27,7 @@ Temperatures
     ``T_case - T_board``. In a ramp the case temperature leads and the board temperature lags.
 Regimes
     The thermal regime is static (S = 0) or dynamic (S = 1), as a detector with memory decides, or
-    unknown until the detector has enough readings. The static set of coefficients applies while
+    unknown while the detector has too few readings. The static set of coefficients applies while
     the regime is unknown.
 Frames
     The output frame is fixed by the sensitivity axes: x along the x sensitivity axis, y in the

@@ -103,7 +103,7 @@ def correct(
     **sensors: Temperature,
 ) -> Corrected:
     """
-    Correct arrays of samples; the result equals that of the node and of ``replay`` bit for bit.
+    Correct arrays of samples; for equal stamps the node and ``replay`` give the same bits.
 
     Parameters
     ----------
@@ -116,9 +116,9 @@ def correct(
     board : array_like, shape (n,), or (array_like, array_like), optional
         Board temperature [degC]: a value for each sample (NaN where there was no reading), or
         (time_s, value) with separate times. A reading applies from the first sample with an equal
-        or later time. A calibration without temperature functions needs no temperature.
+        or later time. A calibration that does not depend on temperature needs no reading.
     config : CompensatorConfig or None, optional
-        Settings of the compensator, those of the node's parameters.
+        Settings of the compensator; None: the defaults of the node's parameters.
     **sensors : as `board`
         The other thermometers that the calibration names, in most calibrations ``case`` only.
 

@@ -3,9 +3,9 @@
 """
 Owns the exceptions for errors that a user can cause and correct; the message is one line.
 
-The exceptions are raised for files, bags and data that do not suffice for a fit. A caller's
-mistake in the numeric core is a plain `ValueError`. The command line prints `str(error)` and
-nothing else.
+The exceptions are raised for files and bags that cannot be used, and for data that do not suffice
+for a fit. A wrong argument of a numeric function is a plain `ValueError`. The command line prints
+`str(error)` and nothing else.
 """
 
 from pathlib import Path
@@ -44,7 +44,7 @@ class OutputError(ThermoCompError):
 
 
 class FitError(ThermoCompError):
-    """Data that do not suffice for a fit; the text says what to record."""
+    """Data that do not suffice for a fit, or that contradict an option of the fit."""
 
 
 class UndeterminedError(FitError):

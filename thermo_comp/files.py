@@ -5,8 +5,8 @@ Owns the reading of files of limited size, and the writing of all output files.
 
 An output never replaces an input of the same command. Without `overwrite` an output replaces no
 existing file, even if another process writes at the same time; with `overwrite` an output replaces
-only a file of the same kind. An output gets its final name once it is complete. If an output's
-name is a symbolic link, the link stays and the target of the link is written.
+only an empty file or a file of the same kind. An output gets its name once it is complete; without
+hard links an empty file reserves the name. A symbolic link stays, and its target is written.
 """
 
 import errno
@@ -100,7 +100,7 @@ def open_regular(path: str | Path) -> BinaryIO:
 def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> bytes:
     """
     Read a regular file of limited size. ValueError if the file is larger than `limit` bytes,
-    PermissionError if the file lies outside `within`, OSError as in `open_regular`.
+    PermissionError if it lies outside `within`, OSError if it is missing or not a regular file.
     """
     with open_regular(path) as file:
         # Check the path of the opened file: a link could be exchanged between a check and the
@@ -123,7 +123,7 @@ def _opened(file: BinaryIO) -> Path:
 def check_output(
     path: str | Path, kind: Kind, *, overwrite: bool = False, others: Iterable[str | Path] = ()
 ) -> None:
-    """Refuse an output that must not be written, or that replaces one of the files `others`."""
+    """Refuse an output that may not be written, or is, contains or lies in one of `others`."""
     target = Path(os.path.realpath(path))
     for other in others:
         if _overlaps(target, Path(os.path.realpath(other))):
@@ -167,7 +167,7 @@ class Draft:
                 self.partial.mkdir()
 
     def publish(self) -> None:
-        """Give the complete output its final name; OutputError if another file has this name."""
+        """Give the output its final name; OutputError if the name exists without `overwrite`."""
         with _output_errors(self._path):
             if self.partial.is_dir():
                 _sync(self.partial)

@@ -92,7 +92,7 @@ def topics_for(calibration: Calibration, topics: Topics | None) -> Topics:
 
 
 def needed_roles(*calibrations: Calibration) -> tuple[Role, ...]:
-    """Return the inputs that the correction of a recording needs: samples, board temperature."""
+    """Return the needed inputs: samples, and board if a calibration depends on temperature."""
     needs_board = any(calibration.needs_temperature for calibration in calibrations)
     return ('accel', 'board') if needs_board else ('accel',)
 
@@ -115,7 +115,7 @@ def replay(
     Correct a recording and write the output of the node, as a bag or (by suffix) a table.
 
     `keep_inputs` also copies the input messages, with their stamps as log times. `all_topics` also
-    copies the inputs and all further topics with their log times, except topics of the outputs.
+    copies all further topics, except those of the outputs, with the log times of the recording.
     """
     compensator = Compensator(calibration, config)
     wanted = topics_for(calibration, topics)
@@ -156,7 +156,7 @@ def replay(
 
 
 def _beyond(calibration: Calibration, block: Block) -> float:
-    """Return how far board readings lie outside all calibrated ranges [K], without outliers."""
+    """Return how far the 1 % or 99 % quantile of board readings is outside all ranges [K]."""
     ranges = [regime_set.temperature_range_c for regime_set in calibration.regime_sets()]
     lower, upper = min(bounds[0] for bounds in ranges), max(bounds[1] for bounds in ranges)
     celsius = block.temperatures['board'].celsius
@@ -174,7 +174,7 @@ def switches(flags: Iterable[tuple[int, bool]]) -> list[tuple[int, bool]]:
 def _messages_of(
     bag: BagWriter, reader: RecordingReader, serial: str, frame_id: str, all_topics: bool
 ) -> Iterator[WriteBlock]:
-    """Yield a writer of blocks as the node's messages, and of copied messages, by time."""
+    """Yield a function that writes a block as messages of the node, with the copied messages."""
     with bag as writer:
         taken = {topic.name for topic in OUTPUTS}
         taken |= {reader.topics[role].strip('/') for role in reader.topics.keys() - reader.fields}

@@ -124,7 +124,7 @@ def _push(
         _, _, name, stamp_ns, celsius = arrivals.pop()
         if len(thermal.queue) >= PENDING_LIMIT:
             # The node applies waiting readings while no samples come. Here the old readings of a
-            # full queue are applied; after the first sample only those before the next sample.
+            # full queue are applied; after the first sample only those up to the next stamp.
             limit_ns = NEVER_NS if compensator.now_ns is None else due_ns
             thermal.flush(min(limit_ns, stamp_ns - DISORDER_NS))
         thermal.push(name, stamp_ns, celsius)

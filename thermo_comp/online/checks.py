@@ -6,8 +6,8 @@ make, and |f| at rest, which must be gravity.
 
 A converter with noise does not repeat its numbers for seconds; three exact zeros indicate a dead
 wire. A count is charge per cycle, so the scale factor changes with the sample rate. With an aged
-calibration, or the calibration of another unit, |f| at rest differs from gravity by more than the
-stated uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
+calibration, or that of another unit, |f| at rest may differ from gravity by more than the stated
+uncertainty. |f| is averaged over windows of a second or longer. A window is still if its
 scatter is within the sensor's noise and its mean agrees with the mean of the previous window. A
 step of |f| from a rest to another rest is judged within a second.
 """
@@ -22,7 +22,7 @@ from ..thermal.reading_queue import NEVER_NS
 from ..typing import Bools, Floats, Ints
 from .status import GravityResidual
 
-#: Smallest number of equal samples in a row at which the converter counts as stuck.
+#: Smallest number of repeats of a reading at which, after the time-out, an axis counts as stuck.
 STUCK_SAMPLES: Final = 50
 #: Change of both other axes [m/s^2] at which an axis that repeats its reading counts as stuck: the
 #: change in a turn by 1.2 degrees, above the noise and the steps of a converter at rest.
@@ -68,8 +68,8 @@ class StuckCheck:
     Counts consecutive equal readings of each axis; `timeout_s` [s]: 0 = nothing is stuck.
 
     After the time-out samples are stuck if all three axes repeat their readings, or if an axis
-    repeats its reading while both other axes change by `motion` [input unit]. One axis alone may
-    repeat its reading at rest, if its noise is below the converter's step.
+    repeats its reading while both other axes change by `motion` [input unit]. At rest one or two
+    axes may repeat their readings, if their noise is below the converter's step.
     """
 
     def __init__(self, timeout_s: float, motion: float) -> None:

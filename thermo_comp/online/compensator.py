@@ -67,7 +67,7 @@ class CompensatorStatus:
     faults: Mapping[str, tuple[Fault, float]]
     #: Time from the last sample to the latest queued temperature reading [s].
     pending_ahead_s: float
-    #: Result of `ThermalTracker.sample`; empty until there is a board temperature.
+    #: Thermal state in the order of `StateLayout`; empty until there is a board temperature.
     state: tuple[float, ...] = ()
     regime: Regime = Regime.UNKNOWN
     direction: int = 0  # temperature change: -1 cooling, +1 heating, 0 neither
@@ -82,9 +82,9 @@ class CompensatorStatus:
     #: Whether the board temperature changes before that of the case in a ramp: topics swapped?
     is_lead_reversed: bool = False
     gravity: GravityResidual | None = None  # residual at rest, or None before the first rest
-    #: Whether |f| at rest differs from gravity by more than the tolerance: nothing is published.
+    #: Whether |f| at rest misses gravity by over tolerance plus 5 sd: then nothing is published.
     is_refuted: bool = False
-    #: Bias sd of each axis' angular rate [rad/s]; empty without a gyroscope.
+    #: Sd of the corrected angular rate's bias on each axis [rad/s]; empty without a gyroscope.
     rate_bias_sd: tuple[float, ...] = ()
 
 
@@ -234,7 +234,7 @@ class Compensator:
         self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
         if self.gravity.is_refuted and not is_too_fast:
-            # The check of |f| uses dropped samples, too, and so can let the output go on.
+            # The check of |f| also uses samples that it drops: later ones may agree with gravity.
             self.is_refusing = True
             if row is not None:
                 counters.n_out -= 1
@@ -284,23 +284,23 @@ class Compensator:
         self.event_ns = EVER_NS
 
     def swap(self, calibration: Calibration) -> None:
-        """Use another calibration from the next sample on."""
+        """Use `calibration` instead of the present calibration from the next sample on."""
         vars(self).update(vars(self.successor(Model(calibration), self.config)))
 
     def successor(self, model: Model, config: CompensatorConfig) -> Compensator:
         """
-        Build a compensator that continues from the last sample with another model or settings.
+        Build a compensator that continues from the last sample with `model` and `config`.
 
-        The states of thermometers, regime and memory are kept if the new model has the same
-        detector settings, lags and plays; otherwise only the last temperatures are kept. The
-        present compensator does not change; afterwards only one of the two may continue.
+        The states of thermometers, regime and memory are kept if `model` has the detector
+        settings, lags and plays of the present model; otherwise only the last temperatures are
+        kept. The present compensator does not change, but the two must not both process samples.
         """
         new = copy(self)
         new.take_over(model, config)
         return new
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
-        """Use another model or settings; if `self` is a copy, the original does not change."""
+        """Use `model` and `config` from now on; an object that `self` copies does not change."""
         gravity, before = copy(self.gravity), self._gravity_settings
         stuck = self.stuck
         self.config, self.thermal = config, copy(self.thermal)

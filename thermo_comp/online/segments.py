@@ -6,7 +6,7 @@ Owns the segments: time intervals between temperature readings, with a correctio
 A segment ends at a temperature reading, or after one second. The correction is evaluated at both
 ends of a segment and interpolated, so a sample takes a few operations, the output has no steps
 between two readings, and a batch needs one evaluation per segment. The slowly varying variance due
-to the parameters and initial lag states is evaluated at the first segment in each ten seconds.
+to parameters and initial lag states is evaluated every 10 s, at first in each segment.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ from .status import CompensatorConfig, Counters
 
 #: Longest segment [ns].
 SEGMENT_NS: Final = 1_000_000_000
-SLOW_NS: Final = 10_000_000_000  # time for which a `SlowState` and its variance are used [ns]
+SLOW_NS: Final = 10_000_000_000  # longest use of a `SlowState` and its variance [ns]
 YOUNG_READINGS: Final = 30  # number of board readings that determine the board's rate
 EVER_NS: Final = -NEVER_NS  # a stamp earlier than any real stamp
 #: Sd of the temperature of a unit without thermometer about the reference temperature [K].
@@ -42,7 +42,7 @@ UNMEASURED_SD_K: Final = 10.0
 class SlowState(NamedTuple):
     """
     Arguments of the variance due to parameters and initial lag states: thermal state, remaining
-    shares of the lags' unknown initial states, `ThermalMemory.start_rate`.
+    shares of the lags' unknown initial states, largest board rate since the start [K/s].
     """
 
     state: tuple[float, ...]
@@ -133,7 +133,7 @@ class ThermalSide:
         return config, unit.board_lag_s, unit.rest_gradient_range_k or ANY_RANGE
 
     def take_over(self, model: Model, config: CompensatorConfig, now_ns: int | None) -> None:
-        """Use another model or settings; if `self` is a copy, the original does not change."""
+        """Use `model` and `config` from now on; an object that `self` copies does not change."""
         old, self.queue = self.tracker, copy(self.queue)
         unit, rate = self.calibration.unit, copy(self.rate)
         self._use(model, config)
@@ -191,11 +191,11 @@ class ThermalSide:
 
     @property
     def is_unmeasured(self) -> bool:
-        """Whether the correction is constant and no temperature reading has been received."""
+        """Whether the correction is constant and no board temperature has been used."""
         return not self.model.needs_temperature and self.tracker.board.stamp_ns is None
 
     def sample(self, stamp_ns: int) -> tuple[float, ...]:
-        """Return the thermal state at a stamp; see `ThermalTracker.sample`."""
+        """Return the thermal state at a stamp; if `is_unmeasured`, a soak at the reference."""
         if self.is_unmeasured:
             gradients = (0.0, 0.0) * len(self.calibration.sensors)
             reference = self.calibration.reference_temperature_c
@@ -204,7 +204,7 @@ class ThermalSide:
 
     @property
     def fresh_until_ns(self) -> int:
-        """The last stamp at which the board temperature may be used; `EVER_NS` without reading."""
+        """Last stamp of a fresh board temperature; NEVER_NS: none needed, EVER_NS: none yet."""
         if not self.model.needs_temperature:
             return NEVER_NS
         board_ns = self.tracker.board.stamp_ns
@@ -250,7 +250,7 @@ class ThermalSide:
         return self._slow_rows
 
     def _slow_at(self, start_ns: int, end_state: tuple[float, ...]) -> SlowState:
-        """Return the arguments of the slowly varying variance, new after each `SLOW_NS`."""
+        """Return the arguments of the slowly varying variance, new at least every `SLOW_NS`."""
         # The unknown initial lag states depend on the board's rate, which the first readings after
         # a start do not determine: evaluate the variance in each segment.
         is_young = self.tracker.board.n_in_row < YOUNG_READINGS

@@ -100,7 +100,7 @@ class SampleConverter:
         )  # fmt: skip
 
     def _learn(self, data: bytes) -> bytes:
-        """Store the layout of a message; return the message's plain form, or empty bytes."""
+        """Store a message's layout; return its plain form, empty bytes if it is unreadable."""
         is_imu = self._kind is Imu
         skip, n_after = (_PASSED, 72) if is_imu else (0, 0)
         size = skip + 24 + n_after

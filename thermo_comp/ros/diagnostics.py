@@ -3,8 +3,8 @@
 """
 Owns the node's diagnostics: the compensator's status as a `DiagnosticStatus`.
 
-The level is ERROR if there is no valid output, or if samples are saturated; WARN if the output is
-worse than the calibration states. The message names every reason, the most severe first.
+Each finding has the level ERROR or WARN. The message names every finding, the most severe first,
+and has the level of the first finding; without findings the level is OK.
 """
 
 import math
@@ -109,7 +109,7 @@ class Reporter:
         self._before, self._before_ns = counts, status.stamp_ns
         findings = [*self._inputs(), *self._lost_rests()]
         findings += findings_of(loaded, status, new, rate, silence_s)
-        # If the calibration has no nonlinear terms, the warning begins 1 g above the fit's |f|,
+        # If the calibration has no nonlinearity, the warning begins 1 g above 1.01 times gravity,
         # where the unknown square term has an sd of 0.1 mg, and not at each vehicle acceleration.
         least = 0.0 if loaded.calibration.nonlinearity else STANDARD_GRAVITY
         if (over := self._force_excess()) > least:
@@ -138,7 +138,7 @@ class Reporter:
                 log.error(message.message)
 
     def _force_excess(self) -> float:
-        """Return by how much the last sample's |f| exceeds the largest |f| of the fit [m/s^2]."""
+        """Return the excess of the last |f| over that of the fit, or over 1.01 g [m/s^2]."""
         last = self._relay.running.converter.last_result
         if last is None:
             return 0.0
@@ -150,7 +150,7 @@ class Reporter:
         return {'n_in': counters.n_in, **asdict(counters), **traffic}
 
     def _count_lost(self) -> None:
-        """Count gaps in the driver's numbering; valid only while there is one publisher."""
+        """Count the messages missing in the numbering of the driver if no other node publishes."""
         samples = self._relay.samples
         n_lost, samples.n_lost = samples.n_lost, 0
         before, self._n_publishers = self._n_publishers, samples.count_publishers()

@@ -103,7 +103,7 @@ class LiveTopics:
         return messages if field is None else list(map(field.as_temperature, messages))
 
     def _find_topics(self) -> None:
-        """Subscribe to the published topics; list topics without a publisher in `problems`."""
+        """Subscribe to the published topics; list in `problems` why topics are not received."""
         problems: list[str] = []
         resolved = self._node.resolve_topic_name
         chosen = self._feeds.get('accel')

@@ -3,8 +3,8 @@
 """
 Owns the node `thermo_comp`, which turns samples and temperatures into force, flag and diagnostics.
 
-The output equals that of the offline replay of the same messages bit for bit. Parameters are
-checked when they are set, and applied between two wake-ups of the node's loop.
+The output equals that of the offline replay of the same messages in the same order bit for bit.
+Parameters are checked when they are set, and applied between two wake-ups of the node's loop.
 """
 
 import gc
@@ -168,7 +168,7 @@ class CompensationNode:
     def _check(
         self, loaded: LoadedCalibration, config: parameters.NodeConfig, inputs: tuple[str, ...]
     ) -> None:
-        """Refuse a calibration of another unit, input or set of thermometers."""
+        """Refuse a calibration whose serial, input or thermometers are not those of the node."""
         unit, listened_sensors = loaded.calibration.unit, inputs[1:]
         message = key = ''
         taken = {'counts': 'counts', 'imu': 'm/s^2'}[config.input]
@@ -197,7 +197,7 @@ class CompensationNode:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; return 0 after an orderly end, 1 if the start failed, 2 for a wrong usage."""
+    """Run the node; return 0 after an orderly end, 1 after an error, 2 for a wrong usage."""
     args = sys.argv if args is None else args
     hold_standard_streams()
     try:
@@ -238,7 +238,7 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _fail(error: Exception, code: int) -> int:
-    """Print the reason of a failed start on one line; return the exit code."""
+    """Print the reason of a failure on one line; return the exit code."""
     with suppress(OSError):
         print(f'thermo_comp_node: {one_line(str(error))}', file=sys.stderr, flush=True)
     return code

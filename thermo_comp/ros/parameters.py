@@ -67,8 +67,8 @@ class NodeConfig:
     )
     topics: str = _parameter(
         '',
-        'Topics of inputs, if not the default topics: INPUT=TOPIC[:FIELD], separated by commas, '
-        'or a file like those in config/drivers. Fixed at start.',
+        'Topics of inputs and output, if not the defaults: INPUT=TOPIC[:FIELD] or output=TOPIC, '
+        'separated by commas, or a file like those in config/drivers. Fixed at start.',
         longest=4096,
         is_fixed=True,
     )
@@ -98,7 +98,8 @@ class NodeConfig:
     )
     temperature_timeout: float = _parameter(
         _DEFAULTS.temperature_timeout_s,
-        'Age of the last board temperature at which publishing stops [s].',
+        'Age of the last board temperature at which publishing stops [s], unless the correction '
+        'is constant.',
         (0.1, 86400.0),
     )
     case_timeout: float = _parameter(
@@ -110,7 +111,7 @@ class NodeConfig:
     stuck_timeout: float = _parameter(
         _DEFAULTS.stuck_timeout_s,
         'Time after which samples that repeat their values on all axes, or on one axis while the '
-        'other two change, are not published [s]; samples of three zeros are never published; '
+        'other two change, are not published [s]; samples of three zeros are dropped at once; '
         '0: repeated values and zeros are published.',
         (0.0, 3600.0),
     )
@@ -121,9 +122,9 @@ class NodeConfig:
     )
     gravity_tolerance: float = _parameter(
         _DEFAULTS.gravity_tolerance_m_s2,
-        'Error of |f| at rest [m/s^2] at which publishing stops, as with the calibration of '
-        'another unit; 0: publishing never stops. A reversed axis changes |f| at rest by at most '
-        'twice the bias of the axis.',
+        'Error of |f| at rest [m/s^2], beyond 5 sd, at which publishing stops, as with the '
+        'calibration of another unit; 0: no error of |f| stops publishing. A reversed axis '
+        'changes |f| at rest by at most twice the bias of the axis.',
         (0.0, 100.0),
     )
     diagnostics_period: float = _parameter(1.0, 'Period of /diagnostics [s].', (0.01, 60.0))
@@ -139,7 +140,7 @@ _TABLE: Mapping[str, Field[Any]] = {entry.name: entry for entry in fields(NodeCo
 
 
 class ParameterError(ThermoCompError):
-    """The node refuses a parameter value; the message names parameter, rule and value."""
+    """A parameter that the node refuses, with the reason."""
 
 
 def declare(node: Node) -> NodeConfig:
@@ -185,7 +186,7 @@ def descriptor(name: str) -> ParameterDescriptor:
 
 
 def updated(config: NodeConfig, parameters: Iterable[Parameter]) -> NodeConfig:
-    """Apply values set together, skipping unknown parameters; ParameterError as in `declare`."""
+    """Apply the values of known parameters together; ParameterError if a value is invalid."""
     values = {new.name: _checked(new.name, new.value) for new in parameters if new.name in _TABLE}
     return replace(config, **values)
 

@@ -4,11 +4,11 @@
 Owns the player: publishes a bag on the node's input topics, with `/clock`, at a multiple of real
 time or as fast as the subscribers acknowledge messages.
 
-Topics have the node's relative names. Messages keep the bag's order and their bytes; only ROS 1
-messages are rewritten, in CDR. After `WINDOW` messages of a topic the player waits until every
-reliable subscriber has acknowledged them. Fast DDS requests acknowledgements with every message
-only while the history is full, otherwise every 3 s, so the histories are small, and
-transient-local durability keeps them full.
+Topics have the node's relative names. Messages keep the bag's order and their bytes; ROS 1
+messages are rewritten in CDR, and temperatures of other types as Temperature. After `WINDOW`
+messages of a topic the player waits until every reliable subscriber has acknowledged them. Fast
+DDS requests acknowledgements with every message only while the history is full, otherwise every
+3 s, so the histories are small, and transient-local durability keeps them full.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ WINDOW: dict[Role, int] = defaultdict(lambda: 50, accel=200)
 CLOCK_PERIOD = 0.01  # wall time between two messages on `/clock` [s]
 #: Interval of the checks for acknowledgements, which Fast DDS sends within some 5 ms [s].
 ACKNOWLEDGEMENT_NAP = 0.0005
-#: Time for subscribers to discover the player, if the middleware does not report this [s].
+#: Time for subscribers to discover the player, which the middleware does not report [s].
 SETTLING = 0.3
-PATIENCE = 30.0  # longest time in which a subscriber may acknowledge no message [s]
+PATIENCE = 30.0  # longest wait for the acknowledgement of all sent messages of a topic [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ def play(
     ros_args: Sequence[str] = (),
     progress: Callable[[float], None] = lambda _: None,
 ) -> PlayReport:
-    """Play a bag (see `opened_player`) once all topics have subscribers, or after `wait_s`."""
+    """Play a bag at `rate` times real time once all topics have subscribers, or `wait_s` later."""
     with opened_player(path, rate, topics, ros_args) as player:
         wait_until(lambda: not player.unheard(), wait_s)
         if wait_s > 0.0:
@@ -178,8 +178,8 @@ class Player:
         if not wait_until(is_done, PATIENCE, ACKNOWLEDGEMENT_NAP):
             name = publisher.topic_name
             raise ThermoCompError(
-                f'{name}: a subscriber acknowledged nothing for {PATIENCE:g} s; restart the '
-                'subscriber, or let it subscribe with best effort'
+                f'{name}: a subscriber has not acknowledged all messages within {PATIENCE:g} s; '
+                'restart the subscriber, or let it subscribe with best effort'
             )
 
 

@@ -102,7 +102,7 @@ def _hanging(name: str, limit_s: float) -> CalibrationError:
 
 
 class Reader:
-    """A process that reads calibrations; started at the first request and after a hang."""
+    """A process that reads calibrations; a request starts the process if none is running."""
 
     def __init__(self, limit_s: float = LIMIT_S) -> None:
         self._limit_s = limit_s

@@ -84,12 +84,12 @@ class Relay:
         self._newest_reading_ns: int | None = None
 
     def _topic(self, name: str) -> str:
-        """Return the topic of a thermometer, with the field of its messages if named."""
+        """Return a thermometer's topic, with the field if the parameter `topics` names one."""
         usual = thermometer(name)
         return self._names.get(name, self._names.get(usual, usual))
 
     def _check_topics(self, output: str) -> None:
-        """Refuse a topic shared by two thermometers, and an output equal to the input."""
+        """Refuse two thermometers in one field of a topic, and an output on the input's topic."""
         roles: dict[tuple[str, str], str] = {}
         for name, raw in self.thermometers.items():
             topic = raw.subscription.topic_name
@@ -101,7 +101,7 @@ class Relay:
             raise ThermoCompError(reason, key=output)
 
     def follow_types(self) -> None:
-        """Subscribe again to thermometers whose publisher sends another type than Temperature."""
+        """Subscribe to a thermometer in its publisher's type, if this is not Temperature."""
         for name, raw in list(self.thermometers.items()):
             if self._fields[name].kind is not Temperature or raw.count_publishers():
                 continue
@@ -158,7 +158,7 @@ class Relay:
         return Running(loaded, config, compensator, samples, converter)
 
     def release(self, samples: RawSubscription) -> None:
-        """Destroy a subscription to samples that is not in use."""
+        """Destroy a subscription to samples, unless it is in use."""
         if samples is not self.samples:
             self._loop.unsubscribe(samples)
 

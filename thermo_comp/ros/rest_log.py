@@ -39,8 +39,8 @@ _WAITING = 1000
 _EPOCH_NS = 946_684_800 * 10**9
 #: Smallest backward step of the stamps [ns] that begins a new recording.
 _JUMP_NS = 10**9
-# First bytes of a message in plain form (see `conversion`); offsets of counts, force and angular
-# rate from the end of a message [bytes].
+# First bytes of a message in little-endian CDR; offsets of counts, force and angular rate from the
+# end of a message [bytes].
 _PLAIN, _COUNTS, _FORCE, _RATE = (0, 1, 0, 0), -24, -96, -192
 _SHORTEST = {False: 44, True: 316}  # shortest message [bytes]: of counts, and of an Imu (True)
 
@@ -66,7 +66,7 @@ class RestLog:
         self._thread.start()
 
     def put(self, stamp_ns: int, start: bytes, rest: bytes) -> None:
-        """Queue the line of a rest, preceded by the line of the node's start if necessary."""
+        """Queue the line of a rest; `start` precedes it in a new file or after a changed start."""
         day = np.datetime64(stamp_ns, 'ns').astype('datetime64[D]')
         try:
             self._lines.put_nowait((str(day), start, rest))
@@ -153,7 +153,7 @@ class RestKeeper:
     def gather(
         self, messages: list[bytes], loaded: LoadedCalibration, compensator: Compensator
     ) -> None:
-        """Sum messages that the compensator has corrected; queue the rests that end in them."""
+        """Sum messages that the compensator has processed; queue the rests that end in them."""
         # All messages are summed with the present calibration, although those that arrived before
         # a reload were corrected with the old calibration.
         self._use(loaded, compensator)
@@ -209,7 +209,7 @@ class RestKeeper:
 
 
 def samples_of(messages: Sequence[bytes], *, is_imu: bool) -> tuple[Stamps, Floats]:
-    """Read stamps [ns] and samples of little-endian messages with the length of the last one."""
+    """Read stamps [ns] and samples of the plain messages that are as long as the last message."""
     size = len(messages[-1]) if messages else 0
     # Shorter messages than those with an empty frame_id are malformed.
     if size < _SHORTEST[is_imu]:

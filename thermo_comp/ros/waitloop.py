@@ -186,7 +186,7 @@ class WaitLoop:
         return self._raw[-1]
 
     def publisher(self, message_type: Any, topic: str, qos: QoSProfile) -> Publisher:
-        """Open a publisher."""
+        """Open a publisher; ThermoCompError if name or QoS is invalid."""
         return _opened(self.node.create_publisher, message_type, topic, qos)
 
     def unsubscribe(self, raw: RawSubscription) -> None:
@@ -230,7 +230,7 @@ class WaitLoop:
         others |= {service: partial(self._take_request, service) for service in node.services}
         waking = next((subscription for subscription in self._raw if subscription.wakes), None)
         rest_ns = 0
-        # Pause only with best-effort QoS: with reliable QoS a wake-up takes less than a sleep.
+        # Pause only with best-effort QoS: with reliable QoS a wake-up takes less CPU than a sleep.
         if waking and waking.subscription.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             rest_ns = self._rest_ns
         crowd_ns = rest_ns * 3 // 4
@@ -347,7 +347,7 @@ def _take_message(subscription: Subscription) -> bool:
 
 @contextmanager
 def separate_node(name: str, ros_args: Sequence[str]) -> Iterator[Node]:
-    """Open a node in a separate context."""
+    """Open a node in a new rclpy context; at the end destroy the node and the context."""
     context = rclpy.context.Context()
     rclpy.init(args=['--ros-args', *ros_args], context=context)
     try:

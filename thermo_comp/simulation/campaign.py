@@ -23,8 +23,7 @@ _PROGRAMS = {
     # A program with the temperature range and the style of Fig. 3 of Golovach's paper: up, down
     # and back, with long soaks.
     'paper': '20 60min, 35@0.5 90min, 20 60min, 5 90min, 20 60min, 35 60min',
-    # A program of 4 h 20 min for one bag of a thermal test: the whole temperature range, ramps in
-    # both directions.
+    # A program of 4 h 20 min for one bag of a thermal test: 5 to 35 degC, ramps up and down.
     'chamber': '20 20min, 35@0.75 35min, 5@0.6 45min, 20@0.75 35min, 8@1 23min',
     # A program of 3 h from 5 to 35 degC: ramps in both directions and short soaks.
     'three-hours': '20 10min, 35@0.8 30min, 5@1.2 40min, 22@0.5 22.25min',

@@ -6,7 +6,7 @@ Owns the thermal network of a unit (lumped parts, heat paths, thermostat) and it
 The state of the network obeys ``dx/dt = A x + b u(t) + p``: `x` holds the temperatures of the
 parts, then the integral of the thermostat's controller; `u` is the air temperature; `p` is
 constant. Between the knots of the air temperature the solution is linear plus decaying modes. The
-part of a convective heat flow that is nonlinear in the temperatures is constant within each 1 s.
+part of a convective heat flow that is nonlinear in temperature is constant in each step of 1 s.
 """
 
 from collections.abc import Mapping

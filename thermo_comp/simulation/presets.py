@@ -63,7 +63,7 @@ class Specimen:
         misalignment_sd: float = 1e-3,
         **others: Any,
     ) -> UnitModel:
-        """Return a unit with random constants."""
+        """Return a unit with random scale factors, biases and misalignment."""
         K = self.axes(32768.0 / (full_scale_g * STANDARD_GRAVITY), spread)
         bx, by, bz = self.normal(bias_ug)
         yx, zx, zy = self.normal(misalignment_sd)
@@ -181,7 +181,7 @@ def _mems(draw: Specimen) -> UnitModel:
 
 
 def _demo(draw: Specimen) -> UnitModel:
-    """Draw the unit of the sample bags: tempcos of the board, `loads`, a head that lags."""
+    """Draw the unit of the sample bags: tempcos, heat loads, and a head that lags the board."""
     # The thermal time constants are short, so that the unit settles in the soaks of the bags.
     board_tau, tau = 0.25 * draw.between(400.0, 900.0), draw.between(500.0, 1500.0)
     capacity = {'case': draw.between(900.0, 1800.0), 'board': 0.4 * board_tau}

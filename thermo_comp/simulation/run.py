@@ -87,14 +87,14 @@ class SimulatedRun:
 
 
 def simulate(unit: UnitModel, cyclogram: Cyclogram, up: ArrayLike, **options: Any) -> SimulatedRun:
-    """Simulate a unit in a chamber program as one block; see `simulate_blocks`."""
+    """Simulate a unit in a chamber program as one block; `options`: of `simulate_blocks`."""
     return next(simulate_blocks(unit, cyclogram, up, block_size=sys.maxsize, **options))
 
 
 def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
-    """Simulate all positions of a test in memory, with different seeds and stamps from 0."""
+    """Simulate all positions of a test in memory, each with another seed, stamps from 0."""
     return [
         simulate(
             unit,

@@ -16,8 +16,8 @@ from .drift import ZERO, Triple
 @dataclass(frozen=True)
 class Bend:
     """
-    Nonlinear terms of the axes, as in `unit.nonlinearity`: K2 [ug/g^2] and K3 [ug/g^3] at the
-    reference temperature, and their relative change per kelvin of the board.
+    Nonlinear terms ``K2 f^2 + K3 f^3`` of the axes: K2 [ug/g^2] and K3 [ug/g^3] at the reference
+    temperature, and the relative change of K2 and K3 per kelvin of the board.
     """
 
     square: Triple = ZERO
@@ -25,7 +25,7 @@ class Bend:
     per_kelvin: float = 0.0
 
     def added(self, force: Floats, t: Floats) -> Floats:
-        """Return the nonlinear terms [m/s^2], shape (n, 3), at t [K] from the reference."""
+        """Return the nonlinear terms [m/s^2], shape (n, 3), t [K] above the reference."""
         f = force / STANDARD_GRAVITY
         terms = np.array(self.square) * f**2 + np.array(self.cube) * f**3
         return np.asarray(MICRO_G * (1.0 + self.per_kelvin * t)[:, None] * terms)

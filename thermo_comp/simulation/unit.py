@@ -164,7 +164,7 @@ class UnitModel:
     A physical unit with all its constants: the truth that a calibration estimates.
 
     Per axis, ``counts = K * scale(T) * s + bias(T) + noise``, converted to whole counts; ``s =
-    inverse(M) @ f`` is the specific force along the sensitivity axes, plus the nonlinear `bend`.
+    inverse(M) @ f`` is the specific force along the sensitivity axes, plus the terms of `bend`.
     `scale_factor` K [counts/cycle per m/s^2] and bias [counts/cycle] hold at the reference
     temperature.
     `noise_density` is in ug/sqrt(Hz): the mean over T seconds has the standard deviation
@@ -203,6 +203,6 @@ class UnitModel:
         return self.network.equilibrium(air)
 
     def with_thermometers(self, **changes: Any) -> UnitModel:
-        """Return the unit with changed settings of its thermometers on board and case."""
+        """Return the unit with `changes` in the fields of its thermometers on board and case."""
         board, case = (replace(sensor, **changes) for sensor in (self.board, self.case))
         return replace(self, board=board, case=case)

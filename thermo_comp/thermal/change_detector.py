@@ -4,11 +4,11 @@
 Owns the detection of departures: a temperature's rate leaves the baseline, its rate in a soak.
 
 Two Kalman filters of temperature and rate, one with a long and one with a short memory, have white
-noise as second derivative. A rate has departed if it differs from the baseline by more than the
-swing plus a multiple of the sd of its noise; the multiple follows from the permitted rate of false
-alarms (Rice's formula, see docs/regime.md). The swing is the amplitude of the oscillation of the
-rate in a soak: the ripple of the surroundings (a setting) divided by the lag of the sensor, or the
-observed amplitude if larger.
+noise as second derivative. A rate has departed if it differs from the baseline, away from 0, by
+more than swing, error of the baseline and a multiple of the sd of the noise; the multiple follows
+from the permitted rate of false alarms (Rice's formula, docs/regime.md). The swing is the
+amplitude of the rate's oscillation in a soak: the ripple of the surroundings (a setting) divided
+by the lag of the sensor, or the observed amplitude if larger.
 
 The readings of a sensor with a quantum lie in cells of one quantum. If noise cannot cross a cell,
 the filters are not used: two edges of cells crossed in the same direction give the mean rate.

@@ -70,7 +70,7 @@ class Lag(_Lag, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The thermometers that the quantity is computed from."""
+        """The thermometer `input` and, for a part between board and sensor, `sensor`."""
         return (self.input, self.sensor) if self.sensor else (self.input,)
 
     @property
@@ -130,7 +130,7 @@ class Play(_Play, Quantity):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The thermometers that the quantity is computed from."""
+        """The board and, for a play of a part between board and sensor, `sensor`."""
         return self.lag.inputs if self.lag else (self.input,)
 
 
@@ -139,7 +139,7 @@ class MemorySpec:
     """
     Contents of the thermal state of a tracker. `sensors`: names of the thermometers other than the
     board's; the regime detector uses the first as the leading sensor.
-    `lags`: in the order of `inputs`. `rates`: sensors whose rate of change is in the state.
+    `lags`: sorted by input as in `inputs`. `rates`: sensors whose rate of change is in the state.
     """
 
     sensors: tuple[str, ...] = ('case',)

@@ -91,7 +91,7 @@ class LagBank:
             self.extra = [variance + change * change for variance in self.extra]
 
     def at(self, stamp_ns: int, value: float) -> tuple[list[float], list[float]]:
-        """Return ``u - L`` [K], u = `value`, and the variance `extra` of each lag at a stamp."""
+        """Return ``u - L`` [K], u = `value`, and its variance without that of the first state."""
         seen_ns = self.stamp_ns
         if seen_ns is None or stamp_ns <= seen_ns or not self.taus:
             return self.lagging, self.extra
@@ -144,7 +144,7 @@ class ThermalMemory:
         ]
         if [lag.first_order_weights for lag in spec.lags] == [{term: 1.0} for term in terms]:
             self._sums = []
-        #: For each play: index of the lag that it follows, -1 for the board; half-width [K].
+        #: For each play: index of the lag of its input, -1 for the board; half-width [K].
         self._inputs = [spec.lags.index(play.lag) if play.lag else -1 for play in spec.plays]
         #: Index and weight of the first-order terms of each play's lag; [] without a lag.
         self._followed = [
@@ -179,7 +179,7 @@ class ThermalMemory:
         self.board.step(stamp_ns, board, sd)
         values = self.board.lagging
         if self._needs_sensors:
-            # Other sensors have no reading at the board's stamp, so their last gradients are used.
+            # Only the board has a reading at this stamp: use the last gradients of the sensors.
             gradients = [self.banks[name].input for name in self.spec.sensors]
             values, _ = self._first_order(stamp_ns, board, gradients)
         inputs = [

@@ -25,8 +25,8 @@ LARGEST_RATE: Final = 0.2
 #: may be wrong.
 SETTLED_READINGS: Final = 5
 
-#: A sensor's first reading is wrong if the step to the second reading is impossible and the next
-#: change, to the third reading, is less than this share of the step.
+#: A sensor's first reading is wrong if the step to the second reading is impossible and the change
+#: to the third is less than this share of the step, and of the change at the step's rate.
 CONTINUED_SHARE: Final = 0.25
 
 #: Smallest number of equal readings, and shortest time [s], after which a sensor counts as
@@ -35,7 +35,7 @@ CONTINUED_SHARE: Final = 0.25
 STILL_READINGS: Final = 20
 STILL_S: Final = 5.0
 STILL_PROBABILITY: Final = 1e-9
-#: Number of equal readings in a row from which the variance of the temperature is increased.
+#: Number of equal readings in a row from which, without cells, the temperature's variance grows.
 DOUBTFUL_READINGS: Final = 4
 #: Change of the other sensor's temperature, beyond noise and quanta [K], from which a sensor with
 #: constant readings counts as frozen: for a sensor whose readings vary with the noise, and for a
@@ -78,8 +78,8 @@ class Fault(Enum):
 
 class SensorCheck:
     """
-    Judges a sensor's readings by its earlier readings and by the other sensor, which the sensor
-    lags by `lag_s` [s] (0 for the leading sensor). `is_revived`: the last reading ends a fault.
+    Judges a sensor's readings by its earlier readings and by the other sensor, which the board
+    lags by `lag_s` [s] (else 0). `is_revived`: after a fault the estimate must start again.
     """
 
     def __init__(self, sensor: Thermometer, other: Thermometer, lag_s: float) -> None:
@@ -113,7 +113,7 @@ class SensorCheck:
         self._first: list[tuple[int, float]] | None = []
 
     def forget_other(self) -> None:
-        """Measure the other sensor's change from now on: readings of a sensor were wrong."""
+        """Measure the other sensor's change from now on, as readings of a sensor were wrong."""
         self._other_then = nan
 
     def has_wrong_start(self, stamp_ns: int, celsius: float) -> bool:
@@ -197,7 +197,7 @@ class SensorCheck:
                 # Expect the judged sensor to follow the other sensor with a first-order lag.
                 self._expected += dt / (dt + self.lag_s) * (moved - self._expected)
         else:
-            # The board passes the leading sensor's temperature only if that sensor has changed.
+            # The board may approach this sensor's temperature, but not pass it by itself.
             ahead = self.sensor.temperature - self._other_then
             self._expected = moved - min(max(moved, min(ahead, 0.0)), max(ahead, 0.0))
         self._seen_ns = now_ns
@@ -234,7 +234,7 @@ class SensorCheck:
     def still(self, stamp_ns: int) -> tuple[float, float]:
         """
         Return the possible error of constant readings [K], and the time since their last change
-        [s]; zeros if the readings change.
+        [s]; zeros if the readings change or a cell explains why they do not.
         """
         changed_ns = self.sensor.changed_ns
         if changed_ns is None or self._n_same < self._n_doubtful:

@@ -8,19 +8,19 @@ from ..quantities import QUANTITIES
 
 
 class Quantity:
-    """A quantity of the thermal state, computed from the readings of the thermometer `input`."""
+    """A quantity of the thermal state, from readings of `input` (a gradient: and of the board)."""
 
     input: str
     #: Largest magnitude of the quantity that a calibration may contain.
     largest: ClassVar[float] = QUANTITIES['temperature span'].at_most or 0.0
     #: Typical change of the quantity per kelvin of temperature change.
     per_kelvin: ClassVar[float] = 1.0
-    #: Whether the quantity is computed with the time constants of one part of the unit.
+    #: Whether the quantity is computed with the lag of one part of the unit; the board's lag is 0.
     is_of_part: ClassVar[bool] = True
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The thermometers that the quantity is computed from."""
+        """The thermometers of the quantity; of a gradient, the sensor without the board."""
         return (self.input,)
 
     @property

@@ -56,7 +56,7 @@ class ReadingQueue:
         heapq.heapify(self._entries)
 
     def due(self, stamp_ns: int) -> Iterator[Entry]:
-        """Remove the readings up to a stamp, and return them in order."""
+        """Remove and return the readings up to a stamp, in order of stamps."""
         while self._entries and self._entries[0][0] <= stamp_ns:
             yield heapq.heappop(self._entries)
 

@@ -121,11 +121,11 @@ class DetectorSettings:
 class ThermalConfig:
     """Times of the tracker that the user sets; ValueError if a value is out of its range."""
 
-    #: Time over which the two sets of coefficients are blended after a change of regime [s], which
-    #: `Correction.gentle_transition` lengthens if the sets differ much; 0 = step, as in the paper.
+    #: Time over which the two sets of coefficients are blended after a change of regime [s], up to
+    #: ten times longer if the force would change faster than 1 ug/s; 0 = step, as in the paper.
     transition_time_s: NotNegative = 30.0
-    #: Age of the board temperature after which nothing is published [s]; also the time for which
-    #: the readings after an impossible step of the board temperature are refused.
+    #: Age of the board temperature after which nothing is published, unless the correction is
+    #: constant; also the time for which board readings after an impossible step are refused.
     temperature_timeout_s: Positive = 60.0
     #: Age of the case temperature at which the board temperature decides the regime [s]; also the
     #: time for which the readings of other sensors after an impossible step are refused.

@@ -58,8 +58,8 @@ class Thermometer:
     The estimates hold at `stamp_ns`, the stamp of the last used reading; before the first reading
     they are NaN with infinite variances. `changed_ns`: stamp of the last change of the reading;
     `interval_s`: typical interval between readings; `n_in_row`: number of readings since the last
-    start; `n_restarts`: number of starts after a gap or a step; `is_ready`: two readings exist, so
-    that a rate is known. `measured` and its variance: the last reading, or for a sensor with cells
+    start; `n_restarts`: number of starts after a gap or a step; `is_ready`: `n_in_row` is 2 or
+    more, which gives a rate. `measured` and its variance: the last reading, or for quantized cells
     the equivalent Gaussian measurement (infinite variance: no information). `bending`: probability
     of the bending mode, in which the acceleration changes.
     """
@@ -103,8 +103,8 @@ class Thermometer:
 
     def update(self, stamp_ns: int, reading_c: float) -> bool:
         """
-        Use a reading [degC]; return False if it is not a possible temperature, is not newer than
-        the last used reading, or is an outlier.
+        Use a reading [degC]; return False for an impossible temperature, a stamp not after that of
+        the last used reading, or an outlier that is too far from the prediction to be used.
         """
         if not COLDEST <= reading_c <= HOTTEST:
             return False

@@ -92,7 +92,7 @@ class ThermalTracker:
         rest_gradient_range_k: tuple[float, float],
         stamp_ns: int | None,
     ) -> None:
-        """Use another configuration from a stamp on, without a step in the dynamic weight."""
+        """Use the given settings from a stamp on, without a step in the dynamic weight."""
         if stamp_ns is not None:
             self._weight = self.weight_at(stamp_ns)
             self._weight_ns = stamp_ns
@@ -163,7 +163,7 @@ class ThermalTracker:
         n_before = sensor.n_in_row
         is_anew = not check.admits(stamp_ns, celsius)
         if is_anew:
-            # A sensor whose readings are rejected as a step starts again after its time-out.
+            # A sensor starts again if all readings within the time-out were rejected as a step.
             age_s = 0.0 if before_ns is None else (stamp_ns - before_ns) * 1e-9
             is_board = sensor is self.board
             patience_s = self.config.temperature_timeout_s if is_board else self._case_timeout_s
@@ -299,7 +299,7 @@ class ThermalTracker:
     def _lost_gradient(self, name: str, stamp_ns: int, rate: float) -> tuple[float, float]:
         """
         Estimate a gradient while its sensor is lost: the gradient of self-heating, from the last
-        static reading or else from the fit, plus the board's lag times the board's rate.
+        static reading, the fit, or else 0, plus the board's lag times the board's rate.
         """
         lag = self._board_lag_s
         lower, upper = self._rest_gradient_range

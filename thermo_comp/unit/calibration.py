@@ -3,9 +3,9 @@
 """
 Owns the calibration of one unit: immutable dataclasses with the keys of the calibration file.
 
-Measurement model, per axis i, with ``t = T_board - T_ref``, w the weight of the dynamic regime
-(0..1), and phi_j the columns of the thermal response (`columns`), common to the static and the
-dynamic set (equations 6 to 9 of the paper, which has no thermal response)::
+Measurement model of axis i (equations 6 to 9 of the paper, which has no phi_j): N_i is the raw
+sample, ``t = T_board - T_ref``, w the weight of the dynamic regime (0..1), phi_j column j of the
+thermal response (`columns`), M the misalignment matrix, f the specific force::
 
     bias  = bias_i + (1 - w) (delta_s + Fs_s(t)) + w (delta_d + Fs_d(t)) + sum_j bias_ji phi_j
     scale = K_i ((1 - w) Fc_s(t) + w Fc_d(t) + sum_j scale_ji phi_j)
@@ -132,9 +132,9 @@ class LackOfFit:
 @dataclass(frozen=True)
 class RegimeSet:
     """
-    The curves of one regime. Outside `temperature_range_c` a curve follows that of the other
-    regime at a constant difference; outside both ranges a curve follows a tangent for a quarter
-    of the range and is then constant. The covariance grows with the distance from the range.
+    The curves of one regime. Outside `temperature_range_c` the covariance of the force grows, and
+    a curve differs from that of the other regime by a constant; outside the ranges of both regimes
+    a curve is a tangent for a quarter of the range, then constant.
     """
 
     temperature_range_c: Annotated[tuple[Celsius, Celsius], 'Calibrated range of T_board [degC].']
@@ -145,7 +145,7 @@ class RegimeSet:
     lack_of_fit: Annotated[
         tuple[LackOfFit, ...],
         'Error on data left out of the fit, beyond the sd of the posterior; includes the error of '
-        'scale factors at temperatures at which no position had the axis along gravity. The '
+        'scale factors at temperatures at which no position had their axis along gravity. The '
         'variance is linear between two entries, and constant outside all entries.',
     ] = ()
 
@@ -182,7 +182,7 @@ class ResponseTerm(Column):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration of one unit; ValueError if two of its values contradict each other."""
+    """Calibration of one unit; ValueError if a value is impossible or contradicts another."""
 
     format_version: Annotated[int, f'Version of the layout of this file: {FORMAT_VERSION}.']
     unit: Unit
@@ -218,7 +218,7 @@ class Calibration:
         float,
         QUANTITIES['time constant'],
         'Lag of T_board behind T_case. Without readings of the case, T_case - T_board is '
-        'estimated as its last value in the static regime plus board_lag_s * dT_board/dt.',
+        'estimated as its value in the last soak, or in the fit, plus board_lag_s * dT_board/dt.',
     ] = 900.0
     rest_gradient_range_k: Annotated[
         tuple[_Kelvin, _Kelvin] | None,
@@ -300,7 +300,7 @@ class Calibration:
 
     @property
     def needs_temperature(self) -> bool:
-        """Whether the correction depends on temperature; otherwise the correction is constant."""
+        """Whether curves, regimes or columns make bias, scale or the bias of the rate vary."""
         weights: list[float] = []
         for axis in (axis for part in self.regime_sets() for axis in part.axes()):
             weights += (axis.delta, *axis.bias_function.free_coefficients)
@@ -312,7 +312,7 @@ class Calibration:
 
     @property
     def needs_case(self) -> bool:
-        """Whether the fit used a case thermometer, or a column depends on one of `sensors`."""
+        """Whether `detector.case` is not the default, or a column depends on one of `sensors`."""
         columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
         return self.detector.case != ThermometerSettings() or any(
             column.is_of_sensor for column in columns
@@ -320,7 +320,7 @@ class Calibration:
 
     @property
     def has_uncertainty(self) -> bool:
-        """Whether the calibration states any uncertainty of its parameters."""
+        """Whether a posterior, misalignment sd, residual sd or lack of fit is given."""
         return (
             self.posterior is not None
             or any(self.misalignment_sd)
@@ -343,7 +343,7 @@ def parameter_layout(calibration: Calibration) -> ParameterLayout:
 
 
 def rate_triad(calibration: Calibration) -> Calibration:
-    """Return a calibration of the gyroscope alone, of scale 1; ValueError without gyroscope."""
+    """Return the gyroscope's bias as a `Calibration` of scale 1; ValueError without gyroscope."""
     gyroscope = calibration.gyroscope
     if gyroscope is None:
         raise ValueError('`calibration` must have a gyroscope')

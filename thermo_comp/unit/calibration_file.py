@@ -3,8 +3,8 @@
 """
 Owns the calibration file, from YAML to a validated Calibration and back.
 
-Any bytes give a Calibration or a CalibrationError that names file and key: size, nesting and YAML
-features are limited before anything is built (no aliases, tags or duplicate keys).
+Any bytes give a Calibration or a CalibrationError, which names the key of a wrong value: size,
+nesting and YAML features are limited before parsing ends (no aliases, tags or duplicate keys).
 """
 
 from pathlib import Path
@@ -43,8 +43,8 @@ def load_calibration(path: str | Path) -> Calibration:
     """
     Read and validate a calibration file.
 
-    Raises CalibrationError if the file cannot be read, is not YAML of the accepted kind, or has a
-    wrong value; the message names file, key, value and the expected value.
+    Raises CalibrationError, which names the file, if the file cannot be read, is not YAML of the
+    accepted kind, or has a wrong value; then the message also names key, value and expected value.
     """
     try:
         content = read_bounded(path, SIZE_LIMIT)
@@ -103,9 +103,7 @@ def _rename(data: dict[str, Any]) -> None:
 
 
 def dump_calibration(calibration: Calibration) -> str:
-    """
-    Write a Calibration as YAML; raises CalibrationError if reading the text gives another value.
-    """
+    """Return a Calibration as YAML; CalibrationError if it is too large or not read as equal."""
     content: str = yaml.dump(
         plain(calibration),
         Dumper=_Dumper,
@@ -121,7 +119,7 @@ def dump_calibration(calibration: Calibration) -> str:
             f'the calibration takes {size} bytes, at most {SIZE_LIMIT} are accepted'
         )
     if parse_calibration(text.encode()) != calibration:
-        raise CalibrationError('the written text, read again, gives another calibration')
+        raise CalibrationError('the written text, read again, gives other values')
     return text
 
 
@@ -131,8 +129,8 @@ def save_calibration(
     """
     Write a calibration file atomically.
 
-    Raises CalibrationError if the calibration is not valid. Raises OutputError if the file may not
-    or cannot be written; an existing file then stays as it was.
+    Raises CalibrationError if the calibration is not valid or the text too large, OutputError if
+    the file may not or cannot be written; an existing file then stays as it was.
     """
     text = dump_calibration(calibration)
     write_atomically(path, text.encode(), CALIBRATION, overwrite=overwrite)

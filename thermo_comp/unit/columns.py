@@ -6,16 +6,16 @@ Owns the columns of the thermal response: the regressors of bias and scale.
 A column is ``phi = u t^power r``. The value u is computed by the column's kind (`unit.terms`), t
 is the board temperature less the reference, and r is 1, 1 - w or w, with w the weight of the
 dynamic regime. u is limited to the column's range, and t to the calibrated temperatures. Outside
-the calibrated temperatures the curves of the sets continue along their tangents, but the factor
-t^power is constant, because no recording determines the coefficients at these temperatures.
+the calibrated temperatures the curves of the sets first continue along tangents, but t^power is
+constant, because no recording determines the weights of columns at these temperatures.
 
 The function `bank` makes the columns in groups. A group has the columns of the kind with the
 group's name, except for the following groups. Group *product* has the kind board, and group
 *gradient_x_temperature* the kinds gradient and gradient_lag, times a power of temperature, for
 coefficients that change with temperature. Group *square* also has the kind cube, and group
-*gradient_even* the kinds size and square. Group *part* has the kinds board, square and cube, whose
-sum with a curve over the board temperature is a curve over a part's temperature. Group
-*gradient_even_about_rest* has the kinds of *gradient_even* with the gradient less its rest value.
+*gradient_even* also the kinds size and square. Group *gradient_even_about_rest* has the kinds of
+*gradient_even*, for the gradient less its rest value. The fit makes group *part* of board, square
+and cube: their sum with a curve over the board temperature is a curve over a part's temperature.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,7 +39,7 @@ UNBOUNDED: Final = (-1e9, 1e9)
 #: Time constants of the columns of `bank` [s], in steps of a factor sqrt(2), from a few reading
 #: intervals to the longest lag that bags determine. Columns linear in a lag have all 15 time
 #: constants: sums of columns approximate any time constant in between. Products and powers of lags
-#: have smaller effects, so every second time constant suffices.
+#: have smaller effects than the lags, so every second time constant suffices for them.
 FINE_TAUS: Final = tuple(np.geomspace(60.0, 7680.0, 15).round(9).tolist())
 BANK_TAUS: Final = FINE_TAUS[::2]
 #: Widths of kind gradient_even [K], half-widths of plays [K], and time constants of the lagged
@@ -47,13 +47,13 @@ BANK_TAUS: Final = FINE_TAUS[::2]
 EVEN_WIDTHS: Final = (0.375, 0.75, 1.5, 3.0, 6.0)
 PLAY_WIDTHS: Final = (0.4, 0.8, 1.6, 3.2, 6.4)
 PLAY_TAUS: Final[tuple[float, ...]] = (0.0, 450.0, 900.0, 1800.0)
-#: Kind bend: time constants [s]; temperature span per knee (the temperature at which the slope
-#: changes) [K]; largest number of knees per lag, and per lag of a part, with a third of this span.
+#: Kind bend: time constants [s]; least temperature span per knee (temperature at which the slope
+#: changes) [K]; most knees per lag, and, for lags given to `bank`, with a third of the span.
 BEND_TAUS: Final = (0.0, *FINE_TAUS[4:11])
 LEAST_KNEE_K, MOST_KNEES, MOST_PART_KNEES = 1.0, 20, 60
 
 
-# A name of a group or kind is a text for type checkers, and one of the names in the schema.
+# Name of a group or kind: any text for type checkers; for the schema, a key of GROUPS or TERMS.
 if TYPE_CHECKING:
     _Group: TypeAlias = str
     _Kind: TypeAlias = str
@@ -78,7 +78,7 @@ class Part(NamedTuple):
 
     @property
     def of_gradient(self) -> 'Part':
-        """The time constants of the part: the lag of a gradient has no share and no lead."""
+        """The part without `sensor_share` and `lead_s`, which a lag of a gradient cannot have."""
         return Part(self.tau_s, self.second_tau_s)
 
 
@@ -96,7 +96,7 @@ class Column:
     tau_s: Annotated[
         float,
         QUANTITIES['lag'],
-        'Time constant of the lag; 0 = no lag (kinds square, play and bend).',
+        'Time constant of the lag; 0 = no lag (not in kinds board, gradient_lag and cube).',
     ] = 0.0
     second_tau_s: Annotated[
         float,
@@ -189,7 +189,7 @@ def bank(
     parts: Sequence[Part] | None = None,
 ) -> tuple[Column, ...]:
     """
-    Return all columns that a response may have, without limits of range. `at_rest`: gradient of
+    Return the candidate columns of a response, with the widest ranges. `at_rest`: gradient of
     each sensor at rest [K]; `span_k`: lowest and highest board temperature in the data, less the
     reference [K]; `parts`: lags of the part of each axis; if given, all lags are from `parts`.
     """

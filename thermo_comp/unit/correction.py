@@ -28,8 +28,8 @@ from .functions import hold, in_order
 from .gravity import MICRO_G
 from .nonlinearity import ForceCorrection, beyond_force
 
-#: Largest rate of change of the force while static and dynamic set are blended [m/s^3], 1 ug per
-#: second; largest factor by which the transition time is lengthened to keep this rate.
+#: Rate of change of the force while static and dynamic set are blended [m/s^3], above which the
+#: transition time is lengthened: 1 ug per second; largest factor of this lengthening.
 GENTLE_RATE = MICRO_G
 LONGEST_TRANSITION = 10.0
 #: Number of board temperatures at which slopes, and dynamic - static differences, are evaluated.
@@ -60,15 +60,15 @@ class Excess(NamedTuple):
     temperature: float  # board temperature beyond the range of the present regime, signed [K]
     rate: float  # rate of the board temperature beyond this regime's range, signed [K/s]
     gradient: float  # excess of the gradient farthest outside its range, signed [K]
-    relative: float  # excess of temperature plus rate plus largest of the columns [half ranges]
+    relative: float  # sum of the temperature's, rate's and worst column's excess [half ranges]
 
 
 class Correction:
     """
     Evaluates bias, scale and error variances of a calibration at thermal states.
 
-    memory: lags, plays and rates of the states; by default those of `memory_of_unit`
-    noise: noise variance of one sample per axis, rounding included [m^2/s^4]
+    memory: lags, plays and rates of the states; by default those that the unit's columns need
+    noise: noise variance of one sample per axis, rounding of counts included [m^2/s^4]
     noise_trace: the sum of `noise`
     misalignment: elements yx, zx, zy of the misalignment matrix M
     beyond: additional variance at forces beyond those of the fit
@@ -149,7 +149,7 @@ class Correction:
         return in_order(np.concatenate((start[:, np.newaxis], self._W * columns), axis=1), 1)
 
     def gentle_transition(self, given_s: float) -> float:
-        """Lengthen a transition [s], so that the force changes at GENTLE_RATE at most."""
+        """Lengthen a transition [s], at most 10 times, to let the force change at GENTLE_RATE."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
         static, dynamic = self.curves.values(board)
         gap = dynamic - static
@@ -178,7 +178,7 @@ class Correction:
     def by_pairs(self, slopes: Floats) -> Floats:
         """
         Differentiate bias and relative scale w.r.t. the quantities of `StateLayout.pairs`, shape
-        (p, 6, n); `slopes`: derivatives of the columns phi w.r.t. these, (n_columns, n).
+        (p, 6, n); `slopes`: derivatives of columns w.r.t. their quantities, (n_columns, n).
         """
         columns = self._pair_columns
         result = np.zeros((len(self._signs), 6, slopes.shape[1]))
@@ -201,7 +201,7 @@ class Correction:
         `SlowUncertainty.at`. Returns (52,) or (52, n): by axis bias and its change over the
         segment (1 s), scale and its change, then the coefficients of the covariance with the noise
         of a sample, see `covariance.covariance_at`. A nonlinearity adds 15 rows to `slow` and 21
-        rows to the result, see `ForceCorrection.rows`.
+        to the result: K2, Kq, K3 by axis, coefficients of x^3 to x^6 in the variance by axis.
         """
         ends = np.array((start, end), dtype=np.float64)
         n = ends[0, 0].size
@@ -226,7 +226,7 @@ class Correction:
             states[:, n:], raw[:, n:], held[:, n:], factors_at_end, gap, slow[:9].reshape(3, 3, n)
         )
         between = grown(slow[9:N_ROWS], growth)
-        # The largest force that each axis can measure [m/s^2], and the error variance of it.
+        # The largest force that each axis can measure [m/s^2], and the error variance there.
         most = (self._full_scale + np.abs(both[0, :, 0])) / np.abs(both[1, :, 0])
         tilts = misalignment_variances(between).max(axis=0)
         variance = v[:, 0] + most * (np.abs(v[:, 1]) + most * (v[:, 2] + tilts))
@@ -262,7 +262,7 @@ class Correction:
         static_weight, beyond_range = 1.0 - weight, raw - held
         excess, _, relative, by_rate = self.curves.excess(states)
         if not self._has_lags:
-            # Only without lags the excess of the rate adds variance; else that of the lags does.
+            # Without lags the rate's excess adds variance; with lags, the lags' excess instead.
             relative = relative + by_rate
         outside = static_weight * relative[0] + weight * relative[1]
         shares = np.array([static_weight + unknown * weight, weight + unknown * static_weight])
@@ -289,7 +289,7 @@ class Correction:
             )
             # Outside the calibrated range the curves are extrapolated. Add two errors: the slope
             # at the edge of the range times the board's distance from the edge, and the sd of the
-            # slopes within the range times the distance of the board or of the farthest part.
+            # slopes within the range times the larger distance: the board's or that of a part.
             v += self._spread(shares * excess * excess, slopes)
             bent = shares * np.maximum(excess * excess, parts_out * parts_out)
             bends = np.broadcast_to(self._bends, (4, *slopes.shape[1:]))
@@ -324,14 +324,14 @@ class Correction:
 
 
 def memory_of_unit(calibration: Calibration) -> MemorySpec:
-    """Return the memory that the corrections of force and angular rate need."""
+    """Return the lags, plays and rates that the columns of force and angular rate need."""
     gyroscope = calibration.gyroscope
     columns = (*calibration.response, *(gyroscope.response if gyroscope else ()))
     return memory_of(columns, calibration.sensors)
 
 
 def is_sound(line: Floats) -> npt.NDArray[np.bool_]:
-    """Whether every sample corrected by a result of `Correction.line` is finite."""
+    """Whether a result of `Correction.line` gives finite forces: scales not 0, all below 1e140."""
     scale = line[2:12:4]
     is_finite = (np.abs(line) < _LARGEST).all(axis=0)
     return np.asarray(is_finite & (scale * (scale + line[3:12:4]) > 0.0).all(axis=0))

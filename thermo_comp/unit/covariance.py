@@ -97,7 +97,7 @@ def grown(between: Floats, growth: Floats) -> Floats:
 def rows_between(errors: Floats, misalignment_variances: Floats) -> Floats:
     """
     Return the rows `BETWEEN`, (36, n), of errors that are linear in p independent unit variances,
-    (9, p, n), and of variances that are added to the elements of the misalignment, (3,).
+    (9, p, n), with variances, (3,), added to those of the elements of the misalignment.
     """
     # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
     result = in_order(errors[_FIRST] * errors[_SECOND], 1)

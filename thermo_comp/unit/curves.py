@@ -3,7 +3,7 @@
 """
 Owns the curves of static and dynamic set over board temperature, within and beyond their ranges.
 
-Thermal states and rows of results are laid out as in `correction`.
+n thermal states are the columns of an array; results have the rows bias x, y, z, scale x, y, z.
 """
 
 from functools import cached_property
@@ -110,7 +110,7 @@ class Curves:
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate ``residual_sd_m_s2 ** 2`` plus variance of the lack of fit, shape (2, 3, n)."""
+        """Evaluate ``residual_sd_m_s2 ** 2`` plus lack of fit, shape (2, 3, n) or (2, 3, 1)."""
         return self._residuals + self.lack_of_fit(board) if self._has_lacks else self._residuals
 
     def lack_of_fit(self, board: Floats) -> Floats:

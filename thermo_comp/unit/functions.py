@@ -35,7 +35,7 @@ TANGENT_SPANS = 0.25
 #: Largest accepted error of a function's value at the reference temperature.
 NORMALISATION_TOLERANCE = 1e-9
 #: Smallest distance between a spline's knots, and largest distance of a knot from the reference
-#: temperature [K]; numbers beyond these limits would make the spline overflow.
+#: temperature [K]; numbers far beyond these limits would make the spline overflow.
 _KNOT_STEP = 1e-3
 _FARTHEST_KNOT = 2000.0
 
@@ -89,7 +89,7 @@ class Polynomial(_Family):
 
     def __post_init__(self) -> None:
         if not self.coefficients:
-            raise ValueError('`coefficients` must hold at least the value at the reference')
+            raise ValueError('`coefficients` must hold at least the value at t = 0')
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
@@ -116,7 +116,7 @@ class Polynomial(_Family):
 @dataclass(frozen=True)
 class CubicSpline(_Family):
     """
-    Natural cubic spline through values at rising knots [K from the reference]. One knot is 0, with
+    Natural cubic spline through values at rising knots t [K from T_ref]. One knot is 0, with
     the value 0 (bias) or 1 (scale). Beyond the outer knots the spline is constant.
     """
 
@@ -135,7 +135,7 @@ class CubicSpline(_Family):
         if any(b - a < _KNOT_STEP for a, b in zip(self.knots_k, self.knots_k[1:], strict=False)):
             raise ValueError(f'`knots_k` must rise strictly, by {_KNOT_STEP} K or more')
         if max(map(abs, self.knots_k)) > _FARTHEST_KNOT:
-            raise ValueError(f'`knots_k` must lie within {_FARTHEST_KNOT:g} K of the reference')
+            raise ValueError(f'`knots_k` must lie within {_FARTHEST_KNOT:g} K of t = 0')
         if 0.0 not in self.knots_k:
             raise ValueError('`knots_k` must contain 0, the reference temperature')
 
@@ -268,7 +268,7 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:
-        raise ValueError(f'`{name}` must be {expected:g} at the reference, got {value:g}')
+        raise ValueError(f'`{name}` must be {expected:g} at t = 0 (T_ref), got {value:g}')
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:

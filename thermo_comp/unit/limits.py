@@ -4,8 +4,8 @@
 Owns the limits of a calibration's bias and scale over its temperatures.
 
 The bias at the reference temperature, and its change over temperature, are each at most twice the
-full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, may be a
-million times the limit of bias or scale: far beyond any instrument, but without overflow.
+full scale. The effect of a column on the bias, and of a parameter's sd on bias or scale, is at
+most a million times the limit of bias or scale: beyond any instrument, but without overflow.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
             if not worst <= WORST * bound:
                 raise ValueError(
                     "`posterior.factor` must keep the effect of each parameter's sd at most "
-                    f'{WORST * bound:g}, got {worst:g}'
+                    f'{WORST * bound:g} (bias: input units; scale: relative), got {worst:g}'
                 )
 
 
@@ -103,7 +103,9 @@ def _check_axes(calibration: Calibration, most: float) -> None:
 
 def _check_bias(key: str, level: float, reached: tuple[float, float], most: float) -> None:
     if abs(level) > most:
-        raise ValueError(f'`{key}.delta` must keep bias plus delta within {most:g}, got {level:g}')
+        raise ValueError(
+            f'`{key}.delta` must keep bias plus delta within {most:g} input units, got {level:g}'
+        )
     least, largest = reached
     if not math.isfinite(largest - least):
         raise ValueError(f'`{key}.bias_function` must be finite over its {_AROUND}')

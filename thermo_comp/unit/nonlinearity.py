@@ -6,7 +6,7 @@ Owns the nonlinearity of the axes over specific force: terms, correction and var
 x is the reading of an axis less bias, divided by the scale factor; f is the specific force along
 the sensitivity axis. With x and f in g, as in IEEE Std 1293::
 
-    x = f + K2 f^2 + Kq |f| f + K3 f^3,    K(t) = coefficient + per_kelvin t
+    x = f + K2 f^2 + Kq |f| f + K3 f^3,    K = coefficient + per_kelvin (T_board - T_ref)
 
 """
 
@@ -103,7 +103,7 @@ class Nonlinearity:
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
         """
         Raise ValueError if the slope of the terms reaches `LARGEST_SLOPE` at a |f| up to `force`
-        [m/s^2], at one of the temperatures [K from the reference].
+        [m/s^2], at one of the temperatures [K from T_ref].
         """
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
@@ -111,7 +111,7 @@ class Nonlinearity:
             if not slope < LARGEST_SLOPE:
                 raise ValueError(
                     f'`nonlinearity.terms` must have a slope below {LARGEST_SLOPE:g} up to full '
-                    f'scale, got {slope:.3g} at {t:+.3g} K from the reference'
+                    f'scale, got {slope:.3g} at {t:+.3g} K from T_ref'
                 )
 
     def coefficients(self, t: Floats) -> Floats:
@@ -131,8 +131,8 @@ def unit_of(kind: Kind) -> float:
 def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
     """
     Solve ``x = f + k2 f^2 + kq |f| f + k3 f^3`` for f by one step of Halley's method from x. The
-    error of the result is (k2^2 - k3) times the cube of x - f: at f = 10 g, 1e-14 g with
-    k2 = 100 ug/g^2, and 1e-11 g with k3 = 10 ug/g^3.
+    error of the result is about (k^2 - k3) (x - f)^3, k = k2 + kq sign(f): at f = 10 g, 1e-14 g
+    with k2 = 100 ug/g^2, and 1e-11 g with k3 = 10 ug/g^3.
     """
     r = k3 * x * x
     s = k2 * x + kq * abs(x) + r
@@ -143,7 +143,7 @@ def linearised(x: Real, k2: Real, kq: Real, k3: Real) -> Real:
 def corrected_nonlinear(
     line: Sequence[Real], misalignment: tuple[float, ...], dt: Real, x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real, Real, Real, Real]:
-    """Correct a sample as `online.compensator.corrected` does, for axes with a nonlinearity."""
+    """Return the force of a sample and its covariance xx to zz, for nonlinear axes."""
     bx, bx1, sx, sx1, by, by1, sy, sy1, bz, bz1, sz, sz1 = line[:12]
     k2x, kqx, k3x, k2y, kqy, k3y, k2z, kqz, k3z = line[_NONLINEAR : _NONLINEAR + 9]
     yx, zx, zy = misalignment
@@ -158,7 +158,7 @@ def corrected_nonlinear(
 def nonlinear_covariance(
     line: Sequence[Real], misalignment: tuple[float, ...], x: Real, y: Real, z: Real
 ) -> tuple[Real, Real, Real, Real, Real, Real]:
-    """Evaluate the covariance as `covariance_at` does, for axes with a nonlinearity."""
+    """Evaluate xx, xy, xz, yy, yz, zz of the force's covariance, for nonlinear axes."""
     xx, xy, xz, yy, yz, zz = covariance_at(line[12:_NONLINEAR], x, y, z)
     dx, ex, fx, gx, dy, ey, fy, gy, dz, ez, fz, gz = line[_NONLINEAR + 9 :]
     yx, zx, zy = misalignment

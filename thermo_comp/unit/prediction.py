@@ -4,11 +4,11 @@
 Owns the slowly varying error covariance of thermal states, due to the parameters and the unknown
 initial lag states, and the thermal states of a soak and of a ramp.
 
-In a ramp of rate q that has lasted for s seconds the gradients are the board's lag times q, a part
-of time constant tau lags the board by ``tau q (1 - exp(-s / tau))``, and a play has its largest
-distance from its input. In a soak (q = 0) gradients, lags and plays are 0, except for the gradient
-of the first sensor and its lags: these are `soak_gradient_k`. In a soak the static set applies, in
-a ramp the dynamic set. Predicted variances include neither noise nor thermometer errors.
+In a ramp of rate q that has lasted for s seconds the gradients are ``board_lag_s q``, a part of
+time constant tau lags the board by ``tau q (1 - exp(-s / tau))``, and a play has its largest
+distance from its input; in a soak (q = 0) all these are 0. In both, `soak_gradient_k` is added to
+the gradient of the first sensor and its lags. In a soak the static set applies, in a ramp the
+dynamic set. Predicted variances include neither noise nor thermometer errors.
 """
 
 from collections.abc import Callable
@@ -63,8 +63,8 @@ class SlowUncertainty:
     ) -> Floats:
         """
         Evaluate the rows of the error covariance (see `unit.covariance`) at thermal states, shape
-        (width, n). `start_shares`, (n_lags, n): `ThermalMemory.remaining_shares` of each state;
-        `start_rates`, (n,): `ThermalMemory.start_rate` of each state, by default 0.
+        (width, n). `start_shares`, (n_lags, n): share of each lag's initial state that remains;
+        `start_rates`, (n,): largest board rate since the start, if above the present rate [K/s].
         Returns `Correction.n_slow` rows: a, b, c of each axis' error variance ``v(x) = a + b x + c
         x^2`` [m^2/s^4], then the rows between axes and misalignment, then the contribution of a
         nonlinearity to the coefficients of x^2 to x^6 of each axis' variance.

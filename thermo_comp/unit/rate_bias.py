@@ -26,7 +26,7 @@ _Deviation = Annotated[float, QUANTITIES['rate deviation']]
 
 @dataclass(frozen=True)
 class RateCurve:
-    """The curve of the bias of one axis in one regime."""
+    """The bias of one axis of the gyroscope over temperature in one regime."""
 
     bias_function: Annotated[TemperatureFunction, 'Fs(t) [rad/s]; Fs(0) = 0.']
     delta: Annotated[float, 'Bias of this regime less `bias_rad_s`, at T_ref [rad/s].'] = 0.0
@@ -37,7 +37,7 @@ class RateCurve:
 
 @dataclass(frozen=True)
 class RateSet:
-    """The curves of the three axes in one regime."""
+    """The bias curves of the gyroscope's three axes in one regime."""
 
     x: RateCurve
     y: RateCurve

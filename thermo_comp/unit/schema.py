@@ -3,10 +3,10 @@
 """
 Owns the conversion of plain values to dataclasses and back: type hints are a file's schema.
 
-Hints are float, int, bool, str, Literal, tuple, dataclass, any of them or None, and
-``Annotated[hint, Bounds(...), 'what it means']``. The only conversions are integer to float and
-list to tuple. Rules between keys are checked by the dataclass, which raises a ValueError that
-starts with the key in backticks.
+Hints are float, int, bool, str, Literal, tuple, dataclass, unions of these and None, and
+``Annotated[hint, Bounds(...), 'what it means']``. The only conversions are those of a mapping to a
+dataclass, a list to a tuple and an integer to a float. Rules between keys are checked by the
+dataclass, which raises a ValueError that starts with the key in backticks.
 """
 
 import dataclasses
@@ -117,7 +117,7 @@ def _object(cls: type, data: Any, key: str) -> Any:
     if not isinstance(data, dict):
         _refuse(key, 'must be a mapping of keys', data)
     hints, required = fields_of(cls)
-    # A misspelt key is both an unknown and a missing key; the unknown key is reported.
+    # If a required key is misspelt, a key is unknown and a key is missing: report the unknown key.
     for name in data:
         if name not in hints:
             others = ', '.join(other for other in hints if other not in data)

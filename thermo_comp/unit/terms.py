@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Form(NamedTuple):
-    """A function of x and its derivative; the bits of a value depend on its x only."""
+    """A function of x and its derivative; equal x give equal bits in arrays of any length."""
 
     value: Callable[[Floats], Floats]
     slope: Callable[[Floats], Floats]
