@@ -31,6 +31,14 @@ def term(kind, x, y, z, slope=0.0):
     return NonlinearTerm(kind, (x, y, z), per_kelvin, 1e-4)
 
 
+def test_a_nonlinear_term_that_depends_on_temperature_needs_a_thermometer():
+    # WHY: with constant bias and scale, such terms were applied without a board temperature.
+    for slope in (0.0, 1e-7):
+        square = NonlinearTerm('square', (1e-5,) * 3, (0.0, 0.0, slope), 1e-4)
+        value = calibration(nonlinearity=Nonlinearity((0.0, 20.0), 1e-5, (square,)))
+        assert value.needs_temperature == bool(slope)
+
+
 SQUARE = term('square', 1e-5, -2e-5, 3e-5, 0.01)
 ODD = term('odd_square', 5e-6, -5e-6, 1e-5, 0.01)
 CUBE = term('cube', 1e-6, -1e-6, 2e-6, 0.01)

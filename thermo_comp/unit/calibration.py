@@ -300,7 +300,7 @@ class Calibration:
 
     @property
     def needs_temperature(self) -> bool:
-        """Whether curves, regimes or columns make bias, scale or the bias of the rate vary."""
+        """Whether any parameter of the correction depends on the temperature or on the regime."""
         weights: list[float] = []
         for axis in (axis for part in self.regime_sets() for axis in part.axes()):
             weights += (axis.delta, *axis.bias_function.free_coefficients)
@@ -308,6 +308,8 @@ class Calibration:
         gyroscope = self.gyroscope
         for rate in (*gyroscope.static.axes(), *gyroscope.dynamic.axes()) if gyroscope else ():
             weights += (rate.delta, *rate.bias_function.free_coefficients)
+        for term in self.nonlinearity.terms if self.nonlinearity else ():
+            weights += term.per_kelvin
         return any(weights) or bool(self.response or (gyroscope and gyroscope.response))
 
     @property
