@@ -5,7 +5,7 @@ Owns the update of a calibration from rests in the field, and its score on left-
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
 An axis is updated only if the rests reduce the sd of a combination of its bias and scale to at
-most 0.6 times the sd before the update. Other axes keep their values; their sd grows.
+most 0.6 times the sd before the update, with ageing. Other axes keep their values; their sd grows.
 """
 
 from collections.abc import Iterator, Sequence
@@ -41,7 +41,7 @@ AHEAD_DAYS = 1.0
 class AxisChange:
     """
     Changes of the bias and scale of an axis by an update, each with its posterior sd; for an axis
-    that the rests do not determine, the changes are 0 and the sds are those before the update.
+    that the rests do not determine, the changes are 0, and the sds include ageing but no rests.
 
     bias: change of the bias at the mean temperature of the rests [m/s^2]
     scale: relative change of the scale

@@ -37,7 +37,7 @@ _CLASS_K, _PERIODS = 10.0, 30
 
 @dataclass(frozen=True)
 class Row:
-    """Statistics of ``|f| - g`` over rests of a day, period or class of temperature [m/s^2]."""
+    """``|f| - g`` [m/s^2] and temperature [degC] over a day, a period or a temperature class."""
 
     name: str
     n_rests: int
@@ -66,7 +66,7 @@ class Watch:
     inside_since: first day after the last time outside the claim; None if there was no such time,
         or if the unit is outside its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
-        exceeds its claim [days]; infinite if later than ten years
+        exceeds its claim [days]; infinite if later than ten years; () if unknown or outside
     interval: the same quantiles if the calibration is updated at the last rest
     """
 

@@ -39,7 +39,7 @@ class PositionReport:
     duration_s: duration of the interval [s]
     up: estimated direction of the specific force, in the output frame
     residual_rms: RMS of ``|f| - g`` over the windows of the interval [m/s^2]
-    left_out_rms: RMS of the interval's left-out error, see `left_out_error` [m/s^2]
+    left_out_rms: RMS of ``|f| - g``, or of the drift, by a fit without the interval [m/s^2]
     """
 
     source: str

@@ -136,7 +136,7 @@ def _examine(
     by_rounding = 2.0**0.5 * rounding_sd
     lasting_sd = np.hypot(lasting_sd, by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
-    # If the noise is correlated, the scatter within a cell underestimates the noise of means.
+    # If noise is correlated, the scatter within half a second underestimates the noise of means.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = np.hypot(sd * relative_sd * _correlation(residual, sd), by_rounding)
     if r:

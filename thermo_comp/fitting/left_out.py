@@ -11,9 +11,9 @@ parameters alone, initial lag states at their prior mean, no mounting offsets an
 support. The errors are the drift (the force along each axis less its mean over the position, which
 does not depend on the attitude) and, if the other positions determine |f|, ``|f| - g``.
 
-A model is better than another model if its error is smaller by more than the standard error over
-the folds, both for positions and for sections of the program. A model that describes only one
-recording fails for positions, a model of only one chamber program fails for sections.
+Model A is better than B if the error of A is smaller by more than the standard error over the
+folds, both for positions and for sections of the program; `gain` lists exceptions. A model that
+describes only one recording fails for positions, a model of only one program fails for sections.
 
 References
 ----------
@@ -180,7 +180,9 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
     sections. If the drifts of both models are equal, the gain is the log ratio of the errors of
     left-out norms, if that exceeds two standard errors. `by_halves`: whether an increased error of
-    left-out halves of the chamber program, a sign of too many columns, excludes a gain.
+    left-out halves of the chamber program, a sign of too many columns, excludes a gain. Increased
+    errors of left-out norms exclude a gain, and so does an increased expected error of the settled
+    bias, unless noise explains the drift. A drift that noise explains need not decrease.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
@@ -314,7 +316,8 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
 def _is_determined(by_others: float, by_all: float) -> bool:
     """
     Whether `by_others`, the variance of a position's norm or drift by a fit without this position,
-    is below ten times `by_all`, that by all positions plus that of the mounting offset or noise.
+    is below ten times `by_all`, the sum of this variance by a fit of all positions and of the
+    variance of mounting offset or noise.
     """
     return by_others < 10.0 * by_all
 

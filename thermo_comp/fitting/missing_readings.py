@@ -25,7 +25,7 @@ class _Missing(NamedTuple):
 
     n_still: all samples
     n_unsettled: samples before the estimate of the board temperature is accurate
-    n_between: later samples without a temperature, between first and last readings
+    n_between: later samples without a temperature, between readings of each thermometer
     """
 
     n_still: float

@@ -167,7 +167,7 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
     """
     Find the axes that are constant throughout a rest but have noise in at least half of the rests,
-    and the axes that are constant in every rest while another axis has noise.
+    and the axes that are constant, but not always 0, in every rest while another axis has noise.
     """
     rests = [rest for bag in bags for rest in bag.intervals]
     alive = np.array([rest.sample_sd > 0.0 for rest in rests])

@@ -80,7 +80,8 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite, or whose stamps are out of order
     n_saturated: number of samples at the full scale
-    n_cells, n_still_cells: number of cells (means of half a second) in the bag, and in its rests
+    n_cells, n_still_cells: number of cells (means of half a second, or of more at a low sample
+        rate) in the bag, and in its rests
     window_s: length of a window [s]; above the requested length if the sample rate is low
     cycle_s: typical interval between samples [s]
     is_integer: whether all samples are integers
@@ -191,7 +192,8 @@ def reduce_source(
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
-    variance of a rest is also chosen so that the rests determine bias and scale best. At a low
+    variance of a rest is also chosen so that the rests determine bias and scale best. If the
+    user or the bag states |f|, the variance is not chosen, and a rest lasts 3 s or more. At a low
     sample rate a cell of the usual number of samples is so long that a drift within it looks like
     a motion, and that short rests are lost: cells of 10 or 5 samples are then tried.
     """

@@ -214,7 +214,7 @@ def thermal_windows(
 
     Windows are left out before the board's first reading, while the estimate of the board
     temperature settles, and while readings of a thermometer are missing. A bag without any
-    temperature is taken to be at the reference temperature, where all columns are 0.
+    board temperature is taken to be at the reference temperature, where all columns are 0.
 
     `tracks`: thermal states of the bags, if already computed with the detector of `model`
     """

@@ -72,7 +72,7 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """Exit code: 1 if not valid, or a gyroscope is `RECALIBRATE` or `NO_BETTER`, else 0."""
+        """1 if not valid, or if a gyroscope's verdict is `RECALIBRATE` or `NO_BETTER`, else 0."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 

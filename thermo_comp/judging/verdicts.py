@@ -71,9 +71,7 @@ class Section:
 
 
 class Sections(dict[str, Section]):
-    """
-    The sections ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside``.
-    """
+    """Sections ``static``, ``dynamic``, ``all``, inside the calibrated ranges; and ``outside``."""
 
     @property
     def regimes(self) -> list[Section]:

@@ -99,7 +99,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
 
 
 def draw_gravity(evidence: Evidence) -> Figure:
-    """Draw |f| over time, raw and corrected, and corrected in detail (the paper's Fig. 7)."""
+    """Draw |f| - g over time, raw and corrected, and corrected in detail (the paper's Fig. 7)."""
     residuals = evidence.residuals
     corrected = [name for name in residuals if name != RAW]
     sets = [forces for forces in (list(residuals), corrected) if forces]
