@@ -298,7 +298,7 @@ def _over_turn_ons(
 ) -> tuple[Floats, float]:
     """
     Return the covariance of the mixture of fits over the sd of turn-on offsets, and the mean
-    variance of a turn-on offset; arguments as in `_over_mountings`.
+    variance of a turn-on offset, for the sds `tried`, (k,), and their log prior density.
     """
     fits = [
         regression.solve(

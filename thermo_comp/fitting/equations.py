@@ -214,7 +214,7 @@ class Equations(Series):
         self, state: State, layout: Layout, base: Base, scaled: int
     ) -> tuple[Ints, Floats | float]:
         """
-        Return index and factor of the series of each active nonlinear coefficient, see `Tangent`.
+        Return index and factor (as in `Tangent`) of each active nonlinear coefficient's series.
 
         The factor 1 + S s of the scale multiplies the terms at the reference temperature. In the
         terms' change per kelvin this factor is left out, as its effect is negligible.

@@ -158,7 +158,7 @@ class Score:
 
     @property
     def excess(self) -> float:
-        """RMS of the left-out drift beyond noise and thermometer [m/s^2]; 0 if it is unknown."""
+        """RMS of the left-out drift in excess of noise and thermometer [m/s^2]; 0 if unknown."""
         square = self.rms**2 - self.noise**2 - self.by_thermometer**2
         return float(np.sqrt(square)) if square > 0.0 else 0.0
 
@@ -178,7 +178,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     Return the gain of the model of `after` over that of `before` if it is significant, else 0.
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
-    sections. If the drifts of both models are equal, the gain is the log ratio of the errors of
+    sections. If the drifts of both models agree to 5 %, the gain is the log ratio of the errors of
     left-out norms, if that exceeds two standard errors. `by_halves`: whether an increased error of
     left-out halves of the chamber program, a sign of too many columns, excludes a gain. Increased
     errors of left-out norms exclude a gain, and so does an increased expected error of the settled
@@ -218,8 +218,8 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 def is_undecided(before: Score, after: Score) -> bool:
     """
     Whether left-out data do not decide between two models, of which `after` is not better: the
-    drifts are equal, and errors of norms are not scored for both models, or are smaller in `after`
-    by one to two standard errors.
+    drifts agree to 5 %, and errors of norms are not scored for both models, or are smaller in
+    `after` by one to two standard errors.
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)

@@ -76,7 +76,7 @@ class FitOptions:
     detector: thermometer and detector settings, or None to estimate them from the bags
     min_rest_s: length of the shortest rest [s], or None for 1, 2 or 3 s, chosen by the rests
     still_sd: largest sd of the samples at rest [m/s^2]
-    allow: names of refusals that the user overrides, see `data_checks`
+    allow: names of the refusals of data, of `REFUSALS`, that the user overrides
     """
 
     gravity: float

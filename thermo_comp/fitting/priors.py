@@ -123,7 +123,7 @@ def informative_priors(
     # Stated ageing, with uncorrelated variances added: 0 to 1 times the variances of the prior.
     tried = [(grown(*stated), share, 0.0) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Ageing to try: sd of the biases [g] and of the scale factors. Both are equal, because
+        # Ageing to try: sd of the biases [g] and of the scale factors. Both sds are equal, as
         # data sheets state similar numbers for both, and few rests do not separate bias and scale.
         tried += [
             (grown(ageing * options.gravity, ageing), 0.0, ageing)

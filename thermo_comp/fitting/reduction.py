@@ -86,11 +86,11 @@ class ReducedBag:
     cycle_s: typical interval between samples [s]
     is_integer: whether all samples are integers
     middle: code at zero force if the samples are unsigned codes, else 0
-    max_abs: largest magnitude of a sample without outliers, see `_max_abs` [input units]
+    max_abs: largest magnitude of a sample, without the largest 1 % of the cells [input units]
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
     angular_rate: whether none, a part or all of the bag's samples have a finite angular rate
-    n_spikes: number of readings of each thermometer that are spikes, see `is_spike`
+    n_spikes: number of readings of each thermometer left out, 10 K from the readings about them
     n_glitches: number of single samples far from their neighbours, which are left out
     n_repeated: number of dropped samples with the same stamp as the preceding sample
     parts: the bags that were joined to this recording, see `joining`; () for a single bag

@@ -49,7 +49,7 @@ class Judgement:
     `left_out_rms` is the fit's RMS on positions left out, NaN if the bags are not those of the
     fit; `tolerance` is the user's limit on the RMS [m/s^2]. `shifts`: shift of bias and scale of
     each axis, empty with fewer than six distinct positions; `moved`: text of each significant
-    shift; `axis_rms`: see `rms_by_axis`; `rate`: judgement of the gyroscope.
+    shift; `axis_rms`: RMS drift by regime and axis; `rate`: judgement of the gyroscope.
     """
 
     kind: Verdict
