@@ -119,8 +119,8 @@ def _better(fit: Fit | None, other: Fit) -> Fit:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the chosen model has two sets, or a model with two sets has a score within one standard
-    error of the chosen model's and, on each axis, less than 80 % of the chosen model's noise.
+    Whether the chosen model has two sets, or a model with two sets is at most one standard error
+    worse than the chosen model and, on each axis, has less than 80 % of the chosen model's noise.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma

@@ -4,10 +4,10 @@
 Owns the estimation of prior sd and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
-scale, found by MacKay's fixed point [1]_ with a log-normal hyperprior. The mode of log evidence
-plus log hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w
-being the weights of the column on the three axes, sd0 and tau^2 centre and variance of the
-hyperprior of log sd. The sd of a column about which the data have no information stays at sd0.
+scale. If not fixed, both follow from MacKay's fixed point [1]_ with a log-normal hyperprior of the
+sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
+satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
+the column on the three axes. If the data do not inform about a column, the sd stays at sd0.
 
 References
 ----------

@@ -42,7 +42,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
 
 
 def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
-    """Whether a bag is the part of a recording that follows `part`."""
+    """Whether a bag, by its stamps, sample interval and serial, continues `part`."""
     gap_s = 1e-9 * (bag.start_ns - part.end_ns)
     is_alike = _is_alike(part.cycle_s, bag.cycle_s)
     # A bag with known |f| is not joined, because times of |f| count from the start of the bag.

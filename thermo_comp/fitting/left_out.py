@@ -153,7 +153,7 @@ class Score:
 
     @property
     def exceeds_noise(self) -> bool:
-        """Whether neither noise nor errors of a coarse thermometer explain the left-out drift."""
+        """Whether noise plus errors of a coarse thermometer do not explain the left-out drift."""
         return self.rms > _NOISE_RATIO * float(np.hypot(self.noise, self.by_thermometer))
 
     @property

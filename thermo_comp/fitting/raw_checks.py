@@ -35,7 +35,7 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
-    """Check the raw data: saturation, motion, values that are not counts, jumps, angular rate."""
+    """Check the raw data: samples, motion, dead axes, thermometers, units, jumps, angular rate."""
 
     def total(name: str) -> int:
         return sum(getattr(bag, name) for bag in bags)

@@ -44,7 +44,7 @@ class Trial:
     score: left-out errors of the model
     posterior: fit of the model
     typical: typical prior sd of the model's columns, shape (2, m)
-    is_near: whether the score is within one standard error of that of the chosen model
+    is_near: whether the score is at most one standard error worse than that of the chosen model
     """
 
     groups: tuple[str, ...]
@@ -338,7 +338,7 @@ def _grown(
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, and the models within one standard error of its score."""
+    """Mark the chosen model, and those at most one standard error worse than this model."""
     marked = []
     for trial in trials:
         is_chosen = trial.groups == chosen.groups

@@ -39,7 +39,7 @@ PART_SUMS = ('board', 'product', 'square')
 #: Groups of columns linear in a difference of temperatures; groups of the products of such a
 #: difference with temperature, and of its squares.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
-#: Smallest number of windows into which a rest is divided, to determine the noise of the rest.
+#: Number of windows into which a short rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20
 # Number of temperatures at which the columns are evaluated for settled lags, see `_settled`.
 _N_SETTLED = 9
