@@ -293,7 +293,7 @@ def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
 
 
 def refuse_another_unit(result: Update) -> None:
-    """Raise FitError if the RMS of |f| - g in a start exceeds both limits, `_LARGEST_...`."""
+    """Raise FitError if a start's RMS of |f| - g exceeds 1 mg and 30 claimed sds."""
     series = result.series
     residual = series.residual - _gravity_part(series, result.solution)
     rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))

@@ -163,7 +163,7 @@ def _valid_columns(
 
 
 def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
-    """Return the response columns that a mask selects directly or by their sums, `part_curves`."""
+    """Return the response columns that a mask selects, directly or in a sum of `part_curves`."""
     sums, n_curves = windows.model.part_curves.sums, len(windows.model.sets.groups)
     contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
     return [int(k) for k in np.flatnonzero(contained[n_curves:])]

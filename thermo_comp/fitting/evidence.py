@@ -132,7 +132,7 @@ def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str,
 
 
 def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[PositionReport, ...]:
-    """Return a report for each position; `residual`, `left_out`: of windows (`residual_rows`)."""
+    """Return a report for each position, from the residuals of `residual_rows`, shape (n,)."""
     windows, state = fit.windows, fit.posterior.state
     result = []
     for number, (bag, interval) in enumerate(windows.rests):

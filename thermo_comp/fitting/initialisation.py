@@ -94,7 +94,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
-    # With a prior calibration, drifts in a single attitude separate bias and scale factor.
+    # With a prior calibration, drifts in one attitude separate bias and scale: assume no bench.
     is_bench = known is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
@@ -207,7 +207,7 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     Return the prior with a smaller misalignment sd if a noisy sensor has only positions near its
     six faces. Faces hardly determine misalignments, and misalignments of some degrees would, to
-    second order, explain other errors of |f|. The published covariance keeps the sd of `prior`.
+    second order, explain any errors of |f|. The published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Smaller sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.

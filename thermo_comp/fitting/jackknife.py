@@ -53,7 +53,7 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
 
     `change`: change of the unknowns, shape (n,), and `remaining`: root of the information of the
     remaining windows, ``remaining.T @ remaining``, shape (n, n), both scaled so that the
-    covariance of the fit of all windows is 1
+    covariance of the fit of all windows is the unit matrix
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
     # Use combinations about which the left-out windows have more than 1e-6 of the information.

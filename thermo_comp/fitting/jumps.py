@@ -81,7 +81,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     rounding_sd = np.median([interval.rounding_sd for interval in bag.intervals], axis=0)
     quiet_sd = np.maximum(quiet_sd, np.maximum(rounding_sd, 1e-9))
     beside = _beside_gaps(bag, gaps, [margin_s] * len(gaps))
-    # If the noise is correlated, the mean level before and after a gap needs more samples.
+    # Correlated noise needs more samples than white noise for a mean level beside a gap.
     margins = [max(_margin(part, quiet_sd), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)

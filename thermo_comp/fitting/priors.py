@@ -67,7 +67,7 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def offset_sd_of(calibration: Calibration) -> float:
-    """Return the sd of the bias offset of a mounting or turn-on, on the best axis [m/s^2]."""
+    """Return the smallest sd of any axis of a mounting's or turn-on's bias offset [m/s^2]."""
     axes = [axis for part in calibration.regime_sets() for axis in part.axes()]
     return min(axis.residual_sd_m_s2 for axis in axes)
 

@@ -19,7 +19,7 @@ from .evidence import LEFT_OUT, RAW, Evidence, Position, required
 from .html import number
 from .trace import ShownBag
 
-# Time at the start of a position whose mean reading counts as zero drift [s].
+# Length of the part at the start of a position whose mean reading counts as zero drift [s].
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
