@@ -363,7 +363,7 @@ def change_texts(result: Update) -> list[str]:
             lines.append('the slopes of the bias over temperature have changed, not only the bias')
         elif change.kind == 'levels':
             day = np.datetime64(int(change.time * 86400.0), 's')
-            text = f'the bias jumped before {day}: a shock, not ageing'
+            text = f'bias and scale jumped before {day}: a shock, not ageing'
             if change.may_be_gravity:
                 text += (
                     '; or gravity changed, which rests in these attitudes do not distinguish from '
@@ -381,6 +381,7 @@ def change_texts(result: Update) -> list[str]:
         )
     if result.n_outliers:
         lines.append(
-            f'{counted(result.n_outliers, "rest")} left out: more than 5 sd from the prediction'
+            f'{counted(result.n_outliers, "rest")} left out: at a start of the node with |f| - g '
+            'more than 5 sd from the prediction by all other rests'
         )
     return lines

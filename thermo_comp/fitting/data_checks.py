@@ -370,7 +370,7 @@ def judge_result(
         )
         yield advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
-        why = 'the positions predict a left-out position badly; record more positions'
+        why = 'the other positions predict a left-out position badly; record more positions'
         yield advice('left out', f'{text}: left-out residuals exceed the raw residual: {why}')
     else:
         yield Finding('residual', 'good', text)
@@ -385,7 +385,7 @@ def judge_result(
             'a static and a dynamic set fitted without the prior'
         )
     elif is_changed:
-        contradiction = 'the parameters differ from those of the prior by far more than its sd'
+        contradiction = 'the parameters differ from the prior by far more than the prior sd'
     if contradiction:
         yield advice(
             'prior',

@@ -118,7 +118,7 @@ def fit_bags(
             raise FitError(
                 'the bags do not determine the fit: its equations have no solution in double '
                 'precision. Record rests of ten minutes or longer; bags that update a '
-                'prior calibration can be fitted together with its bags'
+                'prior calibration can be fitted together with the bags of the prior'
             ) from error
 
 
@@ -329,7 +329,7 @@ def _fit(
         if known is not None or not is_beyond(fit.windows):
             calibration, rates = add_gyroscope(calibration, fit.windows, bags, options)
         elif fit.windows.angular_rate.shape[1]:
-            text = 'the unit rotated in some rests, so the bias of the gyroscope was not fitted'
+            text = 'the stated |f| differs between rests: no bias of the gyroscope was fitted'
             findings.append(Finding('rate', 'advice', text))
     except ValueError as error:
         raise _unusable(error, fit.posterior.state.up) from error
