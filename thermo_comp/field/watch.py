@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the drift watch: the comparison of ``|f| - g`` in a rest log with the claimed sd, a forecast.
+Owns the drift watch: comparison of ``|f| - g`` in a rest log with the claimed sd, and a forecast.
 
 A unit is within its claim while the RMS of its errors along gravity, over attitudes and starts, is
 at most `LIMIT` times the sd that its calibration claims for these errors. The verdict follows from

@@ -339,7 +339,7 @@ def judge_result(
     """
     Check the residuals of a fit.
 
-    K: scale factors; rows: residuals of the axes and, last, overall
+    K: scale factors; rows: residuals by regime and, last, of all windows
     slow: sd of the bias offset of a mounting or turn-on [m/s^2]
     span: span of the board temperature [K]
     drift: RMS of ``|f| - g`` about the means of the positions [m/s^2]

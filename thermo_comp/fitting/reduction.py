@@ -90,7 +90,7 @@ class ReducedBag:
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
     angular_rate: whether none, a part or all of the bag's samples have a finite angular rate
-    n_spikes: number of readings of each thermometer left out, 10 K from the readings about them
+    n_spikes: number of readings of each thermometer left out, over 10 K from those about them
     n_glitches: number of single samples far from their neighbours, which are left out
     n_repeated: number of dropped samples with the same stamp as the preceding sample
     parts: the bags that were joined to this recording, see `joining`; () for a single bag

@@ -74,7 +74,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of static and dynamic curve; a shared dynamic curve gets the higher order."""
+        """Families of both curves; a shared dynamic curve has the higher of both orders."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
