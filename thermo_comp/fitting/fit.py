@@ -401,7 +401,7 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale == COUNTS_FULL_SCALE:
         full_scale = widened(full_scale, np.array([[largest]]))
     if full_scale is None:
-        # The smallest of the usual full scales that exceeds the largest sample by 10 %.
+        # The smallest usual full scale 10 % above the largest sample, else twice this sample.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))
