@@ -129,7 +129,7 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
     assert later.axes == alone.axes
     for unit in (joint, later):
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
-        assert 'took no part' in note
+        assert 'did not use these data' in note
         # The slope of bag r4 above the knee is greater than that of the others by 100 ug/K on x
         # and y and 50 ug/K on z; the board is up to 11 K above the knee: an error up to 1.1 mg.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2

@@ -78,7 +78,7 @@ def test_a_complete_thermal_test_gives_only_good_findings(good):
         ('temperature', lambda w: {'temperature': 0.0 * w.temperature + 20.0},
          'no thermometer: the calibration holds at the temperature of the test'),
         ('ramps', lambda w: {'rate': 0.0 * w.rate}, 'no ramp'),
-        ('directions', lambda w: {'rate': np.abs(w.rate)}, 'only heating was recorded'),
+        ('directions', lambda w: {'rate': np.abs(w.rate)}, 'hardly any cooling was recorded'),
         ('soak', lambda w: {'weight': 0.0 * w.weight + 1.0}, 'only 0 % of the windows are static'),
         # WHY: with soaks at a single temperature the error was 800 ug, the claimed sd 100 ug.
         ('soak', lambda w: {'weight': 1.0 * (np.abs(w.temperature - 20.0) > 3.0)},

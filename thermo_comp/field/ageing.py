@@ -10,9 +10,9 @@ calibration, o_k is the bias offset of start k, l_k are the unknown lag states a
 the lack of fit of the calibration, e_i is independent noise. The matrices H_i, B_i, S_i and L_i
 are derivatives of ``|f|``. The slopes of the bias over temperature are random walks of a fixed sd
 per root day. Jumps of the levels (bias and scale of each axis) or of gravity, and a change of the
-slope of the bias over temperature, are added one at a time while the log Bayes factor of the next
-change is at least 5. The variances of random walks, offsets, lag states and scatter maximise the
-marginal likelihood times wide priors.
+slope of the bias over temperature, are added one at a time, up to four, while the log Bayes factor
+of the next change is at least 5. The variances of random walks, offsets, lag states and scatter
+maximise the marginal likelihood times wide priors.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class Rows:
     Equations of the rests in the order of the node's starts, at most `_ROWS` per start: orthogonal
     combinations of the rests of a start, with all information of the rests about the six levels.
 
-    y: combination of the values ``|f| - g`` of the rests [m/s^2]; `by_...`, lack: see `RestSeries`
+    y, `by_...`, lack: combinations of ``|f| - g`` [m/s^2] and of the fields of `RestSeries`
     noise, scatter: variance of the noise of a row, and factor of the scatter variance in a row
     rank: number of the row among the rows of its start, from 0
     warmth: mean board temperature at the rests of a start less the reference temperature [K]
@@ -280,7 +280,7 @@ def learn(
 
     At most four changes are added, each with a log Bayes factor of at least `_LEAST_GAIN`. A start
     of the node is left out if an equation of its rests (a row) is more than 5 sd from the
-    prediction by all other rows. Returns the model's sds, the model with all rows, the rests used.
+    prediction by all other rows. Returns the sds, the model of the used rests, and these rests.
     """
     centre = usual(calibration)
     is_used = np.ones(len(series), dtype=np.bool_)
@@ -310,7 +310,10 @@ def learn(
 
 
 def _best(candidates: Iterable[Change], is_gravity_certain: bool) -> Change | None:
-    """Return the most probable change, or None if all log Bayes factors are too small."""
+    """
+    Return the most probable change, or None if no log Bayes factor reaches `_LEAST_GAIN`. That of
+    a jump of gravity must also exceed those of all other changes by `_LEAST_LEAD`.
+    """
     best: dict[str, Change] = {}
     for change in candidates:
         if change.log_bayes_factor > _gain(best.get(change.kind)):
@@ -331,9 +334,7 @@ def _gain(change: Change | None) -> float:
 
 
 def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
-    """
-    Yield jumps before each start, and a change of the bias slopes, with their log Bayes factors.
-    """
+    """Yield jumps before each start and a change of the bias slopes, with log Bayes factors."""
     rows = model.rows
     alpha, by_jump = inverse @ rows.y, rows.by_jump
     _, first = np.unique(rows.start, return_index=True)

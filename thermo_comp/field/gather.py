@@ -5,10 +5,10 @@ Owns the detection of rests in a stream of samples: windows of 10 s without moti
 
 Samples are summed by whole seconds of their stamps. A cell is the smallest number of seconds with
 at least five samples, which is one second at 5 Hz or more. A cell is still if its standard
-deviation is that of the noise, and its mean agrees with the means of the preceding cell and of the
-first cell of the window. Successive still cells that span 10 s form a window. In a long rest all
-windows of the first ten minutes are kept, then one window per minute up to an hour, then one
-window per five minutes.
+deviation is above 0 and below `SCATTER_FACTOR` times that of the noise, and its mean agrees with
+those of the preceding cell and of the first cell of the window. Successive still cells that span
+10 s form a window. In a long rest all windows of the first ten minutes are kept, then one window
+per minute up to an hour, then one per five minutes.
 """
 
 from collections.abc import Callable, Sequence
@@ -73,9 +73,7 @@ class RestFinder:
         self._last: list[_Cell] = []  # sums of the last cell of the previous window
 
     def add(self, stamps: Stamps, samples: Floats) -> list[Rest]:
-        """
-        Add samples with rising stamps, (n, 3), or (n, 6) with angular rates; return new rests.
-        """
+        """Add samples of rising stamps, (n, 3) or, with angular rates, (n, 6); return rests."""
         rests: list[Rest] = []
         seconds = stamps // _SECOND_NS
         cuts = np.flatnonzero(np.diff(seconds)) + 1

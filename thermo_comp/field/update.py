@@ -5,7 +5,7 @@ Owns the update of a calibration from rests in the field, and its score on left-
 
 A rest determines the error along gravity alone, so rests in few attitudes leave axes undetermined.
 An axis is updated only if the rests reduce the sd of a combination of its bias and scale to at
-most 0.6 times the sd before the update. Other axes keep their values; their sd grows.
+most 0.6 times the sd before the update, with ageing. Other axes keep their values; their sd grows.
 """
 
 from collections.abc import Iterator, Sequence
@@ -41,7 +41,7 @@ AHEAD_DAYS = 1.0
 class AxisChange:
     """
     Changes of the bias and scale of an axis by an update, each with its posterior sd; for an axis
-    that the rests do not determine, the changes are 0 and the sds are those before the update.
+    that the rests do not determine, the changes are 0, and the sds include ageing but no rests.
 
     bias: change of the bias at the mean temperature of the rests [m/s^2]
     scale: relative change of the scale
@@ -293,7 +293,7 @@ def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
 
 
 def refuse_another_unit(result: Update) -> None:
-    """Raise FitError if the RMS of |f| - g in a start exceeds both limits, `_LARGEST_...`."""
+    """Raise FitError if a start's RMS of |f| - g exceeds 1 mg and 30 claimed sds."""
     series = result.series
     residual = series.residual - _gravity_part(series, result.solution)
     rms, claim = (np.sqrt(means_by(series.start, part**2)) for part in (residual, series.claim))
@@ -363,7 +363,7 @@ def change_texts(result: Update) -> list[str]:
             lines.append('the slopes of the bias over temperature have changed, not only the bias')
         elif change.kind == 'levels':
             day = np.datetime64(int(change.time * 86400.0), 's')
-            text = f'the bias jumped before {day}: a shock, not ageing'
+            text = f'bias and scale jumped before {day}: a shock, not ageing'
             if change.may_be_gravity:
                 text += (
                     '; or gravity changed, which rests in these attitudes do not distinguish from '
@@ -381,6 +381,7 @@ def change_texts(result: Update) -> list[str]:
         )
     if result.n_outliers:
         lines.append(
-            f'{counted(result.n_outliers, "rest")} left out: more than 5 sd from the prediction'
+            f'{counted(result.n_outliers, "rest")} left out: at a start of the node with |f| - g '
+            'more than 5 sd from the prediction by all other rests'
         )
     return lines

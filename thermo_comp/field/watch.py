@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the drift watch: the comparison of ``|f| - g`` in a rest log with the claimed sd, a forecast.
+Owns the drift watch: comparison of ``|f| - g`` in a rest log with the claimed sd, and a forecast.
 
 A unit is within its claim while the RMS of its errors along gravity, over attitudes and starts, is
 at most `LIMIT` times the sd that its calibration claims for these errors. The verdict follows from
@@ -37,7 +37,7 @@ _CLASS_K, _PERIODS = 10.0, 30
 
 @dataclass(frozen=True)
 class Row:
-    """Statistics of ``|f| - g`` over rests of a day, period or class of temperature [m/s^2]."""
+    """``|f| - g`` [m/s^2] and temperature [degC] over a day, a period or a temperature class."""
 
     name: str
     n_rests: int
@@ -66,7 +66,7 @@ class Watch:
     inside_since: first day after the last time outside the claim; None if there was no such time,
         or if the unit is outside its claim
     forecast: quantiles (10, 50, 90 %) of the time from the last rest until the unit's error
-        exceeds its claim [days]; infinite if later than ten years
+        exceeds its claim [days]; infinite if later than ten years; () if unknown or outside
     interval: the same quantiles if the calibration is updated at the last rest
     """
 

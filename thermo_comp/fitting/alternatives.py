@@ -28,8 +28,8 @@ def model_of(
     bags: Sequence[ReducedBag], options: FitOptions, parts: tuple[Part, Part, Part] | None = None
 ) -> Model:
     """
-    Return the model of the prior or, without a prior, a model of all columns for which the bags
-    have thermometers.
+    Return the model of the prior or, without a prior, the model of `options` with all its columns
+    for which the bags have thermometers.
 
     `parts`: the lag of each axis, or None for the bank of time constants
     """
@@ -73,7 +73,7 @@ def regressed(windows: ThermalWindows, problem: Problem) -> Fit:
     closed = replace(model, detector=replace(model.detector, end_condition='case'))
     undisturbed = fit.windows.data.undisturbed
     early = regress(windows_of(bags, closed, options, undisturbed=undisturbed), problem)
-    # Errors of left-out halves limit the number of columns, which is equal for both detectors.
+    # Errors of left-out halves serve to limit the number of columns, not to compare detectors.
     return early if is_better(fit.selected.score, early.selected.score, by_halves=False) else fit
 
 
@@ -85,9 +85,10 @@ def windows_of(
     undisturbed: Floats | None = None,
 ) -> ThermalWindows:
     """
-    Return the windows of bags, with the known |f| of each position.
+    Return the windows of bags, with the stated |f| of the positions if not all are at 1 g.
 
-    `tracks`: thermal states of the bags, if computed before; `undisturbed`: see `Windows`
+    `tracks`: thermal states of the bags, if computed before; `undisturbed`: factors of the weights
+    of the windows, or None if the fit estimates these factors
     """
     windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
@@ -95,9 +96,9 @@ def windows_of(
 
 def _with_lags(windows: ThermalWindows, problem: Problem) -> Fit:
     """
-    Fit the windows with one lag per axis, see `find_parts`; or with a bank of time constants, if
-    no lags are found, or if all lags found leave a left-out drift above `Parts.most_drift` and the
-    fit with the bank is better.
+    Fit the windows with one lag per axis (`find_parts`); or with the columns of `windows`, if no
+    lags are found (with a prior, and for Golovach's model, none are sought), or if all lags found
+    leave a left-out drift above `Parts.most_drift` and the fit without these lags is better.
     """
     bags, options = problem.bags, problem.options
     is_free = options.prior is None and options.model != 'golovach'
@@ -118,8 +119,8 @@ def _better(fit: Fit | None, other: Fit) -> Fit:
 
 def _may_have_sets(selected: Selected) -> bool:
     """
-    Whether the chosen model has two sets, or a model with two sets has a score within one standard
-    error of the chosen model's and, on each axis, less than 80 % of the chosen model's noise.
+    Whether the chosen model has two sets, or a model with two sets is at most one standard error
+    worse than the chosen model and, on each axis, has less than 80 % of the chosen model's noise.
     """
     chosen = next(trial for trial in selected.trials if trial.is_chosen)
     limit = 0.8 * chosen.posterior.prior.sigma
@@ -131,7 +132,7 @@ def _may_have_sets(selected: Selected) -> bool:
 
 
 def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Return the case, then all other thermometers that every bag has, except the board."""
+    """Return 'case', recorded or not, then all thermometers of every bag but board and case."""
     recorded = (
         {name for name, readings in bag.temperatures.items() if len(readings.value)}
         for bag in bags

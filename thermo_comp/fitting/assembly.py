@@ -60,10 +60,10 @@ def build_calibration(
     known: Calibration | None = None,
     nonlinearity: Nonlinearity | None = None,
 ) -> Calibration:
-    """Make a calibration from a fit; its valid ranges include those of the prior, `known`."""
+    """Make a fit's calibration, with valid ranges that include those of the prior `known`."""
     (windows, regression, *_), posterior = fit, fit.posterior
     model, prior, state, layout = windows.model, posterior.prior, posterior.state, claim.layout
-    # Response columns with a weight, or with a variance and zero weight.
+    # Response columns in the covariance, with a weight or with zero weight.
     used = _of_columns(windows, np.any(layout.weights[:, 0] >= 0, axis=0))
     kinds = tuple(term.kind for term in nonlinearity.terms) if nonlinearity else ()
     to_file = file_jacobian(regression, layout, state, model, used, kinds)
@@ -106,7 +106,7 @@ def build_calibration(
 
 
 def _regime_sets(fit: Fit, claim: Claim, known: Calibration | None) -> list[RegimeSet]:
-    """Return the static and the dynamic set with valid ranges, and with all coefficients 0."""
+    """Return the static and the dynamic set with valid ranges, and all free coefficients 0."""
     windows, prior = fit.windows, fit.posterior.prior
     temperatures = temperature_range(windows)
     rates = valid_range(windows.rate * 60.0, 0.01 if windows.was_measured else 3.0, order=1)
@@ -163,7 +163,7 @@ def _valid_columns(
 
 
 def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
-    """Return the response columns that a mask selects, itself or as a sum (`part_curves`)."""
+    """Return the response columns that a mask selects, directly or in a sum of `part_curves`."""
     sums, n_curves = windows.model.part_curves.sums, len(windows.model.sets.groups)
     contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
     return [int(k) for k in np.flatnonzero(contained[n_curves:])]
@@ -238,7 +238,7 @@ def with_parameters(
     calibration: Calibration, scale_factor: Floats, values: Floats, covariance: Floats
 ) -> Calibration:
     """
-    Replace K and the parameters of a calibration.
+    Replace the scale factors and the parameters of a calibration.
 
     `values`: parameters in the order of the posterior; the levels of the scale are not used
     """

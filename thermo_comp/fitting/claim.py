@@ -4,11 +4,12 @@
 Owns the published uncertainty: the covariance of the fit, increased for columns that the data do
 not determine, and for effects that the model lacks.
 
-The standard deviation of mounting and turn-on offsets is marginalised: the covariance is that of a
-mixture of fits on a grid of this standard deviation. The weight of a fit in the mixture is its
-evidence, limited by the evidence of the positions' norms, times a half-Student prior of the offset
-sd. The covariance includes the sd of local gravity, whose error changes all scale factors by the
-same ratio. `jackknife` adds the variance due to effects that the model lacks.
+The standard deviation of mounting and turn-on offsets, unless the user states it, is marginalised:
+the covariance is that of a mixture of fits on a grid of this standard deviation. The weight of a
+fit is the fit's evidence, limited by the evidence of the positions' norms, times a prior of the
+offset sd (half-Student [1]_ without a prior calibration). An error of local gravity, included in
+the covariance, changes all scale factors by the same ratio. `jackknife` adds variance for effects
+that the model lacks.
 
 References
 ----------
@@ -76,8 +77,8 @@ def claim_of(
     the data do not determine are added to the covariance; `gravity_sd`: sd of local gravity
     [m/s^2]; `known_offset_sd`: sd of mounting and turn-on offsets by a prior calibration, or 0
     [m/s^2]; `informative`: priors from one calibration, for several amounts of ageing;
-    `of_means`: see `Fit`; `lacks_effects`: whether noise does not explain the left-out drift, see
-    `Selected` and `jackknife`
+    `of_means`: state of a fit to the positions' means, or None; `lacks_effects`: whether noise
+    does not explain the left-out drift, so that `jackknife` adds variance
     """
     # All rests of a mounting share an offset, but the regression has an offset for each rest: with
     # `n_rests` times the variance, the mean over a mounting's rests has the offset's variance.
@@ -115,8 +116,8 @@ def _over_offsets(
     """
     Return the covariance of the unit's unknowns by the mixtures over the sd of the offsets of
     mountings and turn-ons, the sd of the offset of a new mounting after a new turn-on [m/s^2], and
-    the variance of the turn-on offset if all bags have one turn-on, else 0: the regression has no
-    unknown for this offset.
+    the variance to add for the bias offset of a turn-on that all bags share, else 0: the
+    regression has no unknown for this offset.
 
     `offset_sd`: sd of a mounting's offset; `known_sd`: offset sd of a prior calibration [m/s^2]
     """
@@ -125,7 +126,7 @@ def _over_offsets(
     is_single = windows.n_turn_ons == 1 < n_mountings
     if scale <= 0.0:
         # A stated offset sd also holds for the turn-on. The regression's offsets of m mountings
-        # have a mean with 1 / m of this variance, so 1 - 1 / m of it is added for one turn-on.
+        # have a mean with 1 / m of the variance; 1 - 1 / m of the variance is added.
         variance = offset_sd**2 * (1.0 - 1.0 / n_mountings) if is_single else 0.0
         return posterior.covariance, offset_sd, variance
     kind = 'mounting' if is_single or windows.has_turn_ons else 'both'
@@ -138,7 +139,7 @@ def _over_offsets(
         return covariance, float(np.hypot(offset_sd, variance**0.5)), 0.0
     if not (is_single and regression.gravity):
         return covariance, offset_sd, 0.0
-    # Bags of one turn-on do not show how well turn-ons repeat: use the prior of their sd.
+    # Bags of one turn-on do not show the sd of the bias over turn-ons: use the prior of this sd.
     values, log_density = _offsets_tried(scale, known_sd, 'turn-on')
     variance = float(np.average(values**2, weights=np.exp(log_density)))
     return covariance, float(np.hypot(offset_sd, variance**0.5)), variance
@@ -149,15 +150,15 @@ def _offsets_tried(scale: float, known_sd: float, kind: str) -> tuple[Floats, Fl
     Return the values to try for the sd of the offsets of mountings or turn-ons [m/s^2], and the
     log prior density of the logarithm of this sd at these values.
 
-    `scale`: `Prior.offset_scale`, 3 times the noise in 1 Hz; `known_sd`: offset sd by a prior
-    calibration, 0 without one; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
+    `scale`: `Prior.offset_scale` [m/s^2]; `known_sd`: offset sd by a prior calibration [m/s^2],
+    0 without a prior calibration; `kind`: kind of the offsets, a key of `LARGEST_USUAL`
     """
     if known_sd:
         # A test of 12 positions determines the sd of mounting offsets within a factor of 1.5.
         ratio = 10.0 ** np.arange(-1.5, 1.51, 0.125)
         return known_sd * ratio, log_student(np.log(ratio) / np.log(1.5))
-    # `least`: smallest usual sd, relative to `scale`. By data sheets, the bias of navigation grade
-    # repeats to some 10 ug over turn-ons at best; over mountings within one turn-on, to less.
+    # `least`: smallest usual sd, relative to `scale`. By data sheets, the bias of navigation-grade
+    # triads repeats to 10 ug over turn-ons at best; over mountings within one turn-on, to less.
     least = 0.01 if kind == 'mounting' else min(1e-4 / scale, 1.0)
     # The log evidence is smooth over the grid's step, a third of a decade of the sd.
     ratio = 10.0 ** np.linspace(-3.45, 2.25, 19)
@@ -216,14 +217,15 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
 
     The weight of an inactive column is consistent with 0, but the data bound it only to ``1 /
     sqrt(S)``, S being the information about the weight given the active columns. A column whose
-    bound exceeds two sd of a window's noise enters the covariance with the bound as sd, and zero
-    weight; for this test the bound of an almost constant column is scaled to the RMS of t [K].
+    bound exceeds two sd of a window's noise enters the covariance with zero weight, and with
+    the bound, or its prior sd if smaller, as sd. In this comparison the bound of a nearly constant
+    column is scaled to the RMS of t [K].
     """
     groups, prior = np.array(regression.windows.groups), posterior.prior
     kelvins = regression.windows.kelvins
     active = groups[prior.column_sd.any(axis=0)]
     # The columns considered are lags, curves (few temperatures do not determine all powers), and
-    # columns active in bias or scale (one attitude does not separate their drifts).
+    # columns active in bias or scale (one attitude does not separate drifts of bias and scale).
     curves = [PART if PART in active else CURVE]
     may = np.isin(groups, [*LAGS, *curves]) | prior.column_sd.any(axis=0)
     inactive = regression.inactive(posterior, may & typical.any(axis=0))
@@ -278,7 +280,7 @@ def _over_mountings(
 
     fits = solved(tried)
     # With a large mounting sd the attitudes absorb errors of the model, which increases the log
-    # evidence. The increase from the mode is limited to that by the norms plus `CLEAR_GAIN`.
+    # evidence; at most the increase of the norms' log evidence plus `CLEAR_GAIN` counts.
     of_data = np.array([fit.log_evidence for fit in fits])
     of_norms = _norm_evidence(regression, posterior, tried, fits[-1].root)
     nearest = int(np.argmin(np.abs(np.log(tried * n_rests**0.5 / prior.offset_sd))))
@@ -296,7 +298,7 @@ def _over_turn_ons(
 ) -> tuple[Floats, float]:
     """
     Return the covariance of the mixture of fits over the sd of turn-on offsets, and the mean
-    variance of a turn-on offset; arguments as in `_over_mountings`.
+    variance of a turn-on offset, for the sds `tried`, (k,), and their log prior density.
     """
     fits = [
         regression.solve(
@@ -347,7 +349,7 @@ def _excess_over_priors(
 
 
 def _excess(covariance: Floats, other: Floats) -> Floats:
-    """Scale ``covariance - other`` by the sds of `other`; set negative eigenvalues to 0."""
+    """Return ``covariance - other``, with negative eigenvalues, in sds of `other`, set to 0."""
     sd = np.sqrt(np.diag(other))
     values, vectors = np.linalg.eigh((covariance - other) / np.outer(sd, sd))
     root = sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
@@ -368,7 +370,7 @@ def _norm_evidence(
     regression: Regression, posterior: PosteriorMode, offset_sd: Floats, by_drifts: Floats
 ) -> Floats:
     """
-    Return the log evidence of the mountings' mean norms for k sds of mounting offsets, shape (k,).
+    Return the log evidence, up to a constant, of mountings' mean norms for k offset sds, (k,).
 
     `by_drifts`: root of the unit's covariance at the largest offset sd, at which drifts alone
     determine the thermal weights; only the rows of these weights are used

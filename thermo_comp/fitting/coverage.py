@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the covariance of a triad's constants after a test, and the choice of its next position.
+Owns the covariance of a triad's constants after a test, and the choice of a further position.
 
 At rest |f| = g is known, so each position gives one equation for the nine constants of a triad:
 bias x y z [g], relative scale x y z, elements yx zx zy of M [rad], in this order. The equations
@@ -83,7 +83,7 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
 
 
 def farthest(up: Floats) -> tuple[Floats, float]:
-    """Return the direction farthest from its nearest vector in `up`, (n, 3); the angle [deg]."""
+    """Return the direction farthest from its nearest vector in `up`, (n, 3); their angle [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
     return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
@@ -107,18 +107,18 @@ def directions(means: Floats, centre: Floats) -> Floats:
 
 def rough_centre(means: Floats) -> Floats:
     """
-    Return the reading at zero force: 0 if the norms agree, else the centre of a fitted sphere.
+    Return the reading at zero force: 0, or the centre of a fitted sphere if the norms differ.
 
     In offset binary codes the angle between two readings is meaningful only after the code at zero
     force is subtracted. `means`: mean readings, shape (n, 3). The result is 0 for fewer than four
-    readings, for readings in a plane, and for readings in almost one attitude.
+    readings, readings in a plane or almost one attitude, and an implausible sphere.
     """
     zero = np.zeros(3)
     if len(means) < 4:
         return zero
     arms = means - means.mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-    # The origin is the centre if the norms' sd is below 30 % of the RMS distance from the mean.
+    # The origin is the centre if the norms scatter (sd) by less than 30 % of the readings' spread.
     if np.std(np.linalg.norm(means, axis=1)) < 0.3 * spread:
         return zero
     values = np.linalg.eigvalsh(arms.T @ arms)
@@ -134,16 +134,16 @@ def rough_centre(means: Floats) -> Floats:
     # the RMS distance of the readings from their mean is at least half of the radius (it is 1
     # radius for six faces, and 0.1 radius for readings within 6 degrees).
     is_sphere = np.std(radii) < 0.1 * np.mean(radii) < 0.2 * spread
-    # A sphere exists through any four readings. Only the centre of a true sphere has similar
-    # coordinates: the outputs at zero force of the axes of an analog sensor are within 20 % of
-    # their mean (ADXL335 data sheet, 1.2 to 1.8 V).
+    # A sphere exists through any four readings, so the coordinates of the centre must also be
+    # similar: the outputs at zero force of the axes of an analog sensor are within 20 % of their
+    # mean (ADXL335 data sheet, 1.2 to 1.8 V).
     centre = means.mean(axis=0) + centre
     is_common = np.ptp(centre) < 0.4 * abs(centre.mean())
     return np.asarray(centre) if is_sphere and is_common else zero
 
 
 def geometry(up: Floats, with_misalignment: bool) -> float:
-    """Return the ratio of the largest sd of a constant to the noise sd of |f|; `up`: (n, 3)."""
+    """Return the ratio of the largest sd of a constant to the noise sd of |f|, inf if unknown."""
     jacobian = norm_columns(up)[:, : 9 if with_misalignment else 6]
     values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     if values[0] < 1e-9 * values[-1]:

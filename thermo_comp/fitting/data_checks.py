@@ -3,8 +3,8 @@
 """
 Owns the checks of the windows of a fit, and of the fitted calibration, with advice to the user.
 
-Only data that contradict themselves or the model are refused; missing data increase the posterior
-uncertainty. A refusal stops the fit unless the user allows it by name; the result lists advice.
+Data that contradict themselves or the model are refused; missing data increase the posterior
+uncertainty. A refusal stops the fit, unless its `Finding.name` is allowed; advice stops no fit.
 """
 
 from __future__ import annotations
@@ -182,11 +182,11 @@ def _judge_ramps(windows: ThermalWindows) -> Iterator[Finding]:
                 'between or beyond the soaks is unknown; five temperatures determine a cubic',
             )
     elif min(heating, cooling) < 0.1 * max(heating, cooling):
-        recorded, missing = ('heating', 'cooling') if heating > cooling else ('cooling', 'heating')
+        missing = 'cooling' if heating > cooling else 'heating'
         yield advice(
             'directions',
-            f'only {recorded} was recorded; heating and cooling cause errors of opposite sign, so '
-            f'record {missing}, too',
+            f'hardly any {missing} was recorded; heating and cooling cause errors of opposite '
+            f'sign, so record more {missing}',
         )
     calm = windows.weight <= 0.5
     span = float(np.ptp(windows.temperature))
@@ -226,7 +226,7 @@ def _judge_positions(up: Floats) -> Finding:
 
 
 def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
-    """Advise a position if the largest sd of |f| is 3 times the median over the positions."""
+    """Advise a position if the largest sd of |f| is 3 times the positions' median or more."""
     if least is not None and least.sd_m_s2 >= 3.0 * least.seen_sd_m_s2:
         yield advice(
             'unseen',
@@ -238,10 +238,10 @@ def judge_coverage(least: LeastKnown | None) -> Iterator[Finding]:
 
 def judge_mountings(fit: Fit, offset_sd: float, options: FitOptions) -> Iterator[Finding]:
     """
-    Report the assumed sd of mounting and turn-on offsets if the data do not determine this sd.
+    Report the sd of mounting and turn-on offsets if the fit had to assume this sd.
 
     `offset_sd`: published sd of the bias offset of a mounting [m/s^2]. Nine constants explain the
-    norms of nine positions, whatever the offsets; drifts of scale factors show large offsets only.
+    norms of nine positions, whatever the offsets; drifts of scale factors show only large offsets.
     """
     prior = fit.posterior.prior
     n, n_turn_ons = int(fit.windows.data.mounting[-1]) + 1, fit.windows.data.n_turn_ons
@@ -284,7 +284,7 @@ def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Findi
     """
     Refuse data that appear to be compensated already.
 
-    `raw`: RMS of |f| - g with constants at the reference temperature alone [m/s^2].
+    `raw`: RMS of |f| - g, corrected only with the constants at reference temperature [m/s^2].
     No uncompensated triad has biases [g], relative errors of the scale and misalignments [rad] all
     below 1e-4, and an RMS of |f| - g below 2e-5 g over 20 K.
     """
@@ -339,7 +339,7 @@ def judge_result(
     """
     Check the residuals of a fit.
 
-    K: scale factors; rows: residuals of the axes and, last, overall
+    K: scale factors; rows: residuals by regime and, last, of all windows
     slow: sd of the bias offset of a mounting or turn-on [m/s^2]
     span: span of the board temperature [K]
     drift: RMS of ``|f| - g`` about the means of the positions [m/s^2]
@@ -370,7 +370,7 @@ def judge_result(
         )
         yield advice('compensated', text + why)
     elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
-        why = 'the positions predict a left-out position badly; record more positions'
+        why = 'the other positions predict a left-out position badly; record more positions'
         yield advice('left out', f'{text}: left-out residuals exceed the raw residual: {why}')
     else:
         yield Finding('residual', 'good', text)
@@ -385,7 +385,7 @@ def judge_result(
             'a static and a dynamic set fitted without the prior'
         )
     elif is_changed:
-        contradiction = 'the parameters differ from those of the prior by far more than its sd'
+        contradiction = 'the parameters differ from the prior by far more than the prior sd'
     if contradiction:
         yield advice(
             'prior',

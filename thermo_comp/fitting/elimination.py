@@ -91,7 +91,7 @@ def inverse_root(factor: Floats) -> Floats:
 @dataclass(frozen=True)
 class Blocks:
     """
-    Eliminated diagonal blocks of the normal equations: one for each position, or for each bag.
+    Eliminated diagonal blocks of the normal equations: of positions, bags, or `Reduced.common`.
 
     root: inverse of each block's Cholesky factor, shape (n, k, k)
     whitened: `root` times the off-diagonal block with the m remaining unknowns and, in the last
@@ -132,7 +132,7 @@ class Reduced:
     of_bag_prior: prior precision of the unknowns of bags, and this precision times their distance
         from the prior mean, shape (2, n_bags, r)
     matrix: Hessian and, in the last column, gradient, shape (n + 1, n + 1)
-    positions: the blocks of the positions; remaining unknowns: of the bag, then of the unit
+    positions: the blocks of the positions, with columns for the bag's, then the unit's unknowns
     shares: contribution of each position to the block of its bag, with off-diagonal blocks and
         gradients, shape (n_positions, r, r + n + 1); and to the diagonal of this block before the
         elimination of the positions, shape (n_positions, r)
@@ -160,7 +160,7 @@ class Reduced:
         return sum(block.log_determinant for block in blocks if block is not None)
 
     def with_prior_of_sum(self, total: Floats, variance: float) -> Reduced:
-        """Add a prior of mean 0 on the sum over the bags of lag states, whose value is `total`."""
+        """Add a prior (mean 0, `variance`) on the sum of the bags' lag states, now `total`."""
         r = len(total)
         cross = self.bags.solved[:, :r].sum(axis=0, keepdims=True)
         cross[..., -1] += total

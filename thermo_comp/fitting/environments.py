@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the exclusion of bags that were recorded in another thermal environment than most bags, such
-as still air, and the error that the calibration states for these bags.
+Owns the exclusion of bags that were recorded in another thermal environment (such as still air)
+than most bags or a prior, and the error that the calibration states for these bags.
 
 In still air the board temperature responds to the case temperature in another way than in a
 chamber with a fan. No thermometer is at the axes, so their bias as a function of the thermometers
@@ -47,9 +47,9 @@ def contradicting_bag(fit: Fit) -> list[int]:
     """
     Return, in a list, the number of a bag that may be of another environment; [] if none may.
 
-    A bag is suspect if its left-out drift is far above both the median over the bags and the white
-    noise of a window. If the other bags do not determine the drift of exactly one bag, and the
-    median left-out drift is far above the noise, this bag is suspect.
+    A bag is suspect if its left-out drift exceeds five times both the median over the bags and the
+    white noise of a window. If the other bags do not determine the drift of exactly one bag, and
+    the median left-out drift exceeds five times the noise, this bag is suspect.
     """
     square = _square_of_bags(fit)
     known = np.isfinite(square)
@@ -64,7 +64,7 @@ def contradicting_bag(fit: Fit) -> list[int]:
 
 
 def is_better_without(whole: Fit, rest: Fit, bag: int) -> bool:
-    """Whether a fit without `bag` halves the mean square left-out drift of the other bags."""
+    """Whether excluding `bag` more than halves the other bags' mean square left-out drift."""
     before, after = np.delete(_square_of_bags(whole), bag), _square_of_bags(rest)
     known = np.isfinite(before) & np.isfinite(after)
     return bool(known.any() and before[known].mean() > 2.0 * after[known].mean())
@@ -81,7 +81,8 @@ class Contradiction(NamedTuple):
     """
     Bags that contradict an earlier calibration of their unit.
 
-    bags: numbers of bags whose drift the calibration does not explain with any lag states at start
+    bags: numbers of the bags whose drift the calibration does not explain with any lag states at
+        start; if these are more than half of the bags, numbers of all bags
     is_updated: whether the bags can update the calibration: ``|f| - g`` is far above the drift and
         the claimed sd of |f|, so that bias or scale has changed, too, or the bags have the six
         attitudes that determine bias and scale
@@ -173,9 +174,9 @@ def with_excluded_error(
     names = ', '.join(one_line(bag.source.name) for bag in bags)
     rms = float(np.sqrt(np.mean(drift**2))) / MICRO_G
     text = (
-        f'{names}: the correction by {others} leaves a drift of {rms:.0f} ug. The recording took '
-        'no part in the fit; the published uncertainty includes this error. Another environment, '
-        'such as still air or another mounting, needs a separate calibration'
+        f'{names}: the correction by {others} leaves a drift of {rms:.0f} ug. The fit did not use '
+        'these data; the published uncertainty includes this drift. Another environment, such as '
+        'still air or another mounting, needs a separate calibration'
     )
     if is_updated:
         text = (

@@ -142,7 +142,7 @@ class Equations(Series):
 
     @last_result_kept
     def effects(self, state: State) -> Effects:
-        """Return forces, readings and derivatives by a state, at the reference temperature."""
+        """Return the parts of the readings that `state` predicts at the reference temperature."""
         force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
         along_axes = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
         sizes = np.reshape(self._norm(state), (-1, 1, 1))
@@ -214,7 +214,7 @@ class Equations(Series):
         self, state: State, layout: Layout, base: Base, scaled: int
     ) -> tuple[Ints, Floats | float]:
         """
-        Return index and factor of the series of each active nonlinear coefficient, see `Tangent`.
+        Return index and factor (as in `Tangent`) of each active nonlinear coefficient's series.
 
         The factor 1 + S s of the scale multiplies the terms at the reference temperature. In the
         terms' change per kelvin this factor is left out, as its effect is negligible.
@@ -302,7 +302,7 @@ class Equations(Series):
         return result
 
     def deviation(self, state: State, prior: Prior, layout: Layout) -> Floats:
-        """Return the unknowns less their prior means, which are 0 for all but the unit's, (n,)."""
+        """Return unknowns less prior means; for attitudes in a pose, rotations from the pose."""
         result = as_vector(state, layout)
         if prior.informative is not None:
             result[: layout.n_unit] -= prior.informative.mean

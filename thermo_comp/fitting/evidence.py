@@ -39,7 +39,7 @@ class PositionReport:
     duration_s: duration of the interval [s]
     up: estimated direction of the specific force, in the output frame
     residual_rms: RMS of ``|f| - g`` over the windows of the interval [m/s^2]
-    left_out_rms: RMS of the interval's left-out error, see `left_out_error` [m/s^2]
+    left_out_rms: RMS of ``|f| - g``, or of the drift, by a fit without the interval [m/s^2]
     """
 
     source: str
@@ -60,7 +60,7 @@ class ResidualRow:
     one_set: corrected with one curve for both regimes; empty if each regime has its own curve
     two_sets: corrected with a curve for each regime
     fitted: corrected with the calibration, in sample
-    left_out: corrected by fits without the corrected data, see `left_out_error`
+    left_out: corrected by fits without the position; RMS drifts where these do not determine |f|
     """
 
     section: str
@@ -132,7 +132,7 @@ def _with_only(regression: Regression, chosen: PosteriorMode, groups: tuple[str,
 
 
 def position_reports(fit: Fit, residual: Floats, left_out: Floats) -> tuple[PositionReport, ...]:
-    """Return a report for each position; `residual`, `left_out`: of windows (`residual_rows`)."""
+    """Return a report for each position, from the residuals of `residual_rows`, shape (n,)."""
     windows, state = fit.windows, fit.posterior.state
     result = []
     for number, (bag, interval) in enumerate(windows.rests):

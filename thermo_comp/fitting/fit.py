@@ -68,7 +68,7 @@ def fit(
     """
     Fit a calibration to bags of a thermal test.
 
-    Raises FitError if the data contradict themselves, or a bag has no still interval.
+    Raises FitError if the data do not allow a fit, as without a still interval in a recording.
     """
     check_serial(sources, options)
     if not sources:
@@ -107,7 +107,7 @@ def _checked(bag: ReducedBag) -> ReducedBag:
 def fit_bags(
     bags: Sequence[ReducedBag], options: FitOptions, progress: Progress = lambda _part: None
 ) -> FitResult:
-    """Fit a calibration to reduced bags; raises FitError if the bags contradict themselves."""
+    """Fit a calibration to reduced bags; raises FitError if the bags do not allow a fit."""
     # One bag of a split recording may have no rest, so the bags are joined before the check.
     recordings = [_checked(bag) for bag in joined(bags)]
     # Threads would slow down the products of small matrices in the fit.
@@ -118,7 +118,7 @@ def fit_bags(
             raise FitError(
                 'the bags do not determine the fit: its equations have no solution in double '
                 'precision. Record rests of ten minutes or longer; bags that update a '
-                'prior calibration can be fitted together with its bags'
+                'prior calibration can be fitted together with the bags of the prior'
             ) from error
 
 
@@ -154,7 +154,7 @@ def find_offset(bags: Sequence[ReducedBag], options: FitOptions) -> Floats:
         return np.zeros(3)
     if options.prior is not None:
         known = constants_of(options.prior)
-        # A bias above 0.5 g is taken for the code at zero force.
+        # If a bias exceeds 0.5 g, the three biases are taken for the codes at zero force.
         is_far = np.abs(known.bias / known.scale).max() > 0.5 * options.gravity
         return np.asarray(np.rint(known.bias) * is_far)
     middle = max(bag.middle for bag in bags)
@@ -238,7 +238,7 @@ def _fit_one_environment(
 def _refined(
     result: FitResult, bags: Sequence[ReducedBag], options: FitOptions, progress: Progress
 ) -> FitResult:
-    """Repeat a fit whose bias at settled temperatures is uncertain, or with tilting supports."""
+    """Repeat a fit if its bias at settled temperatures is uncertain, or if supports may tilt."""
     if options.prior is not None or options.model == 'golovach':
         return result
     if refit_checks.extrapolates(result.fit):
@@ -279,8 +279,8 @@ def _fit(
     has_pieces: bool = False,
 ) -> FitResult:
     """
-    Fit a calibration to bags whose readings at zero force are near 0; for `is_by_settled` and
-    `has_pieces` see `Problem`.
+    Fit a calibration to bags whose readings at zero force are near 0. `is_by_settled`: whether to
+    limit the bias error at settled temperatures; `has_pieces`: whether rests were divided.
     """
     bags, findings = _judged(bags, options)
     windows = windows_of(bags, model_of(bags, options), options)
@@ -329,7 +329,7 @@ def _fit(
         if known is not None or not is_beyond(fit.windows):
             calibration, rates = add_gyroscope(calibration, fit.windows, bags, options)
         elif fit.windows.angular_rate.shape[1]:
-            text = 'the unit rotated in some rests, so the bias of the gyroscope was not fitted'
+            text = 'the stated |f| differs between rests: no bias of the gyroscope was fitted'
             findings.append(Finding('rate', 'advice', text))
     except ValueError as error:
         raise _unusable(error, fit.posterior.state.up) from error
@@ -379,7 +379,7 @@ def _unusable(error: ValueError, up: Floats) -> FitError:
 
 
 def check_serial(sources: Sequence[FitSource], options: FitOptions) -> str:
-    """Return the unit's serial; raises FitError if the bags have different or invalid serials."""
+    """Return the serial of `options` or of the bags; FitError if it is ambiguous or invalid."""
     serials = {source.serial: source.name for source in sources if source.serial}
     if options.serial is None and len(serials) > 1:
         names = ', '.join(f'{name} of {serial}' for serial, name in sorted(serials.items()))
@@ -401,7 +401,7 @@ def _unit(bags: Sequence[ReducedBag], options: FitOptions) -> Unit:
     if full_scale == COUNTS_FULL_SCALE:
         full_scale = widened(full_scale, np.array([[largest]]))
     if full_scale is None:
-        # The smallest of the usual full scales that exceeds the largest sample by 10 %.
+        # The smallest usual full scale 10 % above the largest sample, else twice this sample.
         ranges = (STANDARD_GRAVITY * g for g in (2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0))
         full_scale = next((top for top in ranges if top > 1.1 * largest), 2.0 * largest)
     cycle = float(np.median([bag.cycle_s for bag in bags]))

@@ -58,7 +58,7 @@ class Inactive:
     Q: Floats
 
     def _in_prior_sd(self, column_sd: Floats, wanted: Bools) -> tuple[Floats, Floats, Ints]:
-        """Return S and Q of the weights of `wanted` columns, in units of prior sd; and columns."""
+        """Return S and Q of `wanted` columns' weights, in prior sds; and each weight's column."""
         sd = np.repeat(column_sd[self.part, self.column] * wanted[self.column], 3)
         at = np.flatnonzero(sd > 0.0)
         S = self.S[np.ix_(at, at)] * np.outer(sd[at], sd[at])
@@ -68,8 +68,8 @@ class Inactive:
         """
         Return the gain in log evidence if the columns in the mask `wanted`, (m,), are added.
 
-        The gain is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, with S and q in units of the prior
-        sd `column_sd`, shape (2, m), times the best of `_SQUARED_FACTORS`.
+        The gain is ``(q (1 + S)^-1 q - log det(1 + S)) / 2``, at least 0, with S and q in units of
+        the prior sd: `column_sd`, (2, m), times the root of the best of `_SQUARED_FACTORS`.
         """
         S, Q, _ = self._in_prior_sd(column_sd, wanted)
         S, along = np.linalg.eigh(S)

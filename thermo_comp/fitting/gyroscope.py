@@ -36,7 +36,7 @@ from .windows import ThermalWindows
 
 @dataclass(frozen=True)
 class RateRow:
-    """Statistics of the rate less its mean in each position, fields as in `ResidualRow`."""
+    """Statistics of the rate less its mean in each position: raw, corrected, and left out."""
 
     section: str
     raw: ResidualStatistics

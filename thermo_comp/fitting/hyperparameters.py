@@ -4,10 +4,10 @@
 Owns the estimation of prior sd and noises, and the removal of columns of small log Bayes factor.
 
 Each column has one prior standard deviation of its weights in the bias of all axes and one in the
-scale, found by MacKay's fixed point [1]_ with a log-normal hyperprior. The mode of log evidence
-plus log hyperprior satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w
-being the weights of the column on the three axes, sd0 and tau^2 centre and variance of the
-hyperprior of log sd. The sd of a column about which the data have no information stays at sd0.
+scale. If not fixed, both follow from MacKay's fixed point [1]_ with a log-normal hyperprior of the
+sd, of centre sd0 and variance tau^2 of log sd. The mode of log evidence plus log hyperprior
+satisfies ``effective parameters + log(sd / sd0) / tau^2 = sum w^2 / sd^2``, w being the weights of
+the column on the three axes. If the data do not inform about a column, the sd stays at sd0.
 
 References
 ----------
@@ -66,7 +66,7 @@ class Candidates:
 def settle(
     regression: Regression, state: State, prior: Prior, candidates: Candidates, rounds: int = 25
 ) -> PosteriorMode:
-    """Iterate all prior sd and noises until the logarithm of each changes by less than 0.05."""
+    """Iterate prior sd and noises up to `rounds` times, until `_updated` gives a change < 0.05."""
     posterior = regression.solve(state, prior, n_steps=3)
     for _ in range(rounds):
         prior, change = _updated(regression, posterior, candidates)
@@ -79,7 +79,10 @@ def settle(
 def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """Move all prior sd and noises towards their modes; return also the largest log change."""
+    """
+    Move all prior sd and white noises towards their modes; return also the largest change of a
+    logarithm, that of the tilts' sd divided by 3, and that of the lag states' variance by 4.
+    """
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     sd, determined = prior.column_sd, posterior.determined
     moves = (sd > 0.0) & ~candidates.fixed
@@ -156,9 +159,7 @@ def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> tuple[float, float]:
 
 
 def _pose_sd(posterior: PosteriorMode) -> tuple[float, float]:
-    """
-    Move the sd of attitudes about their poses towards the mode; return also the change of log sd.
-    """
+    """Move the sd of attitudes about poses towards the mode; return also the change of log sd."""
     sd, layout = posterior.prior.pose_sd, posterior.layout
     if not layout.pose.size:
         return sd, 0.0
@@ -247,7 +248,7 @@ def white_noise(regression: Regression, posterior: PosteriorMode) -> Floats:
 def with_slow_noise(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> PosteriorMode:
-    """Estimate slow noise from the residuals, then by log evidence; repeat the fit with it."""
+    """Estimate slow noise from the residuals, then by log evidence; refit with this noise."""
     prior = posterior.prior
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
     estimated = regression.whitener.estimate(residual, regression.weight)
@@ -354,8 +355,9 @@ def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
 
 def downweigh(regression: Regression, posterior: PosteriorMode) -> None:
     """
-    Reduce the weight of windows whose residual is more than 3 sd from the local median, so that
-    the weighted distance becomes 3 sd.
+    Reduce the weight of windows whose residual is more than 3 sd from the local median (in a
+    position of up to 6 windows: from 0), so that the weighted distance becomes 3 sd; keep the
+    weights if `windows.undisturbed` is given.
     """
     windows = regression.windows
     if windows.undisturbed is None:

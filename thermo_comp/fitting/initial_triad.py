@@ -4,8 +4,8 @@
 Owns the initial triad: constant bias, scale and misalignment from the mean readings of positions.
 
 Without thermal effects the mean readings of the positions lie on an ellipsoid, which is fitted by
-robust least squares on ``|f| - g``. The fit begins with the bias and scale that follow from the
-extremes of the mean readings on each axis.
+robust least squares on ``|f| - g``. If |f| is the same in all positions, the fit begins with the
+bias and scale that follow from the extremes of the mean readings on each axis.
 """
 
 from __future__ import annotations

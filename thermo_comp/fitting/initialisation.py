@@ -45,7 +45,7 @@ class Problem:
     start: initial bias, scale and misalignment, without effects of temperature
     up: directions of the positions, shape (n_positions, 3)
     is_by_settled: whether models must not increase the expected bias error at settled temperatures
-    has_pieces: whether the positions are pieces of rests, see `refit_checks`
+    has_pieces: whether the positions are pieces of rests, of about an hour (`refit_checks`)
     """
 
     bags: Sequence[ReducedBag]
@@ -61,8 +61,9 @@ def regress(windows: ThermalWindows, problem: Problem) -> Fit:
     """
     Fit the windows, with or without a prior calibration.
 
-    If the temperature changes more between positions than within them, the curve is fitted to the
-    means of the positions, unless a fit that also uses the drifts is better on left-out data.
+    Without a prior, if the positions are whole rests, and temperature changes more between than
+    within positions, the curve is fitted to the means of the positions, unless a fit that also
+    uses the drifts is better on left-out data.
     """
     if problem.options.prior is not None:
         return _regress(windows, problem)
@@ -93,7 +94,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     """Fit the windows; `is_at_rest`: whether the columns are set constant in each position."""
     data, options, start = windows.data, problem.options, problem.start
     known, n_directions = options.prior, len(distinct_directions(problem.up))
-    # With a prior calibration, drifts in a single attitude separate bias and scale factor.
+    # With a prior calibration, drifts in one attitude separate bias and scale: assume no bench.
     is_bench = known is None and rests.is_bench(windows, problem.up)
     has_poses = n_directions < POSITIONS_NEEDED and rests.is_constant(windows, data.position)
     if (has_poses or n_directions == 1) and known is None and data.forces is None:
@@ -110,7 +111,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
     if n_directions >= POSITIONS_NEEDED and not data.has_turn_ons:
-        # Misalignments would explain turn-on offsets, which are no unknowns here: reduce the sd.
+        # Misalignments would explain turn-on offsets, no unknowns here: reduce the sd of M.
         prior = _with_faces(prior, problem.up)
     steepness = _steepness(windows, start, options, is_at_rest=is_at_rest)
     candidates = _candidates(windows, steepness, options, n_directions, is_bench=is_bench)
@@ -120,7 +121,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         *others, widest = informative_priors(
             known, regression, state, windows.model, options, usual_ageing
         )
-        # Few windows may be fitted exactly: the noise is at least half of that of the calibration.
+        # Few windows may be fitted exactly: the noise is at least half of that in the prior.
         window_s = windows.typical_count * known.unit.cycle_time_s
         least = 0.5 * float(np.min(known.noise_density_m_s2_sqrt_hz)) / window_s**0.5
         prior = replace(
@@ -130,7 +131,7 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
             least_sigma=max(least, prior.least_sigma),
         )
         if prior.offset_scale and (known_sd := offset_sd_of(known)):
-            # The calibration's bags showed how well mountings and turn-ons repeat, at most to a
+            # The prior calibration states the sd of the bias over mountings and turn-ons, to a
             # factor of two: larger changes of the norms are an ageing of the unit.
             scale = min(prior.offset_scale, 2.0 * known_sd)
             offset_sd = prior.offset_sd if data.has_turn_ons else known_sd
@@ -206,7 +207,7 @@ def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
     Return the prior with a smaller misalignment sd if a noisy sensor has only positions near its
     six faces. Faces hardly determine misalignments, and misalignments of some degrees would, to
-    second order, explain other errors of |f|. The published covariance keeps the sd of `prior`.
+    second order, explain any errors of |f|. The published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Smaller sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
@@ -256,7 +257,7 @@ def _noise_in_1_hz(windows: ThermalWindows, scale: Floats) -> float:
 
 
 def _mounting_scale(noise: float) -> float:
-    """Return the scale of the prior of mounting offsets [m/s^2]: 3 times the noise in 1 Hz."""
+    """Return the prior scale of mounting offsets [m/s^2]: 3 times the noise in 1 Hz, bounded."""
     # Bounds of the scale: 30 ug, typical of navigation grade, and 0.5 mg, of consumer MEMS; the
     # tail of the Student prior allows for larger offsets. With almost no noise the lower bound is
     # 100 times the noise in 1 Hz, because an offset 1e6 times as large as the noise cannot be
@@ -360,7 +361,7 @@ def sizes_of(windows: ThermalWindows, options: FitOptions) -> Floats:
 
 
 def initial_triad(windows: ThermalWindows, options: FitOptions) -> ConstantCalibration:
-    """Fit bias, scale and misalignment without temperature; with few attitudes the scale alone."""
+    """Fit the constants without temperature; with few attitudes only the scale, 1 for m/s^2."""
     means = position_means(windows.data)
     gravity = sizes_of(windows, options)
     norms = np.linalg.norm(means, axis=1)

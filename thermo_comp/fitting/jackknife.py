@@ -25,7 +25,7 @@ from .regression import PosteriorMode, Regression
 def jackknife_covariance(regression: Regression, posterior: PosteriorMode) -> Floats:
     """
     Return the covariance of the unit's unknowns by the jackknife over the sections of the test,
-    shape (n_unit, n_unit), or 0 if noise explains how the unknowns change without each section.
+    shape (n_unit, n_unit); 0 for one section, or if noise explains the changes of the unknowns.
     """
     n = posterior.layout.n_unit
     last = int(regression.windows.section.max())
@@ -52,7 +52,8 @@ def _ratios_to_noise(change: Floats, remaining: Floats) -> Floats:
     divided by the variances of these changes due to noise, shape (k,).
 
     `change`: change of the unknowns, shape (n,), and `remaining`: root of the information of the
-    remaining windows, ``remaining.T @ remaining``, shape (n, n), both in units of the fit's root
+    remaining windows, ``remaining.T @ remaining``, shape (n, n), both scaled so that the
+    covariance of the fit of all windows is the unit matrix
     """
     shares, directions = np.linalg.eigh(remaining.T @ remaining)
     # Use combinations about which the left-out windows have more than 1e-6 of the information.

@@ -42,7 +42,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
 
 
 def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
-    """Whether a bag is the part of a recording that follows `part`."""
+    """Whether a bag, by its stamps, sample interval and serial, continues `part`."""
     gap_s = 1e-9 * (bag.start_ns - part.end_ns)
     is_alike = _is_alike(part.cycle_s, bag.cycle_s)
     # A bag with known |f| is not joined, because times of |f| count from the start of the bag.
@@ -55,10 +55,7 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
 
 
 def _step(part: ReducedBag, bag: ReducedBag) -> float:
-    """
-    Return the change of the readings from the last window of a part to the first window of a bag;
-    0 if the part or the bag has no rest.
-    """
+    """Return the norm of the change of the readings from `part` to `bag`; 0 without rests."""
     if not (part.intervals and bag.intervals):
         return 0.0
     return float(np.linalg.norm(bag.intervals[0].mean[0] - part.intervals[-1].mean[-1]))

@@ -81,7 +81,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     rounding_sd = np.median([interval.rounding_sd for interval in bag.intervals], axis=0)
     quiet_sd = np.maximum(quiet_sd, np.maximum(rounding_sd, 1e-9))
     beside = _beside_gaps(bag, gaps, [margin_s] * len(gaps))
-    # If the noise is correlated, the mean level before and after a gap needs more samples.
+    # Correlated noise needs more samples than white noise for a mean level beside a gap.
     margins = [max(_margin(part, quiet_sd), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)
@@ -136,7 +136,7 @@ def _examine(
     by_rounding = 2.0**0.5 * rounding_sd
     lasting_sd = np.hypot(lasting_sd, by_rounding)
     step, relative_sd, residual = _step(time, accel, time[at], r)
-    # If the noise is correlated, the scatter within a cell underestimates the noise of means.
+    # If noise is correlated, the scatter within half a second underestimates the noise of means.
     sd = np.sqrt(np.mean(residual**2, axis=0)) if r else quiet_sd
     step_sd = np.hypot(sd * relative_sd * _correlation(residual, sd), by_rounding)
     if r:

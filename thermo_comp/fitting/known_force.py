@@ -92,7 +92,7 @@ class KnownForce:
                     return Magnitude(section.size, sd=section.sd)
             return Magnitude(None)
         inside = (self.stamp_ns >= start_ns) & (self.stamp_ns <= end_ns)
-        n, needed = int(inside.sum()), 3  # fewer than 3 readings give no error of the mean
+        n, needed = int(inside.sum()), 3  # the sd of the mean of 2 readings is not reliable
         if n < needed:
             since_s = (start_ns - first_ns) * 1e-9
             raise FitError(
@@ -161,8 +161,8 @@ def known_force(path: Path, info: RecordingInfo, asked: ForceOptions) -> KnownFo
 
 def parse_sections(text: str) -> tuple[Section, ...]:
     """
-    Read |f| from a text: a magnitude [m/s^2], or lines of ``BEGIN END MAGNITUDE [SD]``, with times
-    since the bag's first sample [s]. A semicolon also ends a line; a # begins a comment.
+    Read |f| [m/s^2] from a text: one line ``MAGNITUDE [SD]``, or lines of ``BEGIN END MAGNITUDE
+    [SD]``, with times since the bag's first sample [s]. A ; ends a line, a # begins a comment.
     """
     lines = text.replace(',', ' ').replace(';', '\n').split('\n')
     rows = [_numbers(words) for line in lines if (words := line.split('#')[0].split())]

@@ -6,8 +6,8 @@ Owns the lack of fit: the excess of the left-out errors over the published covar
 The lack of fit in a regime, near a temperature, is the mean square of the left-out drift less the
 noise and the published variance of this drift. The lack of fit covers effects that no column
 describes, such as a kink of the curve, a tilt of the support or a drift of the bias. For models
-whose score is within one standard error of that of the chosen model, half of the largest squared
-difference between their drift and that of the chosen model is added.
+whose score is at most one standard error worse than that of the chosen model, half of the largest
+squared difference between the drift of such a model and that of the chosen model is added.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ class Layout:
     Indices of the unknowns in the vector of parameters; the unknowns of the unit come first. The
     names are those of `State`.
 
-    axis: kappa, bias, weights and nonlinear coefficients of each axis, shape (3, k)
+    axis: kappa, bias, active weights and active nonlinear coefficients of each axis, shape (3, k)
     weights, nonlinear: indices of the weights, shape (2, 3, m), and of the nonlinear coefficients,
         shape (3, 2 k); -1 for an inactive unknown
     start, turn_on: unknowns of each bag: initial lag states, and the bias offset of its turn-on,
@@ -87,7 +87,7 @@ class Layout:
 
     @cached_property
     def unit(self) -> Ints:
-        """Indices of the unit's unknowns in the equations of each axis, then n_unit, (3, k)."""
+        """Indices of the unit's unknowns by axis, n_unit for the residual, (3, k)."""
         common = np.append(self.shared, self.n_unit)
         return np.hstack((self.axis, np.tile(common, (3, 1))))
 

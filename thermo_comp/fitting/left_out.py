@@ -11,9 +11,9 @@ parameters alone, initial lag states at their prior mean, no mounting offsets an
 support. The errors are the drift (the force along each axis less its mean over the position, which
 does not depend on the attitude) and, if the other positions determine |f|, ``|f| - g``.
 
-A model is better than another model if its error is smaller by more than the standard error over
-the folds, both for positions and for sections of the program. A model that describes only one
-recording fails for positions, a model of only one chamber program fails for sections.
+Model A is better than B if the error of A is smaller by more than the standard error over the
+folds, both for positions and for sections of the program; `gain` lists exceptions. A model that
+describes only one recording fails for positions, a model of only one program fails for sections.
 
 References
 ----------
@@ -153,12 +153,12 @@ class Score:
 
     @property
     def exceeds_noise(self) -> bool:
-        """Whether neither noise nor errors of a coarse thermometer explain the left-out drift."""
+        """Whether noise plus errors of a coarse thermometer do not explain the left-out drift."""
         return self.rms > _NOISE_RATIO * float(np.hypot(self.noise, self.by_thermometer))
 
     @property
     def excess(self) -> float:
-        """RMS of the left-out drift beyond noise and thermometer [m/s^2]; 0 if it is unknown."""
+        """RMS of the left-out drift in excess of noise and thermometer [m/s^2]; 0 if unknown."""
         square = self.rms**2 - self.noise**2 - self.by_thermometer**2
         return float(np.sqrt(square)) if square > 0.0 else 0.0
 
@@ -178,9 +178,11 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     Return the gain of the model of `after` over that of `before` if it is significant, else 0.
 
     The gain is the sum of the log ratios (`Folds.gain_of`) of the drift of positions and of
-    sections. If the drifts of both models are equal, the gain is the log ratio of the errors of
+    sections. If the drifts of both models agree to 5 %, the gain is the log ratio of the errors of
     left-out norms, if that exceeds two standard errors. `by_halves`: whether an increased error of
-    left-out halves of the chamber program, a sign of too many columns, excludes a gain.
+    left-out halves of the chamber program, a sign of too many columns, excludes a gain. Increased
+    errors of left-out norms exclude a gain, and so does an increased expected error of the settled
+    bias, unless noise explains the drift. A drift that noise explains need not decrease.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
@@ -216,8 +218,8 @@ def is_worse_by_norms(before: Score, after: Score) -> bool:
 def is_undecided(before: Score, after: Score) -> bool:
     """
     Whether left-out data do not decide between two models, of which `after` is not better: the
-    drifts are equal, and errors of norms are not scored for both models, or are smaller in `after`
-    by one to two standard errors.
+    drifts agree to 5 %, and errors of norms are not scored for both models, or are smaller in
+    `after` by one to two standard errors.
     """
     *drift, norms = _beyond_thermometer(before, after)
     is_equal = all(abs(gain[0]) < _NEGLIGIBLE_LOG_RATIO for gain in drift if gain)
@@ -314,7 +316,8 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
 def _is_determined(by_others: float, by_all: float) -> bool:
     """
     Whether `by_others`, the variance of a position's norm or drift by a fit without this position,
-    is below ten times `by_all`, that by all positions plus that of the mounting offset or noise.
+    is below ten times `by_all`, the sum of this variance by a fit of all positions and of the
+    variance of mounting offset or noise.
     """
     return by_others < 10.0 * by_all
 

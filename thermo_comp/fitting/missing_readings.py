@@ -25,7 +25,7 @@ class _Missing(NamedTuple):
 
     n_still: all samples
     n_unsettled: samples before the estimate of the board temperature is accurate
-    n_between: later samples without a temperature, between first and last readings
+    n_between: later samples without a temperature, between readings of each thermometer
     """
 
     n_still: float
@@ -64,7 +64,7 @@ def judge_missing(windows: ThermalWindows) -> Iterator[Finding]:
 
 
 def _missing(bag: ReducedBag, track: Track) -> _Missing:
-    """Count the samples at rest of one bag, see `_Missing`."""
+    """Count a bag's samples at rest: all, and those without an accurate temperature."""
     grid = track.start_s + track.step_s * np.arange(len(track.states))
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s, end_s = (

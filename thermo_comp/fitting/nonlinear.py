@@ -3,9 +3,9 @@
 """
 Owns the known |f| of positions that are not at 1 g, and the choice of the nonlinear terms.
 
-A nonlinear term that the data determine is removed if it lowers the log evidence, or if |f| of
-left-out positions is not better with the term. A nonlinear term that the data do not determine
-keeps its prior mean and sd approximately.
+A nonlinear term that the data determine is removed if the term lowers the log evidence by 1 or
+more, or does not decrease the error of left-out |f| by more than a standard error. A term that the
+data do not determine keeps its prior mean and sd approximately.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ class _TermFits:
         return bool(share.mean() > _DETERMINED_SHARE)
 
     def thinned(self, used: _Active) -> _Active:
-        """Remove the terms that the data determine and that lower the log evidence."""
+        """Remove terms that the data determine and that lower the log evidence by `LEAST_GAIN`."""
         kinds = [at for at in sorted(used) if at < self._n_kinds and self.is_determined(used, at)]
         losses = {at: self.loss(used, self.term(at)) for at in kinds}
         worst = min(losses, key=losses.__getitem__, default=None)

@@ -61,7 +61,7 @@ class FitOptions:
     groups, forced: groups of columns that the model may have (None: all), and that it must have
     prior: calibration of this unit or of its type, whose columns are used without a selection
     ageing_bias, ageing_scale: sd of the change of bias [m/s^2] and scale [1] since the prior
-        calibration; if both are 0, the change is estimated from the bags
+        calibration; if both are 0, these sds are estimated from the bags
     mounting_sd: sd of the bias offset of a mounting or turn-on [m/s^2], or None to estimate it
     gravity_sd: standard deviation of `gravity` [m/s^2]
     k2_sd, k3_sd: prior sd of the nonlinear terms K2 [g/g^2] and K3 [g/g^3], from a data sheet; if
@@ -74,9 +74,9 @@ class FitOptions:
     offset: code at zero force, such as 32768, or None to estimate it from the bags
     reference_temperature: T_ref [degC], 20 in Golovach's paper
     detector: thermometer and detector settings, or None to estimate them from the bags
-    min_rest_s: length of the shortest rest [s], or None for a length that `reduction` chooses
+    min_rest_s: length of the shortest rest [s], or None for 1, 2 or 3 s, chosen by the rests
     still_sd: largest sd of the samples at rest [m/s^2]
-    allow: names of refusals that the user overrides, see `data_checks`
+    allow: names of the refusals of data, of `REFUSALS`, that the user overrides
     """
 
     gravity: float
@@ -185,7 +185,8 @@ def _family(name: str, lower: float, upper: float) -> TemperatureFunction:
     if name == 'exponential':
         # Exponentials that grow e-fold in 15 K (leakage currents, which double in 10 K) and 30 K.
         return Exponential(-2.0, (1.0, 1.0), (15.0, 30.0))
-    # The spline has four pieces; a knot at the reference temperature replaces nearby knots.
+    # The spline has five equidistant knots, and a knot at the reference temperature, which
+    # replaces the equidistant knots near the reference temperature.
     knots = np.linspace(lower, upper, 5)
     step = max((upper - lower) / 4, 1.0)
     kept = sorted([0.0, *(float(k) for k in knots if abs(k) > 0.3 * step)])

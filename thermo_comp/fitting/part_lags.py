@@ -87,7 +87,7 @@ class Parts:
 
     lags: the lag of each axis; 0 s if the axis follows the board without a lag
     undisturbed: factors, up to 1, that reduce the weights of outlying windows, shape (n,)
-    most_drift: left-out drift above which other models of the lags are tried [m/s^2]
+    most_drift: left-out drift above which models without these lags are tried [m/s^2]
     """
 
     lags: tuple[Part, Part, Part]
@@ -101,8 +101,8 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
 
     Returns [] if the model with one lag per axis does not explain the drift of all axes, or if the
     data do not determine a time constant. If the residual of every shape exceeds the noise, lags
-    of one stage are also fitted, and come first in the list if they halve the RMS residual: a
-    second stage may only describe slow noise or a tilt of the support.
+    of one stage are also fitted, and come first in the list if on every axis they halve the RMS
+    residual without a lag: a second stage may only describe slow noise or a tilt of the support.
     """
     data, columns = windows.data, windows.model.columns
     if not windows.has_temperature or not any(column.group == 'board' for column in columns):
@@ -155,7 +155,8 @@ def _parts_of(
     ratio = float(np.sqrt((square / noise**2).max()))
     x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
     # Largest left-out drift at which the lags are kept without trial of other models: 10 sd of the
-    # noise if noise explains the residual (curves extrapolate badly to left-out data), else 2 sd.
+    # noise if noise explains the residual of a shape without stress (its curves extrapolate badly
+    # to left-out data), else 2 sd.
     is_curve = ratio <= shape.most_noise and not shape.has_stress
     return Parts((x, y, z), factors, (10.0 if is_curve else 2.0) * float(noise.mean())), ratio
 
@@ -218,7 +219,10 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """Whether the residual is small against the noise, or much smaller than without a lag."""
+        """
+        Whether the residual is at most `most_noise` times the noise, or `lag` divides the residual
+        by `reduction` or more.
+        """
         typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
@@ -260,10 +264,10 @@ class _PartCurves:
 
     def _with_lead(self, lag: Part, axis: int) -> Part:
         """
-        Add a share of the gradient to a lag or, without a case thermometer, a lead time, if the
-        data show that the temperature which the part lags leads the reading of the board.
+        Add a share of the gradient to a lag or, without a case thermometer, a positive lead time,
+        if the residual then is significantly smaller.
 
-        The residual is linearised in the time constant and in the share or lead. Its sum of
+        The residual is linearised in the time constant and in the share or lead. The sum of its
         squares must decrease by a factor that white residuals reach with a probability of 1e-5.
         """
         tau = lag.tau_s
@@ -344,8 +348,8 @@ class _PartCurves:
 
     def _is_determined(self, lag: Part, axis: int) -> bool:
         """
-        Whether time constants longer or shorter by the factor `_TAU_RATIO` increase the RMS
-        residual by more than 5 %, and the lag decays to 10 % within the longest bag.
+        Whether time constants longer or shorter by `_TAU_RATIO` (21 s for a lag of 0 s) increase
+        the RMS residual by more than 5 %, and the lag decays to 10 % within the longest bag.
         """
         tau, second, share, lead = lag
         if tau > float(self._age.max()) / np.log(10.0):

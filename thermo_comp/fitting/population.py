@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 Owns the prior of a type of unit (`population`): a calibration with the mean of the parameters over
-several units, relative to the scale factors, and with their scatter as covariance.
+several units, relative to the scale factors; its covariance is the scatter of the parameters plus
+the mean covariance of the units.
 
 References
 ----------
@@ -46,8 +47,9 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     """
     Make the prior of a type of unit from calibrations of at least three units.
 
-    Raises FitError for fewer than three calibrations, or if the calibrations differ in the input
-    unit, the reference temperature, the sensors or the form of the curves.
+    Raises FitError for fewer than three calibrations, for two of one unit or one without
+    covariance, or if the calibrations differ in the input unit, the reference temperature, the
+    sensors or the form of the curves.
     """
     # Nonlinear terms are left out: few calibrations have them, as a centrifuge determines them.
     calibrations = [
@@ -82,7 +84,7 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
 
 
 def _check_alike(calibrations: Sequence[Calibration]) -> None:
-    """Raise FitError for too few calibrations, or if they cannot be of one type of unit."""
+    """Raise FitError for too few calibrations, two of one unit, or units of different types."""
     if len(calibrations) < UNITS_NEEDED:
         raise FitError(
             f'the prior of a type needs the calibrations of at least {UNITS_NEEDED} units, got '
@@ -117,7 +119,7 @@ def _scatter(deviations: Floats, layout: ParameterLayout, K: Floats) -> Floats:
     0: with chance correlations from few units, one position would determine all constants of a new
     unit. The correlations between curves are reduced by a ratio estimated from their scatter [1]_,
     after a dynamic curve is replaced by its difference from the static curve: in most units both
-    are equal, and a reduced correlation of equal curves would make them differ.
+    curves are equal, and a reduced correlation of equal curves would make the curves differ.
     """
     to_differences = np.eye(deviations.shape[1])
     for block in (*layout.bias, *layout.scale):

@@ -31,10 +31,7 @@ from .windows import Model, Sets
 
 
 def prior_columns(calibration: Calibration) -> tuple[Column, ...]:
-    """
-    Return the columns of the response; raises FitError if a term acts in one regime alone, as in
-    files of format version 1.
-    """
+    """Return the response columns; FitError for a term of one regime, as in format version 1."""
     for term in calibration.response:
         if term.during != 'always':
             raise FitError(
@@ -70,13 +67,13 @@ def constants_of(calibration: Calibration) -> ConstantCalibration:
 
 
 def offset_sd_of(calibration: Calibration) -> float:
-    """Return the sd of the bias offset of a mounting or turn-on in a calibration [m/s^2]."""
+    """Return the smallest sd of any axis of a mounting's or turn-on's bias offset [m/s^2]."""
     axes = [axis for part in calibration.regime_sets() for axis in part.axes()]
     return min(axis.residual_sd_m_s2 for axis in axes)
 
 
 def with_calibration(calibration: Calibration, regression: Regression, state: State) -> State:
-    """Set bias and weights of a state to those of a calibration, whose K is `nominal_scale`."""
+    """Set bias and weights to those of a calibration with the scale factors `nominal_scale`."""
     layout, values = parameter_layout(calibration), parameters_of(calibration)
     if len({(b - a, d - a) for a, b, _, d in (*layout.bias, *layout.scale)}) > 1:
         raise FitError(
@@ -126,7 +123,7 @@ def informative_priors(
     # Stated ageing, with uncorrelated variances added: 0 to 1 times the variances of the prior.
     tried = [(grown(*stated), share, 0.0) for share in (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)]
     if not any(stated):
-        # Ageing to try: sd of the biases [g] and of the scale factors. Both are equal, because
+        # Ageing to try: sd of the biases [g] and of the scale factors. Both sds are equal, as
         # data sheets state similar numbers for both, and few rests do not separate bias and scale.
         tried += [
             (grown(ageing * options.gravity, ageing), 0.0, ageing)
@@ -175,7 +172,7 @@ def _root(covariance: Floats, share: float, sizes: Floats, to_file: Floats) -> F
     Return the upper triangular root of the inverse covariance of the unit's unknowns.
 
     `covariance`: of the file's parameters; `share` times each variance is added to its diagonal,
-    at most the variance or the square of the parameter in `sizes`;
+    at most the variance or, if larger, the square of the parameter in `sizes`;
     `to_file`: derivatives of the file's parameters w.r.t. the unknowns
     """
     diagonal = np.diag(covariance)

@@ -35,7 +35,7 @@ def judge_prior(serial: str, prior: Calibration | None) -> Iterator[Finding]:
 
 
 def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Finding]:
-    """Check the raw data: saturation, motion, values that are not counts, jumps, angular rate."""
+    """Check the raw data: samples, motion, dead axes, thermometers, units, jumps, angular rate."""
 
     def total(name: str) -> int:
         return sum(getattr(bag, name) for bag in bags)
@@ -167,7 +167,7 @@ def _why_dead(bags: Sequence[ReducedBag], dead: Sequence[_DeadAxis]) -> str:
 def _dead_axes(bags: Sequence[ReducedBag]) -> Iterator[_DeadAxis]:
     """
     Find the axes that are constant throughout a rest but have noise in at least half of the rests,
-    and the axes that are constant in every rest while another axis has noise.
+    and the axes that are constant, but not always 0, in every rest while another axis has noise.
     """
     rests = [rest for bag in bags for rest in bag.intervals]
     alive = np.array([rest.sample_sd > 0.0 for rest in rests])
@@ -210,6 +210,6 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
 def judge_copies(names: Sequence[str]) -> list[Finding]:
     """Report the thermometers `names`, whose readings are equal to the board's."""
     return [
-        advice('copy', f'temperature/{name} repeats the readings of the board: it is left out')
+        advice('copy', f'temperature/{name} repeats the readings of the board, and is left out')
         for name in names
     ]

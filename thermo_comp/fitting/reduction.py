@@ -80,16 +80,17 @@ class ReducedBag:
     start_ns, end_ns: stamps of the first and last sample used
     n_dropped: number of samples that are not finite, or whose stamps are out of order
     n_saturated: number of samples at the full scale
-    n_cells, n_still_cells: number of cells (means of half a second) in the bag, and in its rests
+    n_cells, n_still_cells: number of cells (means of half a second, or of more at a low sample
+        rate) in the bag, and in its rests
     window_s: length of a window [s]; above the requested length if the sample rate is low
     cycle_s: typical interval between samples [s]
     is_integer: whether all samples are integers
     middle: code at zero force if the samples are unsigned codes, else 0
-    max_abs: largest magnitude of a sample without outliers, see `_max_abs` [input units]
+    max_abs: largest magnitude of a sample, without the largest 1 % of the cells [input units]
     since_s: time from the bag's first sample to the part of the bag that was read [s]
     restless: reason why the bag cannot be used, such as no rests; '' if the bag can be used
     angular_rate: whether none, a part or all of the bag's samples have a finite angular rate
-    n_spikes: number of readings of each thermometer that are spikes, see `is_spike`
+    n_spikes: number of readings of each thermometer left out, over 10 K from those about them
     n_glitches: number of single samples far from their neighbours, which are left out
     n_repeated: number of dropped samples with the same stamp as the preceding sample
     parts: the bags that were joined to this recording, see `joining`; () for a single bag
@@ -191,7 +192,8 @@ def reduce_source(
 
     `still_sd` is the largest sd of samples at rest [g]. Without `min_rest_s` a rest lasts at least
     3 s, or at least 1 or 2 s if these shorter rests determine bias and scale better. The largest
-    variance of a rest is also chosen so that the rests determine bias and scale best. At a low
+    variance of a rest is also chosen so that the rests determine bias and scale best. If the
+    user or the bag states |f|, the variance is not chosen, and a rest lasts 3 s or more. At a low
     sample rate a cell of the usual number of samples is so long that a drift within it looks like
     a motion, and that short rests are lost: cells of 10 or 5 samples are then tried.
     """

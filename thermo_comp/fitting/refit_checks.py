@@ -61,8 +61,9 @@ def extrapolates(fit: Fit) -> bool:
 
 def may_have_slow_tilts(fit: Fit) -> bool:
     """
-    Whether the drifts of left-out positions exceed 6 times the noise and a tenth of the error of
-    left-out norms. Slow tilts change the readings of axes across gravity, but hardly the norms.
+    Whether the hourly mean drifts of left-out positions exceed 6 times their noise and a tenth of
+    the error of left-out norms, of which at least `_FEWEST_NORMS` must be known. Slow tilts change
+    the readings of axes across gravity, but hardly the norms.
     """
     score, data = fit.selected.score, fit.windows.data
     if np.isfinite(score.norms.square).sum() < _FEWEST_NORMS:

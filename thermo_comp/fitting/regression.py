@@ -304,7 +304,7 @@ class Regression(Equations):
         return tangent, tangent.normal(self.products_at(grams, state, base))
 
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> PosteriorMode:
-        """Return the posterior after at most `n_steps` steps to the mode, or at `state` with 0."""
+        """Return the posterior after at most `n_steps` steps from `state` to the mode."""
         self.whiten(prior.noise)
         point = self.at(state, prior)
         for _ in range(n_steps):

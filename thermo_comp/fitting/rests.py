@@ -51,8 +51,8 @@ def _is_heated(windows: ThermalWindows) -> Bools:
 
 def is_steady(windows: ThermalWindows) -> Bools:
     """
-    Return the positions whose temperatures, and their differences, change by less than three sd of
-    the thermometers' noise (RMS), shape (n_positions,).
+    Return the positions whose temperatures, and their differences, change (RMS) by less than three
+    sd of the estimated board temperature, shape (n_positions,).
 
     In such a position the noise of the thermometers would count as temperature changes that cause
     no drift, so the fitted slopes would be too small: by a ninth for a change of three sd, because
@@ -98,7 +98,7 @@ def poses_of(windows: ThermalWindows, up: Floats) -> Ints | None:
     (n_positions,), or None if no position has a pose.
 
     `up`: attitudes, shape (n_positions, 3). The positions of an attitude form a pose if the unit
-    was returned to this attitude from another attitude, or if all positions have one attitude.
+    was returned to this attitude from a different one, or if all (two or more) positions have it.
     """
     if len(up) == 1:
         return None

@@ -44,7 +44,7 @@ class Trial:
     score: left-out errors of the model
     posterior: fit of the model
     typical: typical prior sd of the model's columns, shape (2, m)
-    is_near: whether the score is within one standard error of that of the chosen model
+    is_near: whether the score is at most one standard error worse than that of the chosen model
     """
 
     groups: tuple[str, ...]
@@ -169,7 +169,7 @@ class Growth:
             chosen = simplest_of_the_best(chosen, better)
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit `before` with further groups, then also with bends; return all these models."""
+        """Fit `before` with further groups, then also with columns of `BEND`; return all fits."""
         added = tuple(group for group in groups if group in self.free)
         smooth = self.extended(before, added, self._candidates.typical)
         return [smooth, *self.trials(smooth, [BEND])]
@@ -194,7 +194,7 @@ class Growth:
         return chosen
 
     def trials(self, chosen: Trial, groups: Sequence[str]) -> list[Trial]:
-        """Fit the chosen model plus one set of groups, for up to 4 sets of the largest gains."""
+        """Fit the chosen model plus one set of groups, for up to 4 sets of large gains."""
         absent = [group for group in groups if group in self.free and group not in chosen.groups]
         if not absent:
             return []
@@ -202,7 +202,7 @@ class Growth:
         columns = np.isin(self._names, absent) & typical.any(axis=0)
         inactive = self.regression.inactive(chosen.posterior, columns)
         if BEND in absent:
-            # Forward selection of up to 60 bend columns: a bump in the bias of an axis needs 20.
+            # Forward selection of up to 60 bend columns: a bump in an axis' bias needs 20 columns.
             is_bend = self._names == BEND
             knees = inactive.chosen(typical, is_bend, CLEAR_GAIN, 60)
             typical = np.where(is_bend & ~knees, 0.0, typical)
@@ -257,7 +257,7 @@ def better_start(fits: Sequence[Trial]) -> Trial:
 
 
 def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
-    """Return the model of the largest gain or, if not significantly worse, a smaller model."""
+    """Return the smallest model that is not significantly worse than that of the largest gain."""
     best = max(better, key=lambda trial: gain(before.score, trial.score))
     for trial in sorted(better, key=lambda trial: len(trial.groups)):
         if trial is best or not is_better(trial.score, best.score):
@@ -338,7 +338,7 @@ def _grown(
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, and the models within one standard error of its score."""
+    """Mark the chosen model, and those at most one standard error worse than this model."""
     marked = []
     for trial in trials:
         is_chosen = trial.groups == chosen.groups
@@ -355,7 +355,7 @@ def fit_all(
     candidates: Candidates,
     informative: Sequence[InformativePrior] = (),
 ) -> Selected:
-    """Fit all columns, with the prior of `informative` that has the largest log density."""
+    """Fit all columns, with the prior of `informative` whose fit has the largest log density."""
     # Offsets of mountings would explain the norms of few positions as well as an ageing of the
     # unit, so the sd of these offsets is constant until an informative prior is chosen.
     scale = prior.offset_scale

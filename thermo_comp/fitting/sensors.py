@@ -4,8 +4,8 @@
 Owns the estimation of thermometer and detector settings from bags, and the bags' thermal states.
 
 The rates of temperature here are central differences over two minutes, which are not causal and
-need a recording. The noise, the lag and the ramps of the test that these rates show become
-settings of the thermometers and of the regime detector, which are causal.
+need a recording. The lag and the ramps of the test that these rates show, and the noise of the
+readings, become settings of the thermometers and of the regime detector, which are causal.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _BIN_S, _BINS_PER_SIDE = 10.0, 6
 
 @dataclass(frozen=True)
 class RateHistory:
-    """Rate of a thermometer in a bag at intervals of ten seconds, and sd of its noise [K/s]."""
+    """Rate of a thermometer in a bag every ten seconds, and sd of the rate's noise [K/s]."""
 
     rate: Floats
     rate_sd: float
@@ -279,7 +279,7 @@ def thermal_states(
     """
     Run a tracker over a bag; evaluate its thermal state at intervals of `step_s`.
 
-    Returns the time of the first state [s], the states, and whether each has recent readings.
+    Returns the time of the first state [s], the states, and whether readings of each are recent.
     """
     readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
     reading = next(readings, None)

@@ -4,7 +4,7 @@
 Owns the expected error of the bias at constant temperatures, after all lags have settled.
 
 In bags that all begin at one temperature the lags change together with the board temperature, so
-such bags do not determine the bias after the lags have settled: it is extrapolated.
+such bags do not determine the bias after the lags have settled: this bias is extrapolated.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def settled_error(
     regression: Regression, posterior: PosteriorMode, excess: float, settled: Floats
 ) -> float:
     """
-    Return the expected error of the bias after all lags settled [m/s^2]; infinite without a curve.
+    Return the expected error of the bias after all lags settled [m/s^2]; inf without bias columns.
 
     The error is the root sum of squares of two terms: the posterior sd of this bias; and
     `excess`, the left-out drift beyond the noise [m/s^2], times the ratio (if above 1) of this sd

@@ -1,8 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Owns the ranges of temperatures, rates and gradients in a fit's data, and the lag of the board.
-"""
+"""Owns ranges of temperatures, rates and gradients in a fit's data, and the lag of the board."""
 
 from __future__ import annotations
 

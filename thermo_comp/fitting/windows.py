@@ -39,7 +39,7 @@ PART_SUMS = ('board', 'product', 'square')
 #: Groups of columns linear in a difference of temperatures; groups of the products of such a
 #: difference with temperature, and of its squares.
 LAGS, PRODUCTS = ('gradient', 'board', 'gradient_lag'), ('product', 'square')
-#: Smallest number of windows into which a rest is divided, to determine the noise of the rest.
+#: Number of windows into which a short rest is divided, to determine the noise of the rest.
 FEWEST_WINDOWS = 20
 # Number of temperatures at which the columns are evaluated for settled lags, see `_settled`.
 _N_SETTLED = 9
@@ -74,7 +74,7 @@ class Sets:
 
     @property
     def families(self) -> tuple[TemperatureFunction, TemperatureFunction]:
-        """Families of static and dynamic curve; a shared dynamic curve gets the higher order."""
+        """Families of both curves; a shared dynamic curve has the higher of both orders."""
         is_higher = self.is_shared and self.static.n_free > self.dynamic.n_free
         return self.static, self.static if is_higher else self.dynamic
 
@@ -214,7 +214,7 @@ def thermal_windows(
 
     Windows are left out before the board's first reading, while the estimate of the board
     temperature settles, and while readings of a thermometer are missing. A bag without any
-    temperature is taken to be at the reference temperature, where all columns are 0.
+    board temperature is taken to be at the reference temperature, where all columns are 0.
 
     `tracks`: thermal states of the bags, if already computed with the detector of `model`
     """

@@ -58,7 +58,8 @@ def open_bags(
     """
     Read bags for windows of `window_s`; the first calibration, if any, sets topics and full scale.
 
-    Raises RecordingError if a bag cannot be read, or lacks a board temperature that is needed.
+    Raises RecordingError if a bag cannot be read, is given twice, has a dead axis, or lacks a
+    board temperature that is needed.
     """
     require: tuple[Role, ...] = ('board',)
     known: dict[str, Any] = {}
@@ -136,8 +137,8 @@ def evaluate(
     Judge calibrations of a unit, given with their names, on recordings of the unit.
 
     Gravity [m/s^2] and topics default to those of the first calibration; `tolerance`: largest
-    accepted RMS of ``|f| - g`` [m/s^2]; `serial`: see `replay.check_unit`; `force`: the user's
-    options about rests at which |f| is not g.
+    accepted RMS of ``|f| - g`` [m/s^2]; `serial`: serial of the unit, None for that of the
+    recordings, '' for any; `force`: the user's options about rests at which |f| is not g.
 
     Raises RecordingError if a recording cannot be read, or no window at rest is corrected, and
     CalibrationError if a calibration is for another unit.
@@ -186,9 +187,7 @@ class Epoch:
 
 @dataclass(frozen=True)
 class Drift:
-    """
-    The change of a constant between two calibrations; a change beyond three sd is significant.
-    """
+    """The change of a constant between two calibrations, significant if beyond three sd."""
 
     earlier: str
     later: str
@@ -229,7 +228,7 @@ def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
 
 
 def drifts_of(history: Sequence[Epoch]) -> list[Drift]:
-    """List the changes from each calibration to the next, whose errors are independent."""
+    """List the changes from each calibration to the next, with errors taken as independent."""
     return [
         Drift(
             earlier=before.date,

@@ -49,7 +49,7 @@ class Judgement:
     `left_out_rms` is the fit's RMS on positions left out, NaN if the bags are not those of the
     fit; `tolerance` is the user's limit on the RMS [m/s^2]. `shifts`: shift of bias and scale of
     each axis, empty with fewer than six distinct positions; `moved`: text of each significant
-    shift; `axis_rms`: see `rms_by_axis`; `rate`: judgement of the gyroscope.
+    shift; `axis_rms`: RMS drift by regime and axis; `rate`: judgement of the gyroscope.
     """
 
     kind: Verdict
@@ -72,7 +72,7 @@ class Judgement:
 
     @property
     def exit_code(self) -> int:
-        """Exit code: 1 if not valid, or a gyroscope is `RECALIBRATE` or `NO_BETTER`, else 0."""
+        """1 if not valid, or if a gyroscope's verdict is `RECALIBRATE` or `NO_BETTER`, else 0."""
         is_wrong = self.rate and self.rate.kind in (Verdict.RECALIBRATE, Verdict.NO_BETTER)
         return 0 if self.is_valid and not is_wrong else 1
 

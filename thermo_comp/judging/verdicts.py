@@ -17,7 +17,7 @@ from ..unit.prediction import SlowUncertainty
 from ..unit.rate_bias import MILLIDEGREE
 from .windows import JudgedWindows
 
-#: Largest ratio of RMS error to claimed RMS at which a calibration is valid.
+#: Largest ratio of RMS error to claimed RMS of a valid calibration, if no tolerance is given.
 LARGEST_RATIO = 2.0
 #: Ratio of claimed RMS to raw RMS above which, without a tolerance, a valid calibration is wide.
 WIDE_PART = 0.5
@@ -71,9 +71,7 @@ class Section:
 
 
 class Sections(dict[str, Section]):
-    """
-    The sections ``static``, ``dynamic`` and ``all`` within the calibrated ranges, and ``outside``.
-    """
+    """Sections ``static``, ``dynamic``, ``all``, inside the calibrated ranges; and ``outside``."""
 
     @property
     def regimes(self) -> list[Section]:

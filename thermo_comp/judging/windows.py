@@ -104,9 +104,7 @@ def sum_length(window_s: float) -> float:
 
 
 def usual_window(bags: Sequence[ReducedBag]) -> float:
-    """
-    Choose the duration of windows [s]: a multiple of the partial sums' duration, 60 s or more.
-    """
+    """Choose the duration of windows [s], 60 or more: a multiple of that of the partial sums."""
     longest = max(bag.window_s for bag in bags)
     return float(np.ceil(WINDOW_S / longest - 1e-6)) * longest
 
@@ -248,9 +246,7 @@ def _table(
 
 
 def _joined(sums: _Table) -> _Table:
-    """
-    Join the partial sums of each row to a window; drop windows with uncorrected partial sums.
-    """
+    """Join the partial sums of each row to a window; drop windows with uncorrected sums."""
     result = sums[:, 0].copy()
     result['count'] = sums['count'].sum(axis=1)
     result['excess'] = sums['excess'].max(axis=1)

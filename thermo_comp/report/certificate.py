@@ -104,11 +104,7 @@ def budget(evidence: Evidence, info: CertificateInfo) -> tuple[Contribution, ...
 
 
 def unclaimed_gravity_sd(evidence: Evidence, info: CertificateInfo) -> float | None:
-    """
-    Return the standard uncertainty of gravity beyond the part in the covariance [m/s^2].
-
-    None if the uncertainty of gravity is not stated.
-    """
+    """Return the standard uncertainty of gravity not in the covariance [m/s^2]; None: unstated."""
     stated = info.gravity.standard_uncertainty_m_s2
     if stated is None:
         return 0.0 if evidence.gravity_sd else None
@@ -123,7 +119,7 @@ def combined(contributions: tuple[Contribution, ...]) -> float:
 def results(
     evidence: Evidence, info: CertificateInfo, contributions: tuple[Contribution, ...]
 ) -> list[Result]:
-    """List the constants at the reference temperature, and the mean residual of |f|."""
+    """List constants and nonlinear terms at the reference temperature, and the mean |f| - g."""
     calibration = evidence.calibration
     if calibration is None:
         return []
@@ -208,9 +204,7 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
 
 
 def _four_digits(value: Floats) -> Floats:
-    """
-    Return the uncertainties, (columns,), that leave four digits (`rounded`) of the largest values.
-    """
+    """Return uncertainties, (columns,), for which `rounded` gives 4 digits of largest values."""
     largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
     return np.asarray(10.0 ** (np.floor(np.log10(largest)) - 2.0))
 
@@ -249,9 +243,10 @@ def conformity(evidence: Evidence) -> tuple[str, str]:
     does = 'conforms' if judgement.is_valid else 'does not conform'
     return (
         f'The unit {does} to the limit of {limit} µg.',
-        'Rule: simple acceptance. The RMS of |f| − g of each regime within the calibrated ranges '
-        'is at most the limit, and below the RMS without correction; the uncertainty is not '
-        'subtracted from the limit (guard band 0).',
+        'Rule: simple acceptance. Within the calibrated ranges the RMS of |f| − g of each regime '
+        'and, if known, on positions left out of the fit is at most the limit, and the overall '
+        'RMS of |f| − g is below that without correction, if the correction depends on '
+        'temperature; the uncertainty is not subtracted from the limit (guard band 0).',
     )
 
 

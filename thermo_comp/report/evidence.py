@@ -112,7 +112,7 @@ class Evidence:
 
     @property
     def level(self) -> Literal['good', 'reserved', 'poor', 'open']:
-        """Good: valid; reserved: valid with reservations; poor: not valid; open: no verdict."""
+        """Good: valid; reserved: wide claim or reservations; poor: not valid; open: no verdict."""
         if self.judgement is None or self.judgement.kind in (Verdict.OUTSIDE, Verdict.NO_CLAIM):
             return 'open'
         if not self.judgement.is_valid:
@@ -149,7 +149,7 @@ class Evidence:
 
     @cached_property
     def least_known(self) -> LeastKnown | None:
-        """The attitude with the largest sd of |f|; None without a calibration."""
+        """The attitude with the largest sd of |f|; None without a calibration's covariance."""
         if self.calibration is None:
             return None
         return least_known(self.calibration, np.array([rest.up for rest in self.positions]))
@@ -186,7 +186,7 @@ class Evidence:
         return text if n == n_rests else f'{text} ({counted(n_rests, "rest")})'
 
     def axis_residuals(self) -> dict[str, Floats]:
-        """Return the force less the vector |f| in the mean direction of the position, (n, 3)."""
+        """Return the force less the known |f| along the position's mean direction, (n, 3)."""
         windows = self.windows
         if windows is None or self.gravity is None or not self.positions:
             return {}
@@ -216,9 +216,9 @@ def evidence_of_bags(
     """
     Return the evidence of bags, judged with a calibration if given, or of a calibration alone.
 
-    `window_s` and `tolerance` are as for `evaluate`; an empty `serial` accepts any calibration;
-    `others` are earlier or later calibrations of the unit. Raises CalibrationError for a
-    calibration of another unit; RecordingError if the sample rate is too low for the windows.
+    `window_s`: length of a window; `tolerance`: largest accepted RMS [m/s^2], or None; an empty
+    `serial` accepts any calibration; `others`: earlier or later calibrations of the unit. Raises
+    CalibrationError for another unit's calibration; RecordingError if the sample rate is too low.
     """
     windows = judgement = None
     serials = sorted({bag.source.serial for bag in bags if bag.source.serial})
@@ -245,7 +245,7 @@ def evidence_of_bags(
 
 
 def evidence_of_fit(result: FitResult, gravity_sd: float = 0.0) -> Evidence:
-    """Return the evidence of a fit on its bags; `gravity_sd`: option of the fit [m/s^2]."""
+    """Return the evidence of a fit on its bags; `gravity_sd`: given to the fit [m/s^2]."""
     rests = [(bag.source.name, rest.start_ns) for bag in result.bags for rest in bag.intervals]
     left_out = {(place.source, place.start_ns): place.left_out_rms for place in result.positions}
     against = [f'{note.name}: {note.message}' for note in result.findings if _is_reservation(note)]

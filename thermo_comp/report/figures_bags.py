@@ -19,7 +19,7 @@ from .evidence import LEFT_OUT, RAW, Evidence, Position, required
 from .html import number
 from .trace import ShownBag
 
-# Time at the start of a position whose mean reading counts as zero drift [s].
+# Length of the part at the start of a position whose mean reading counts as zero drift [s].
 _ZERO_S = 120.0
 _SHADE = '#E9E9E9'
 # Diameter of the ring of the position with the largest residual [pt].
@@ -99,7 +99,7 @@ def draw_residuals(evidence: Evidence) -> Figure:
 
 
 def draw_gravity(evidence: Evidence) -> Figure:
-    """Draw |f| over time, raw and corrected, and corrected in detail (the paper's Fig. 7)."""
+    """Draw |f| - g over time, raw and corrected, and corrected in detail (the paper's Fig. 7)."""
     residuals = evidence.residuals
     corrected = [name for name in residuals if name != RAW]
     sets = [forces for forces in (list(residuals), corrected) if forces]

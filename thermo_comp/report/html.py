@@ -77,8 +77,7 @@ def number(value: float, digits: int = 3) -> str:
     if size > 8:
         return f'{value:.{digits - 1}e}'
     decimals = min(digits - 1 - size, digits)
-    # Adding 0.0 turns a negative zero into 0.0.
-    return minus(f'{round(value, decimals) + 0.0:.{max(decimals, 0)}f}')
+    return minus(f'{round(value, decimals) + 0.0:.{max(decimals, 0)}f}')  # + 0.0: no minus zero
 
 
 def minus(text: str) -> str:

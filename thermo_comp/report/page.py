@@ -160,7 +160,7 @@ def _judged_bags(evidence: Evidence) -> list[str]:
 
 
 def _test_dates(evidence: Evidence) -> str:
-    """Return the days on which the bags of the calibration's fit began, empty without bags."""
+    """Return the days on which the bags began, if the fit used one of these bags; else ''."""
     if not evidence.bags or not evidence.is_seen:
         return ''
     days = sorted(f'{utc(span_of(bag)[0]):%Y-%m-%d}' for bag in evidence.bags)

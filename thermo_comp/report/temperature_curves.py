@@ -46,7 +46,7 @@ class Curve(NamedTuple):
 
 
 def programs(calibration: Calibration) -> list[Program]:
-    """Return a soak and, if bias or scale depend on the rate, ramps at half the largest rates."""
+    """Return a soak and, if bias or scale depend on the rate, ramps at half the valid rates."""
     static, dynamic = calibration.regime_sets()
     result = [Program('soak', static, 0.0)]
     if calibration.response or static != dynamic:

@@ -18,7 +18,7 @@ from ..thermal.settings import DetectorSettings
 from ..thermal.tracker import ThermalTracker
 from ..typing import Floats
 
-# Largest number of points of a line; a figure has fewer pixels.
+# Largest number of points of a line; a figure has fewer pixels in a row.
 _MOST_POINTS = 4000
 
 
