@@ -175,8 +175,8 @@ def with_excluded_error(
     rms = float(np.sqrt(np.mean(drift**2))) / MICRO_G
     text = (
         f'{names}: the correction by {others} leaves a drift of {rms:.0f} ug. The fit did not use '
-        'these data; the published uncertainty includes this drift. Another environment, such as '
-        'still air or another mounting, needs a separate calibration'
+        'these data; the published uncertainty includes their errors. Another environment, such '
+        'as still air or another mounting, needs a separate calibration'
     )
     if is_updated:
         text = (
