@@ -178,8 +178,8 @@ def replay(
         '--output',
         '-o',
     ),
-    keep_inputs: bool = option('Also copy the inputs to the output.', False, '--keep-inputs'),
-    all_topics: bool = option('Also copy all topics to the output.', False, '--all-topics'),
+    keep_inputs: bool = option('Also copy the input topics.', False, '--keep-inputs'),
+    all_topics: bool = option('Also copy all topics of the bag.', False, '--all-topics'),
     serial: str | None = options.SERIAL,
     frame_id: str = option('frame_id of the output messages; default: that of the input.', ''),
     transition_time: float = option(

@@ -48,9 +48,9 @@ def fleet_fit(
     grouped by the serial in their metadata. Calibrations go to OUT/units, the
     table of the tests to OUT/fleet.parquet and .csv, its statistics to
     OUT/fleet.html, the prior from the valid units (see `thermo_comp prior`) to
-    OUT/prior.yaml. A second run fits only tests that are missing or have
-    changed. Exit code 1 unless every unit has a valid calibration from all of
-    its bags.
+    OUT/prior.yaml. A second run fits only tests without a result for the
+    same bags and options. Exit code 1 unless every unit has a valid calibration
+    from all of its bags.
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates

@@ -186,7 +186,7 @@ def report(
     output: Path = option('Page to write (HTML).', ..., '--output', '-o'),
     bags: list[Path] | None = options.JUDGED_BAGS,
     calibration: list[Path] | None = option(
-        'Calibration of the unit (YAML); several show the changes.', None, '--calibration', '-c'
+        'Calibrations of the unit (YAML), whose changes are shown.', None, '--calibration', '-c'
     ),
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,

@@ -90,7 +90,7 @@ class Output:
 
     @contextmanager
     def live(self) -> Iterator[Callable[..., None] | None]:
-        """Yield a function that redraws a table with lines below it; None without a terminal."""
+        """Yield a function that redraws a table and lines; None if `quiet` or no terminal."""
         if self.quiet or not sys.stderr.isatty():
             yield None
             return

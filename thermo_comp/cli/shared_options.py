@@ -121,7 +121,7 @@ def check_rate(rate_hz: float | None) -> float | None:
 
 
 FORCE = option('Overwrite an existing output of the same kind.', False, '--force', '-f')
-QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
+QUIET = option('Print only errors and missing parts of bags.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
 JUDGED_BAGS = argument('Bags to judge the calibration on.', None, metavar='[BAG]...')
 CERTIFICATE_INFO = option(

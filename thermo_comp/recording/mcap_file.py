@@ -80,7 +80,7 @@ class McapFile(BagFile):
             opened.pop_all()
 
     def read(self, channels: Collection[int]) -> Iterator[Messages]:
-        """Read the messages of some channels in reading order."""
+        """Read the messages of some channels in the order of their log times."""
         order = sorted(range(len(self.spans)), key=lambda row: self.spans[row].start_ns)
         spans = [self.spans[row] for row in order]
         loaded = map(partial(self._load, channels), spans)
