@@ -197,7 +197,7 @@ class Acquisition:
         self._centre = coverage.rough_centre(means)
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
-        """Combine the rests of the position that end before `end_ns`."""
+        """Combine the rests of the present position that end before `end_ns`."""
         by_name = {
             name: survey_thermometer([_part(part, _FIRST_NS, end_ns) for part in parts])
             for name, parts in self._readings.items()

@@ -203,7 +203,7 @@ def replay(
     out: Output = options.out,
 ) -> None:
     """
-    Correct a whole bag offline; the output equals that of the live node.
+    Correct a whole bag offline; the output equals that of the node for this bag.
 
     Writes imu/data_raw (sensor_msgs/Imu), regime/dynamic (std_msgs/Bool)
     and regime/stamped (the regime with its stamp); the log time of each

@@ -352,7 +352,7 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')
-    out.line('*: chosen; ~: worse than * by at most one standard error; +: besides the curve')
+    out.line('*: chosen; ~: worse than * by at most a standard error; +: groups besides the curve')
 
 
 def _named(groups: tuple[str, ...]) -> str:

@@ -47,10 +47,10 @@ def fleet_fit(
     Each folder of bags is a thermal test of a unit; bags directly in DIR are
     grouped by the serial in their metadata. Calibrations go to OUT/units, the
     table of the tests to OUT/fleet.parquet and .csv, its statistics to
-    OUT/fleet.html, the prior from the valid units (see `thermo_comp prior`) to
-    OUT/prior.yaml. A second run fits only tests without a result for the
-    same bags and options. Exit code 1 unless every unit has a valid calibration
-    from all of its bags.
+    OUT/fleet.html, a prior of the units with complete data and a valid
+    calibration (see `thermo_comp prior`) to OUT/prior.yaml. A second run fits
+    only tests without a result for the same bags and options. Exit code 1
+    unless every unit has a valid calibration from all of its bags.
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates

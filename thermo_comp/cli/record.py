@@ -53,7 +53,7 @@ def record(
     Reads the topics of the driver, or a growing bag. Shows the positions with
     their temperatures and ramps, the expected accuracy of bias, scale and
     misalignment, and the direction for the next position. Ends when the test
-    is complete, or with Ctrl-C; the same command continues the test.
+    or the bag is complete, or with Ctrl-C; the same command continues the test.
 
     Example:
       thermo_comp record --positions 18 --soak 45min -o bags/unit43

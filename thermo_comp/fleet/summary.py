@@ -23,7 +23,7 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# Largest ratio of the sd of a value by its fit to the spread over the units. With a larger ratio
+# Largest ratio of a value's sd (by its fit) to the spread over the units. With a larger ratio
 # the data do not determine the quantity, and its value is about that of the prior of the fit.
 _LARGEST_SD = 5.0
 # Residuals [ug] and noises [ug/sqrt(Hz)] below this number are set to it, for their logarithms.

@@ -286,7 +286,7 @@ def unstamped(stamp_ns: int) -> str:
 
 
 def clocks_apart(block: Block) -> str:
-    """Return a warning for samples with one stamp, or for a thermometer on another clock."""
+    """Return a warning for equal stamps, or for samples and readings of two clocks, or ''."""
     stamps = block.accel_stamp_ns
     if len(stamps) >= _FEWEST_READINGS and (stamps == stamps[0]).all():
         return unstamped(int(stamps[0]))
@@ -306,7 +306,7 @@ def clocks_apart(block: Block) -> str:
 def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
-    A clock that is set during a recording leaves a gap of years, too long for a grid over time. A
+    A clock that is set during a recording can leave a gap of years, too long for a time grid. A
     gap of an hour suffices: after it the thermal state is unknown. RecordingError for more than
     `_MOST_JUMPS` jumps, or if the recording is too sparse (`_SPARSE_NS`, `_SPARSEST_NS`).
     """

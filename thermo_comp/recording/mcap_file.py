@@ -64,7 +64,7 @@ _new_stream: Any = ReadDataStream  # type hints differ between versions of the `
 
 
 class McapFile(BagFile):
-    """An open MCAP file; `spans` are the parts that hold messages, in the order of the file."""
+    """An open MCAP file; `spans` are its parts that hold messages, in file order."""
 
     def __init__(self, path: Path, name: Path) -> None:
         super().__init__(name)
