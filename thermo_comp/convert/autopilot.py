@@ -45,7 +45,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while thermal drift is corrected: name, times, values, advice."""
+    """A parameter that is 1 while the autopilot corrects thermal drift; times of its values."""
 
     parameter: str
     since_ns: Sequence[int]

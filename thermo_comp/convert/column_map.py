@@ -303,7 +303,7 @@ def column_map_text(columns: ColumnMap) -> str:
 def _reads_temperature(values: Floats, unit: str) -> bool:
     """
     Whether the values of a column can be temperatures: most values are in the plausible range.
-    Whole numbers, which may number boards or tests, must change, but in few rows only.
+    Whole numbers, which may number boards or tests, must change, but in under 10 % of rows.
     """
     slope, offset = _CELSIUS[unit]
     celsius = values[np.isfinite(values)] * slope + offset

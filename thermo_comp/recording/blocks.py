@@ -210,7 +210,7 @@ class Recording(NamedTuple):
 
 
 def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Join blocks to blocks of at least `BLOCK_MESSAGES` messages, each with one `frame_id`."""
+    """Join blocks until they have `BLOCK_MESSAGES` messages, or until `frame_id` changes."""
     waiting: list[Block] = []
     frame_id: str | None = None
     for block in blocks:

@@ -81,7 +81,7 @@ def _size(path: Path) -> int:
 
 
 def numbered_bags(folder: Path) -> list[Path]:
-    """List the bags of a folder, in the order of their numbers."""
+    """List the bags of a folder that are named by a number, in the order of the numbers."""
     bags = {int(path.stem): path for path in folder.glob('*.mcap') if path.stem.isdecimal()}
     return [bags[number] for number in sorted(bags)]
 

@@ -100,7 +100,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(error.message, key=shown(f'{topic}:{path}')) from error
 
     def _open(self, path: Path) -> RecordingInfo:
-        """Open the files; files that rosbag2 has compressed are expanded to temporary files."""
+        """Open the files; files that rosbag2 has compressed as a whole are expanded before."""
         described = _described(path)
         folder = ''
         if described.compression == 'file':

@@ -256,7 +256,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Return a cell length of at least `least` [ns] such that whole cells fill 1 to 60 windows."""
+    """Return a cell length [ns] of which whole cells fill 1 to 60 windows, or `least` [ns]."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:
@@ -344,8 +344,8 @@ def still_runs(
 
 def without_rotation(cells: Cells) -> Cells:
     """
-    Subtract from the angular rate of each cell the median rate of the last 10 s, so that a unit at
-    a constant angular rate counts as at rest, and a unit whose rate changes does not.
+    Subtract from the angular rate of each cell its median over the 10 s up to it: a unit at a
+    constant angular rate counts as at rest, and a unit whose rate changes does not.
     """
     n = max(1, round(_ROTATION_S / cells.cell_s)) if cells.cell_s else 1
     if len(cells.rate) <= n or not cells.rate.any():
