@@ -63,9 +63,8 @@ def convert(
     Without a map, convert guesses a map from the headings and prints the map; a
     table with the columns t ax ay az wx wy wz, in this order, or without t or
     wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
-    is that of the IMU (if missing, of the barometer), and the case temperature
-    that of the barometer; in a bag the thermometer that shares most namespaces
-    with the Imu topic is the board thermometer.
+    is the IMU's (if missing, the barometer's), the case temperature the barometer's;
+    in a bag the thermometer nearest the Imu (in namespaces) is the board thermometer.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42

@@ -39,9 +39,8 @@ def update(
     The calibration is the prior; the ageing since the fit is estimated from
     the rests, which may be in any attitude. Old and new calibration are
     compared on days left out of the update. The new calibration is written only
-    if the rests determine an axis, and the mean square of |f| - g decreases by
-    more than the standard error of the decrease; else the exit code is 3, and
-    the present sds are printed.
+    if the rests determine an axis and lower the mean square of |f| - g by more than
+    its standard error; else the exit code is 3, and the present sds are printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml

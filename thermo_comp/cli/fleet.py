@@ -130,7 +130,7 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     )
     if result.prior is not None:
         out.line(
-            f'{result.prior}: prior of the type of unit, from the units with a valid calibration'
+            f'{result.prior}: prior of the type, from units with complete data and a valid fit'
         )
     elif with_prior:
         out.line(f'- fitted without a prior: {result.no_prior}')

@@ -187,8 +187,7 @@ def render_fleet(
         'How large are the residuals of |f| in the fleet?',
         'Share of the units whose residual at rest is below a value: raw (corrected with the '
         'constants at the reference temperature alone), and corrected with each unit’s '
-        'calibration. A steep curve means similar units; inspect the units at the right end of '
-        'a curve.',
+        'calibration. A steep curve means similar units; inspect those at a curve’s right end.',
         partial(draw_shares, curves),
     )
     distances = ReportFigure(
