@@ -130,8 +130,8 @@ def _thermal(
         notes.append(f'scale over temperature is {folded if up else "lost"}: up to {lost}')
     constant = float(np.max(np.abs(gain - 1.0)))
     if constant > 1e-8:
-        rest = folded if up else 'lost, calibrate the six faces in the autopilot afterwards'
-        notes.append(f'the constant scale is {rest}: up to {1e6 * constant:.4g} ppm')
+        lost = f'{1e6 * constant:.4g} ppm' + '; calibrate six faces in the autopilot' * (not up)
+        notes.append(f'the constant scale is {folded if up else "lost"}: up to {lost}')
     worst = float(np.max(np.abs(np.array(calibration.misalignment) - np.eye(3))))
     if worst:
         notes.append(f'misalignment is lost: up to {_millionths(worst)} urad')
