@@ -177,7 +177,7 @@ def export(
         min=0,
     ),
     device_id: int = option(
-        'Device id of the sensor (TC_An_ID), by which PX4 assigns the parameters.', 0
+        'Device id (TC_An_ID), by which PX4 finds the parameters of a sensor.', 0
     ),
     up: tuple[float, float, float] | None = option(
         'Unit vector of the specific force at rest in the sensor frame; the scale error times '

@@ -98,7 +98,7 @@ _TABLE = (
     ('raw_ug', 'number', 'RMS of |f| - g at rest, corrected with the constants at T_ref alone'),
     ('static_ug', 'number', 'RMS of |f| - g at rest in the static regime, corrected'),
     ('dynamic_ug', 'number', 'RMS of |f| - g at rest in the dynamic regime, corrected'),
-    ('all_ug', 'number', 'RMS of |f| - g at rest in both regimes, corrected'),
+    ('all_ug', 'number', 'RMS of |f| - g at rest in both regimes together, corrected'),
     ('peak_ug', 'number', 'largest magnitude of |f| - g of a window at rest, corrected'),
     ('unseen_ug', 'number', 'RMS of |f| - g, or of the drift, of positions left out in turn'),
     ('claimed_ug', 'number', 'RMS over the windows of the claimed standard deviation of |f|'),

@@ -77,7 +77,7 @@ class RecordingInfo:
     """
     The content of a bag, known before its messages are read.
     `topics`: message type (several joined by `` | ``) and number of messages by name. `start_ns`
-    and `end_ns` are log times, 0 without messages. `truncated` describes the missing part;
+    and `end_ns` are log times, 0 without messages. `truncated` describes missing parts, if any;
     `metadata` holds the writer's pairs of key and value; `input` is the kind of the accelerometer
     topic; `chosen` has notes on topics selected by their type and on stamps.
     """
