@@ -298,7 +298,7 @@ def fitting(
         'Temperature at which bias and scale are stated, in degC.', 20.0, metavar='DEGC'
     ),
     min_rest_s: float | None = option(
-        'Shortest rest used, in s; default: 3, or 1 or 2 if these determine bias and scale better.',
+        'Shortest rest used, in s; default: 3, or 1 or 2 if they determine bias and scale better.',
         None,
         '--min-rest',
         metavar='S',
