@@ -36,7 +36,7 @@ def fleet_fit(
         '--with-prior',
     ),
     earlier: list[Path] | None = option(
-        'fleet.parquet of an earlier fit of the fleet, to show drift since.', metavar='TABLE'
+        'Earlier fleet.parquet of these units, to show their drift.', metavar='TABLE'
     ),
     topics: Any = options.reading,
     out: Output = options.out,
