@@ -263,7 +263,7 @@ def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
         for write, given, reason in (
             (bag.write_counts, ([1, 2], [[1, 2], [3, 4]]), r'`xyz` .* \(2, 3\), got \(2, 2\)'),
             (bag.write_counts, ([1.5], xyz), '`stamp_ns` must be one row of integers, got float'),
-            (bag.write_counts, ([-1], xyz), '`stamp_ns` must not be negative, got -1'),
+            (bag.write_counts, ([-1], xyz), '`stamp_ns` must not be negative, got -1 ns'),
             (bag.write_counts, ([2**31 * 10**9], xyz), r'`stamp_ns` .* 2\*\*31 s, got 2147483648'),
             (bag.write_counts, ([1], xyz, '', [1, 2]), '`log_ns` must have 1 values, got 2'),
             (bag.write_temperature, ([1], [1.0, 2.0]), r'`celsius` .* \(1, 1\), got \(2, 1\)'),

@@ -4,7 +4,7 @@
 Owns the state of a test during recording: its positions, the expected accuracy, missing data.
 
 Blocks of samples are added in the order of arrival. A rest whose force direction differs from that
-of the present position begins a new position; handling between the two belongs to the older one.
+of the present position begins the next position; handling in between belongs to the present one.
 """
 
 import math
@@ -23,7 +23,7 @@ from ..unit.gravity import STANDARD_GRAVITY
 
 # Minimum length of a rest [s], unless the wanted soak is shorter.
 _REST_S = 10.0
-# Minimum length of a cell of averaged samples [s]; number of samples that give the sample rate.
+# Minimum length of a cell of averaged samples [s]; number of samples for the first sample rate.
 _CELL_S, _SAMPLES_TO_BEGIN = 0.5, 30
 # Number of earlier cells that each search for rests includes, besides the new cells.
 _LOOKED_BACK = 200
@@ -148,7 +148,7 @@ class Acquisition:
         return begins
 
     def begin(self) -> None:
-        """End the position; the stamps of later blocks may be of another clock."""
+        """End the present position; the stamps of later blocks may be of another clock."""
         self._close(-_FIRST_NS)
         self._start()
 
@@ -164,7 +164,7 @@ class Acquisition:
         ranges = still_intervals(cells, self._rest_s)
         if not ranges:
             return None
-        # Search the cells after the last rest again; the variance limit follows from these alone.
+        # Search the cells after the last rest with a variance limit from these cells alone.
         end = ranges[-1][1]
         behind = cells.part(slice(end, None))
         ranges += [
@@ -184,7 +184,7 @@ class Acquisition:
         return cells.start_ns + round(float(cells.index[lower]) * cells.cell_s * 1e9)
 
     def _close(self, end_ns: int) -> None:
-        """End the position at a stamp [ns]; later samples belong to the next position."""
+        """End the present position at a stamp [ns]; later samples belong to the next position."""
         self._rests.append(self._rest(self._cells(), end_ns))
         self._readings = {
             name: [
@@ -197,7 +197,7 @@ class Acquisition:
         self._centre = coverage.rough_centre(means)
 
     def _rest(self, cells: Cells, end_ns: int) -> _Rest:
-        """Combine the rests of the position that end before `end_ns`."""
+        """Combine the rests of the present position that end before `end_ns`."""
         by_name = {
             name: survey_thermometer([_part(part, _FIRST_NS, end_ns) for part in parts])
             for name, parts in self._readings.items()

@@ -3,7 +3,7 @@
 """
 Owns the entry point of the command line: its commands and exit codes.
 
-Exit code 0: done; 1: error in the data, or the result is not valid; 2: the command line is wrong;
+Exit code 0: done; 1: error in data, files, packages, or an invalid result; 2: wrong command line;
 3: `update` does not improve the calibration; 70: a bug of thermo_comp, whose traceback is saved in
 a file. The text of an error is printed on one line of stderr.
 
@@ -73,7 +73,7 @@ app.add_typer(_fleet)
 def main(arguments: list[str] | None = None) -> None:
     """Run one command and end the process with the command's exit code."""
     hold_standard_streams()
-    # With several BLAS threads, operations on small matrices take 16 times longer on busy cores.
+    # On busy cores, operations on small matrices take 16 times longer with several BLAS threads.
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM runs clean-up code
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))

@@ -178,8 +178,8 @@ def replay(
         '--output',
         '-o',
     ),
-    keep_inputs: bool = option('Also copy the inputs to the output.', False, '--keep-inputs'),
-    all_topics: bool = option('Also copy all topics to the output.', False, '--all-topics'),
+    keep_inputs: bool = option('Also copy the input topics.', False, '--keep-inputs'),
+    all_topics: bool = option('Also copy all topics of the bag.', False, '--all-topics'),
     serial: str | None = options.SERIAL,
     frame_id: str = option('frame_id of the output messages; default: that of the input.', ''),
     transition_time: float = option(
@@ -203,7 +203,7 @@ def replay(
     out: Output = options.out,
 ) -> None:
     """
-    Correct a whole bag offline; the output equals that of the live node.
+    Correct a whole bag offline; the output equals that of the node for this bag.
 
     Writes imu/data_raw (sensor_msgs/Imu), regime/dynamic (std_msgs/Bool)
     and regime/stamped (the regime with its stamp); the log time of each

@@ -63,8 +63,8 @@ def convert(
     Without a map, convert guesses a map from the headings and prints the map; a
     table with the columns t ax ay az wx wy wz, in this order, or without t or
     wx wy wz, needs no headings. The board temperature of a PX4 or ArduPilot log
-    is that of the IMU, and the case temperature that of the barometer; in a bag
-    the thermometer in the namespace of the Imu topic is the board thermometer.
+    is the IMU's (if missing, the barometer's), the case temperature the barometer's;
+    in a bag the thermometer nearest the Imu (in namespaces) is the board thermometer.
 
     Example:
       thermo_comp convert log.csv --columns map.yaml -o unit42
@@ -177,7 +177,7 @@ def export(
         min=0,
     ),
     device_id: int = option(
-        'Device id of the sensor (TC_An_ID), by which PX4 assigns the parameters.', 0
+        'Device id (TC_An_ID), by which PX4 finds the parameters of a sensor.', 0
     ),
     up: tuple[float, float, float] | None = option(
         'Unit vector of the specific force at rest in the sensor frame; the scale error times '

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..field.ageing import Ageing
     from ..field.update import Update
 
-#: Exit code of an update that decreases the error on left-out days by a standard error at most.
+#: Exit code of an update that determines no axis, or is not clearly better on left-out days.
 NOTHING_GAINED = 3
 
 
@@ -39,8 +39,8 @@ def update(
     The calibration is the prior; the ageing since the fit is estimated from
     the rests, which may be in any attitude. Old and new calibration are
     compared on days left out of the update. The new calibration is written only
-    if the mean square of |f| - g decreases by more than the standard error of
-    this decrease; else the exit code is 3, and the present sds are printed.
+    if the rests determine an axis and lower the mean square of |f| - g by more than
+    its standard error; else the exit code is 3, and the present sds are printed.
 
     Example:
       thermo_comp update unit42.yaml rests -o unit42_new.yaml
@@ -113,7 +113,7 @@ def _overrides(allow: list[str] | None, names: tuple[str, ...]) -> list[str]:
 
 
 def _ageing(ageing: 'Ageing | None') -> dict[str, Any]:
-    """Return the attributes of `Ageing` for JSON: sds [m/s^2], and the ratio `lags` of two sds."""
+    """Return the sds of `Ageing` [m/s^2] and the ratio of the lags' sd to the assumed sd."""
     values = vars(ageing).copy() if ageing else {}
     share = values.pop('lags', None)
     return {'ageing_m_s2': values or None, 'lags_at_start': share}
@@ -126,7 +126,7 @@ def evaluate_rests(
     tolerance: float | None,
     out: Output,
 ) -> None:
-    """Print |f| - g over a rest log; exit with 1 if it exceeds the limit (tolerance or claim)."""
+    """Print |f| - g over a rest log; exit with 1 if the unit is outside the limit."""
     from ..field.series import read_rests, series_of
     from ..field.watch import LIMIT, watch
     from ..unit.calibration_file import load_calibration

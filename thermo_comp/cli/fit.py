@@ -166,8 +166,8 @@ def prior(
     Make the prior of a type of unit from calibrations of several units.
 
     The prior is the mean and scatter of the calibrations. With `fit --prior`
-    a further unit of the type needs less time in the chamber. Nonlinear terms
-    (K2, K3) of the calibrations are left out.
+    a further unit of the type needs less time in the chamber than without.
+    Nonlinear terms (K2, K3) of the calibrations are left out.
 
     Example:
       thermo_comp prior unit01.yaml unit02.yaml unit03.yaml -o type.yaml
@@ -352,11 +352,11 @@ def _print_models(out: Output, trials: Sequence['Trial']) -> None:
     )
     for name in names:
         out.line(f'{name}: {columns[name]}')
-    out.line('*: chosen model; ~: at most one standard error worse; +: groups besides the curve')
+    out.line('*: chosen; ~: worse than * by at most a standard error; +: groups besides the curve')
 
 
 def _named(groups: tuple[str, ...]) -> str:
-    """Name a model by its groups without `curve`, which all models but the smallest have."""
+    """Name a model by its groups, without `curve` if this is the first of several groups."""
     if len(groups) < 2 or groups[0] != 'curve':
         return '+'.join(groups) or 'constants'
     return ''.join(f'+{group}' for group in groups[1:])

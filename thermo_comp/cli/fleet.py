@@ -36,7 +36,7 @@ def fleet_fit(
         '--with-prior',
     ),
     earlier: list[Path] | None = option(
-        'fleet.parquet of an earlier fit of the fleet, to show drift.', metavar='TABLE'
+        'Earlier fleet.parquet of these units, to show their drift.', metavar='TABLE'
     ),
     topics: Any = options.reading,
     out: Output = options.out,
@@ -47,10 +47,10 @@ def fleet_fit(
     Each folder of bags is a thermal test of a unit; bags directly in DIR are
     grouped by the serial in their metadata. Calibrations go to OUT/units, the
     table of the tests to OUT/fleet.parquet and .csv, its statistics to
-    OUT/fleet.html, the prior from the valid units (see `thermo_comp prior`) to
-    OUT/prior.yaml. A second run fits only tests that are missing or have
-    changed. Exit code 1 unless every unit has a valid calibration from all of
-    its bags.
+    OUT/fleet.html, a prior of the units with complete data and a valid
+    calibration (see `thermo_comp prior`) to OUT/prior.yaml. A second run fits
+    only tests without a result for the same bags and options. Exit code 1
+    unless every unit has a valid calibration from all of its bags.
 
     Example:
       thermo_comp fleet fit bags/fleet -o fleet --gravity 9.8154 --no-certificates
@@ -130,7 +130,7 @@ def _print_result(out: Output, result: 'FleetResult', with_prior: bool) -> None:
     )
     if result.prior is not None:
         out.line(
-            f'{result.prior}: prior of the type of unit, from the units with a valid calibration'
+            f'{result.prior}: prior of the type, from units with complete data and a valid fit'
         )
     elif with_prior:
         out.line(f'- fitted without a prior: {result.no_prior}')

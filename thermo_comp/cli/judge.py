@@ -42,8 +42,8 @@ def evaluate(
     Judge a calibration on new bags: |f| - g at rest, raw and corrected.
 
     The verdict compares the RMS residual with --tolerance or, without
-    --tolerance, with the uncertainty that the calibration claims for the same
-    windows; six positions or more show which axis has shifted. Exit code 0
+    --tolerance, with twice the uncertainty that the calibration claims for the
+    same windows; six positions or more show which axis has shifted. Exit code 0
     only if the bags show that the calibration is valid. Rest logs of the node
     instead of bags show the drift over the days, and the day from which the
     drift exceeds the claimed uncertainty.
@@ -186,7 +186,7 @@ def report(
     output: Path = option('Page to write (HTML).', ..., '--output', '-o'),
     bags: list[Path] | None = options.JUDGED_BAGS,
     calibration: list[Path] | None = option(
-        'Calibration of the unit (YAML); several show the changes.', None, '--calibration', '-c'
+        'Calibrations of the unit (YAML), whose changes are shown.', None, '--calibration', '-c'
     ),
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,

@@ -90,7 +90,7 @@ class Output:
 
     @contextmanager
     def live(self) -> Iterator[Callable[..., None] | None]:
-        """Yield a function that redraws a table with lines below it; None without a terminal."""
+        """Yield a function that redraws a table and lines; None if `quiet` or no terminal."""
         if self.quiet or not sys.stderr.isatty():
             yield None
             return
@@ -143,7 +143,7 @@ def _shown(text: str, file: TextIO) -> str:
 
 
 def text(cell: Cell) -> str:
-    """Return a cell as text: floats with 4 digits, or as integers from 1000; None, NaN as dash."""
+    """Return a cell as text: floats with 4 digits or more, up to 6 decimals; None, NaN as dash."""
     if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
         return '-'
     if isinstance(cell, float):
@@ -190,7 +190,7 @@ def picked(value: object, names: str) -> dict[str, Any]:
 
 
 def plain(data: object) -> Any:
-    """Return data in JSON's types: arrays as lists, dataclasses as objects, NaN as null."""
+    """Return data in JSON's types: arrays as lists, dataclasses as objects, null if not finite."""
     return json.loads(json.dumps(data, default=_plainer), parse_constant=lambda _: None)
 
 

@@ -53,7 +53,7 @@ def record(
     Reads the topics of the driver, or a growing bag. Shows the positions with
     their temperatures and ramps, the expected accuracy of bias, scale and
     misalignment, and the direction for the next position. Ends when the test
-    is complete, or with Ctrl-C; the same command continues the test.
+    or the bag is complete, or with Ctrl-C; the same command continues the test.
 
     Example:
       thermo_comp record --positions 18 --soak 45min -o bags/unit43
@@ -122,7 +122,7 @@ def _read_earlier(
 def _accounts(
     out: Output, news: Iterable['News | None'], test: 'Acquisition', bags: 'PositionBags'
 ) -> Iterator['Account']:
-    """Write blocks until the test is complete; yield the test's state in pauses between blocks."""
+    """Write blocks until test or bag ends; yield the test's state at each None in `news`."""
     chosen: str | None = None
     for new in news:
         if new is not None:

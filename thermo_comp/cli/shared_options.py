@@ -121,7 +121,7 @@ def check_rate(rate_hz: float | None) -> float | None:
 
 
 FORCE = option('Overwrite an existing output of the same kind.', False, '--force', '-f')
-QUIET = option('Print nothing but errors.', False, '--quiet', '-q')
+QUIET = option('Print only errors and missing parts of bags.', False, '--quiet', '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
 JUDGED_BAGS = argument('Bags to judge the calibration on.', None, metavar='[BAG]...')
 CERTIFICATE_INFO = option(
@@ -298,7 +298,7 @@ def fitting(
         'Temperature at which bias and scale are stated, in degC.', 20.0, metavar='DEGC'
     ),
     min_rest_s: float | None = option(
-        'Shortest rest used, in s; default: 3, or less if shorter rests give more information.',
+        'Shortest rest used, in s; default: 3, or 1 or 2 if they determine bias and scale better.',
         None,
         '--min-rest',
         metavar='S',

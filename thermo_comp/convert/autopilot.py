@@ -6,8 +6,8 @@ Owns the reading of an IMU and a barometer from logs of autopilots, by the optio
 
 The thermometer of an IMU lags the surroundings, so its readings become the board temperature. The
 thermometer of a barometer follows the surroundings, so its readings become the case temperature,
-or the board temperature if the IMU has no thermometer. A simulator's log is refused, because the
-fit cannot weight samples without noise.
+or the board temperature if the IMU has no thermometer. A log without noise at rest, as of a
+simulator, is refused, because the fit cannot weight samples without noise.
 
 PX4's ULog (``.ulg``): ``sensor_accel`` holds the driver's samples before PX4's corrections, with
 the temperature of the same chip, at 1 Hz unless ``SDLOG_PROFILE`` sets a higher rate. If
@@ -16,8 +16,8 @@ calibration, and it has no temperature.
 
 ArduPilot's DataFlash (``.BIN``): old logs have a message type per IMU (``IMU``, ``IMU2``), new
 logs a message type with an instance number ``I``; the IMU's temperature is ``T`` or ``Temp``.
-Samples logged while ``INS_TCALn_ENABLE`` was 1 are dropped: their thermal drift is already
-corrected. While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets
+Samples logged while ``INS_TCALn_ENABLE`` was 1 are dropped by default: their thermal drift is
+already corrected. While ``INS_TCALn_ENABLE`` is 2 (learning) nothing is corrected; ArduPilot sets
 ``INS_TCALn_ENABLE`` to 1 after learning.
 
 https://docs.px4.io/main/en/dev_log/ulog_file_format
@@ -45,7 +45,7 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while thermal drift is corrected: name, times, values, advice."""
+    """A parameter that is 1 while the autopilot corrects thermal drift; times of its values."""
 
     parameter: str
     since_ns: Sequence[int]

@@ -3,9 +3,9 @@
 """
 Owns the reading of bags, of ROS 1 and 2, with topics and units other than those of the node.
 
-Drivers choose their topic names, and some drivers do not publish m/s^2. The Imu topic is found by
-its type. The thermometer in the namespace of the Imu becomes the board thermometer, a thermometer
-in the namespace of a barometer the case thermometer. The norm of samples at rest must be gravity.
+Drivers choose their topic names, and some drivers do not publish m/s^2. Topics that are not named
+are found by their types: as board thermometer, the thermometer with most namespaces in common with
+the Imu; as case thermometer, that nearer to a barometer than to the Imu, or else the only other.
 """
 
 from pathlib import Path, PurePosixPath
@@ -32,7 +32,7 @@ def bag_log(
     case: str | None = None,
     unit: Unit = 'm/s^2',
 ) -> ForeignLog:
-    """Read a bag; search it for topics that are None; `unit`: unit of the Imu's acceleration."""
+    """Read a bag; search for the topics given as None; `unit`: unit of the Imu's acceleration."""
     present = inspect_recording(path).topics
     with translated(path):
         inputs = find_topics(present, imu, board, case)

@@ -5,7 +5,7 @@ Owns column maps of tables: the content and unit of each column, and the message
 
 A map is a small YAML file; config/columns/ has examples. Without a map the columns are recognised
 by their headings (see `headings`). The map of a table without headings, ``[t] ax ay az [wx wy
-wz]`` as for imu_tk, is guessed: the times must rise from row to row, and the unit of acceleration
+wz]`` as for imu_tk, is guessed: the times must rise in most rows, and the unit of acceleration
 is that in which the norm of samples at rest is gravity. An angular rate is taken to be in deg/s if
 its numbers, as rad/s, would be faster than a turn by hand.
 """
@@ -35,7 +35,7 @@ _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}
 #: Range of plausible intervals between samples [s], which decides the unit of the times.
 _STEPS_S = (5e-5, 0.5)
 #: A turn by over `_TURN` rad within two blocks of `_BLOCK` samples, between still blocks (sd below
-#: `_QUIET` g), would be too fast if times were in ms: intervals up to `_SLOW_S` s are plausible.
+#: `_QUIET` g), would be too fast with times in ms: then intervals up to `_SLOW_S` s are plausible.
 _SLOW_S, _BLOCK, _TURN, _QUIET = 2.0, 12, 0.5, 0.02
 _FASTEST_RAD_S = 20.0  # largest angular rate of a unit that is turned by hand [rad/s]
 #: Stamps of the years 2000 to 2038, and their largest interval [s]. A count of us since power-up,
@@ -47,7 +47,7 @@ _FASTEST_K_S = 0.5
 # Largest share of rows in which a temperature in whole degrees changes. The numbers of boards or
 # sensors in a column alternate from row to row, so these numbers change in a larger share of rows.
 _FEW_CHANGES = 0.1
-_RISING = 0.7  # smallest share of rows with a later time than the row before; others may repeat it
+_RISING = 0.7  # smallest share of rows with a later time than that of the row before
 #: A step from the uppermost to the lowest tenth of a counter's range is an overflow.
 _WRAP_EDGE = 0.1
 _A_MAP = 'a column map: --columns MAP'
@@ -161,7 +161,7 @@ def load_column_map(path: Path) -> ColumnMap:
 
 
 def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
-    """Read all rows of a table by its column map; drop repeated temperatures."""
+    """Read all rows of a table by its column map; drop temperatures repeated within 10 s."""
     accel, gyro = columns.accel, columns.gyro
     thermometers = {'board': columns.board, 'case': columns.case}
     thermometers |= {thermometer.name: thermometer for thermometer in columns.further}
@@ -303,7 +303,7 @@ def column_map_text(columns: ColumnMap) -> str:
 def _reads_temperature(values: Floats, unit: str) -> bool:
     """
     Whether the values of a column can be temperatures: most values are in the plausible range.
-    Whole numbers, which may number boards or tests, must change, but in few rows only.
+    Whole numbers, which may number boards or tests, must change, but in under 10 % of rows.
     """
     slope, offset = _CELSIUS[unit]
     celsius = values[np.isfinite(values)] * slope + offset

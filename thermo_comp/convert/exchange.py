@@ -89,7 +89,7 @@ class _Curves(NamedTuple):
     temperature: Floats
     K: Floats
     level: Floats  # bias at the reference temperature, in input units, shape (3,)
-    bias: Floats  # [m/s^2], shape (3, n)
+    bias: Floats  # difference of the bias from `level` [m/s^2], shape (3, n)
     scale: Floats  # relative change of the scale factor, shape (3, n)
 
     @property
@@ -116,7 +116,7 @@ def _thermal(
 ) -> Content:
     """Return each axis' offset over temperature as a cubic, for an autopilot."""
     d, notes = curves.temperature - reference_c, []
-    # Before the tool's correction the driver divides counts by K, but does not change m/s^2.
+    # Before the tool's correction the driver divides counts by K; samples in m/s^2 stay the same.
     gain = curves.K if calibration.unit.input == 'm/s^2' else np.ones(3)
     loads = calibration.gravity_m_s2 * np.array(up or (0.0, 0.0, 0.0))
     offset = (curves.level / curves.K)[:, None] + curves.bias + loads[:, None] * curves.scale
@@ -130,8 +130,8 @@ def _thermal(
         notes.append(f'scale over temperature is {folded if up else "lost"}: up to {lost}')
     constant = float(np.max(np.abs(gain - 1.0)))
     if constant > 1e-8:
-        rest = folded if up else 'lost, calibrate the six faces in the autopilot afterwards'
-        notes.append(f'the constant scale is {rest}: up to {1e6 * constant:.4g} ppm')
+        lost = f'{1e6 * constant:.4g} ppm' + '; calibrate six faces in the autopilot' * (not up)
+        notes.append(f'the constant scale is {folded if up else "lost"}: up to {lost}')
     worst = float(np.max(np.abs(np.array(calibration.misalignment) - np.eye(3))))
     if worst:
         notes.append(f'misalignment is lost: up to {_millionths(worst)} urad')
@@ -178,7 +178,7 @@ def _cubics(d: Floats, offset: Floats) -> tuple[Floats, float]:
 
 
 def _losses(calibration: Calibration) -> list[str]:
-    """List the parts of a calibration that no other tool's file can hold."""
+    """List the parts of a calibration that no file of `TOOLS` can hold."""
     notes = []
     lost = sorted({term.group for term in calibration.response if any(term.bias + term.scale)})
     if lost:

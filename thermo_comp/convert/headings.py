@@ -186,7 +186,7 @@ def _stated(heading: str, units: dict[str, str]) -> str:
 
 
 def _triads(names: dict[str, str]) -> Iterator[tuple[str, tuple[str, str, str]]]:
-    """Find triads of headings that differ in x, y, z alone; yield the common part and columns."""
+    """Find triads of headings that only differ in x, y, z; yield common part and headings."""
     for name in reversed(names):
         for at in (match.start() for match in re.finditer('x', name)):
             three = [f'{name[:at]}{axis}{name[at + 1 :]}' for axis in 'xyz']

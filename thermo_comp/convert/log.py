@@ -39,7 +39,7 @@ _TOLERANCE = 0.2
 _SENSITIVITIES = (2048, 4096, 8192, 16384)
 
 _CELL_S, _MIN_SAMPLES = 0.5, 12  # length of a cell of samples [s], least number of samples in it
-# Ratio of the sd of a cell's samples to the quiet level above which the unit is taken as handled;
+# Ratio of a cell's sd to the lower quartile of the cells' sds, above which the unit is handled;
 # noise alone gives cells of 12 samples a ratio below 2.
 _MOVING_RATIO = 4.0
 _MERGE_NS = 10 * 10**9  # shortest rest between two separate movements [ns]

@@ -288,7 +288,7 @@ def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) 
 
 
 def exact_ns(cell: object, unit: TimeUnit | None) -> int:
-    """Return the exact stamp of a number or a date; `NO_STAMP` for a cell that is neither."""
+    """Return the exact stamp of a number or date; `NO_STAMP` if neither, or beyond 64 bits."""
     if unit == 'iso':
         return _iso_ns(str(cell).strip())
     try:

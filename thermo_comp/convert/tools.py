@@ -3,8 +3,8 @@
 """
 Owns the files of other calibration tools: `TOOLS` writes and reads the file of each tool.
 
-Autopilots only correct the bias of each axis, by a cubic of the sensor's temperature, which is
-limited to a range; ``raw`` and a are in m/s^2 or, for a gyroscope, in rad/s::
+The thermal parameters of autopilots correct only the bias of an axis, by a cubic of the sensor's
+temperature, which is limited to a range; ``raw`` and a are in m/s^2 or (gyroscope) rad/s::
 
     PX4        a = raw - (X0 + X1 d + X2 d^2 + X3 d^3),        d = T - TREF
     ArduPilot  a = raw - 1e-6 (p(T) - p(CALTEMP)),  p(T) = ACC1 d + ACC2 d^2 + ACC3 d^3, d = T - 35

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns fleets: fits many units in parallel; no other package imports Dask or fsspec."""
+"""Owns fleets: fits many units in parallel, by Dask and fsspec (imported only here)."""

@@ -32,7 +32,7 @@ from .work import FleetOptions, UnitOutcome, connected, run, sha256
 PAGE, PRIOR = 'fleet.html', 'prior.yaml'
 _FORMAT = 3  # version of the format of `RESULT`
 _LONGEST_NAME = 100  # longest name of a folder of results [characters]
-# Largest number of units listed on the page; the table lists all units.
+# Largest number of units listed on the page of the fleet; fleet.csv lists all units.
 _MOST_ROWS = 60
 # Verdicts on tests whose bags contradict their fit: a fit with a prior would hide the fault.
 _CONTRADICTIONS = tuple(
@@ -62,7 +62,7 @@ class FleetResult:
 
     @property
     def is_whole(self) -> bool:
-        """Whether every unit has a valid calibration, fitted to all of its bags."""
+        """Whether every unit has a valid calibration, fitted to all of its bags, all complete."""
         return all(is_valid(row) and not (row['n_left_out'] or row['n_torn']) for row in self.rows)
 
 
@@ -82,8 +82,8 @@ def fit_fleet(
     Fit all units without a stored result. Raises ThermoCompError if the folder of bags has none, a
     package is missing or the Dask cluster cannot be used, OutputError if a file cannot be written.
 
-    `progress` is called with the number of finished tests, the number of all tests, and the row of
-    the last finished test, or None before the first fit.
+    `progress` is called with the numbers of finished and of all tests of a round (without a prior,
+    then with the prior), and the row of the last finished test, or None at the begin of a round.
     """
     _require_packages()
     storage = Storage(url)
@@ -144,15 +144,15 @@ def _in_prior(row: Row) -> bool:
 def lacks_data(row: Row) -> bool:
     """
     Whether a unit's data are incomplete, so that the unit is fitted again with the prior of its
-    type. Data that contradict themselves or the fit do not count: a prior would hide the fault.
+    type. False for data that contradict themselves or the fit: a prior would hide the fault.
     """
     is_contradicted = str(row['verdict']) in _CONTRADICTIONS
     return row['is_whole'] == 0 and not is_contradicted
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
-    """Build the type's prior from the units that may be in it; or return None and the reason."""
-    # If a unit was tested several times, only the last test is used.
+    """Build and save the prior from the units of `_in_prior`; or return None and the reason."""
+    # Of the tests of one serial that `_in_prior` accepts, only the last test is used.
     tests = sorted((row for row in rows if _in_prior(row)), key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
@@ -172,7 +172,7 @@ def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, 
 def render_fleet(
     rows: Sequence[Row], summary: Summary, certificate_of: Callable[[Row], str]
 ) -> str:
-    """Render the page; `certificate_of` gives the relative path of a unit's certificate, or ''."""
+    """Render the fleet's page; `certificate_of` returns a certificate's relative path, or ''."""
     from ..report.figures_unit import draw_distances, draw_shares
     from ..report.html import render
     from ..report.page import ReportFigure, drawn_figures
@@ -187,7 +187,7 @@ def render_fleet(
         'How large are the residuals of |f| in the fleet?',
         'Share of the units whose residual at rest is below a value: raw (corrected with the '
         'constants at the reference temperature alone), and corrected with each unit’s '
-        'calibration. A steep curve means similar units; inspect the units at its right end.',
+        'calibration. A steep curve means similar units; inspect those at a curve’s right end.',
         partial(draw_shares, curves),
     )
     distances = ReportFigure(
@@ -241,7 +241,7 @@ class Results:
         return path.relative_to(self.folder).as_posix() if path.is_file() else ''
 
     def look_up(self, unit: FoundUnit, options: FleetOptions) -> Row | None:
-        """Return the stored row of a fit to the same bags with the same options, or None."""
+        """Return the stored row of a unit; None if bags, options or stored files differ."""
         folder = self.folder_of(unit.name, options.fit.prior)
         try:
             record = json.loads((folder / RESULT).read_bytes())
@@ -258,7 +258,7 @@ class Results:
         return row
 
     def store(self, unit: FoundUnit, options: FleetOptions, outcome: UnitOutcome) -> Row:
-        """Store an outcome, return its row; a failed fit leaves an earlier calibration."""
+        """Store an outcome, return its row; if the fit failed, an earlier calibration stays."""
         folder = self.folder_of(unit.name, options.fit.prior)
         row = outcome.row
         if (folder / CALIBRATION).is_file() and not (outcome.calibration and outcome.is_final):

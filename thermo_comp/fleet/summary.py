@@ -23,10 +23,10 @@ _FALSE_ALARMS = 0.05
 _UNITS_NEEDED = 8
 # Efficiency of the median absolute deviation relative to the sample sd, for a normal distribution.
 _MAD_EFFICIENCY = 0.37
-# Largest ratio of the sd of a value by its fit to the spread over the units. With a larger ratio
+# Largest ratio of a value's sd (by its fit) to the spread over the units. With a larger ratio
 # the data do not determine the quantity, and its value is about that of the prior of the fit.
 _LARGEST_SD = 5.0
-# Smaller residuals [ug] and noises [ug/sqrt(Hz)] are set to this, so that logarithms are finite.
+# Residuals [ug] and noises [ug/sqrt(Hz)] below this number are set to it, for their logarithms.
 _LEAST = 1e-12
 #: Columns of the table in which units are compared.
 QUANTITIES = tuple(column for column in COLUMNS if column.label)
@@ -50,7 +50,7 @@ class Spread(NamedTuple):
     middle: float
     sd: float  # 1.4826 times the median absolute deviation (for logarithms, times `middle`)
     z: Floats
-    limit: float = float('inf')  # smallest |z| of an outlier; infinite with too few units
+    limit: float = float('inf')  # smallest |z| of an outlier; infinite below eight units
 
     @property
     def counted(self) -> Floats:
@@ -60,7 +60,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Outlier:
-    """A unit whose value is `z` (see `Spread`) from the fleet's median `middle`."""
+    """A unit whose value of a quantity is `z` sd from the fleet's median `middle`."""
 
     name: str
     serial: str
@@ -74,7 +74,7 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Retest:
-    """Changes of bias, scale, misalignment between two tests; whether any is significant."""
+    """Changes of bias, scale, misalignment of a unit from one test to the next."""
 
     serial: str
     earlier: str
@@ -91,7 +91,7 @@ class Retest:
 
 @dataclass(frozen=True)
 class Summary:
-    """Statistics of a fleet: numbers of units by verdict; outliers and drifts, largest first."""
+    """Statistics of a fleet: units by verdict; outliers and drifts, the largest |z| first."""
 
     verdicts: dict[str, int]
     spreads: tuple[Spread, ...]

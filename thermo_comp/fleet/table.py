@@ -98,7 +98,7 @@ _TABLE = (
     ('raw_ug', 'number', 'RMS of |f| - g at rest, corrected with the constants at T_ref alone'),
     ('static_ug', 'number', 'RMS of |f| - g at rest in the static regime, corrected'),
     ('dynamic_ug', 'number', 'RMS of |f| - g at rest in the dynamic regime, corrected'),
-    ('all_ug', 'number', 'RMS of |f| - g at rest in both regimes, corrected'),
+    ('all_ug', 'number', 'RMS of |f| - g at rest in both regimes together, corrected'),
     ('peak_ug', 'number', 'largest magnitude of |f| - g of a window at rest, corrected'),
     ('unseen_ug', 'number', 'RMS of |f| - g, or of the drift, of positions left out in turn'),
     ('claimed_ug', 'number', 'RMS over the windows of the claimed standard deviation of |f|'),
@@ -122,7 +122,7 @@ _COMPARED = {
 
 
 def _places(name: str) -> dict[str, str]:
-    """Return what replaces {0} and {1} in the name of a column: axes, or elements of M."""
+    """Return the texts for {0} and {1} in the name of a column: axes, or elements of M."""
     if '{0}' not in name:
         return {'': ''}
     if name.startswith('m_'):
@@ -226,7 +226,7 @@ def fitted_cells(
 def _slopes(calibration: Calibration) -> Iterator[tuple[str, str, Floats, Floats]]:
     """
     Yield, for bias and for scale: name, unit, slopes of the static curves at T_ref and their sd,
-    (3,). The sd is NaN if the fit has left out the curve of an axis: its slope is not measured.
+    (3,). The sd of an axis is NaN if the calibration has no covariance or no curve of this axis.
     """
     layout, posterior = parameter_layout(calibration), calibration.posterior
     K = np.array([axis.scale_factor for axis in calibration.axes])
@@ -265,7 +265,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
     writer = csv.DictWriter(text, [column.name for column in COLUMNS], lineterminator='\n')
     writer.writeheader()
     for row in rows:
-        # Quote texts that a spreadsheet would evaluate as a formula.
+        # Begin texts that a spreadsheet would evaluate as a formula with an apostrophe.
         armed = [k for k, v in row.items() if isinstance(v, str) and v.startswith(_FORMULA)]
         writer.writerow({**row, **{name: f"'{row[name]}" for name in armed}})
     paths = folder / 'fleet.parquet', folder / 'fleet.csv'
@@ -275,7 +275,7 @@ def write_tables(rows: Sequence[Row], folder: Path) -> tuple[Path, Path]:
 
 
 def read_parquet(path: Path) -> list[Row]:
-    """Read the table of an earlier run; ThermoCompError for another file; missing cells: empty."""
+    """Read the known columns of an earlier run's table; ThermoCompError for another file."""
     from pyarrow import ArrowException, parquet
 
     try:

@@ -82,7 +82,7 @@ class Storage:
 
     @contextmanager
     def here(self, name: str, files: Sequence[StoredFile]) -> Iterator[Path]:
-        """Yield the path of a local bag, or of a temporary copy of a bag; raises OSError."""
+        """Yield the path of a local bag, or of a temporary copy; OSError if the copy fails."""
         if self._is_local:
             yield Path(self._root, name)
             return
@@ -167,7 +167,7 @@ def group_files(files: Sequence[StoredFile]) -> Bags:
 
 
 def _is_bag(folder: str, inside: list[StoredFile], stored: list[StoredFile]) -> bool:
-    """Whether a folder is a rosbag2 bag; a killed recorder leaves a bag without metadata.yaml."""
+    """Whether a folder is a rosbag2 bag: it has metadata.yaml, or only bags FOLDER_<number>."""
     stems = [file.name.rpartition('.')[0].rpartition('_') for file in stored]
     usual = f'{folder}/{folder.rpartition("/")[2]}'
     return any(file.name == f'{folder}/metadata.yaml' for file in inside) or all(
@@ -180,7 +180,7 @@ def _folder(name: str) -> str:
 
 
 def _serial(storage: Storage, name: str, files: Sequence[StoredFile]) -> str:
-    """Return the serial in the metadata of a bag that lies directly in the fleet's folder."""
+    """Return the serial in the metadata of a bag, or else the name of the fleet's folder."""
     try:
         with storage.here(name, files) as path, open_recording(path, require=()) as reader:
             return reader.info.metadata.get('serial') or storage.name

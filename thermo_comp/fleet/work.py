@@ -139,7 +139,7 @@ def process_unit(unit: FoundUnit, url: str, options: FleetOptions) -> UnitOutcom
 def _fitted(
     row: dict[str, Cell], bags: Sequence[ReducedBag], how: FitOptions, has_page: bool
 ) -> tuple[dict[str, Cell], str, str]:
-    """Fit bags; return the complete row, and calibration file and certificate as texts."""
+    """Fit bags; return the complete row, the texts of calibration file and certificate (or '')."""
     from ..report.evidence import evidence_of_fit
     from ..report.page import render_report
 
@@ -166,7 +166,7 @@ def dask_setup(_worker: object) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Make workers started in the context ignore Ctrl-C; raise it at the end of the context."""
+    """Make workers started in the context ignore Ctrl-C; delay its exception to the end."""
     heard: list[int] = []
     # Workers inherit the ignored SIGINT (Ctrl-C) from the fork server.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -77,7 +77,7 @@ class RecordingInfo:
     """
     The content of a bag, known before its messages are read.
     `topics`: message type (several joined by `` | ``) and number of messages by name. `start_ns`
-    and `end_ns` are log times, 0 without messages. `truncated` describes the missing part;
+    and `end_ns` are log times, 0 without messages. `truncated` describes missing parts, if any;
     `metadata` holds the writer's pairs of key and value; `input` is the kind of the accelerometer
     topic; `chosen` has notes on topics selected by their type and on stamps.
     """
@@ -210,7 +210,7 @@ class Recording(NamedTuple):
 
 
 def gathered(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Join blocks to blocks of at least `BLOCK_MESSAGES` messages, each with one `frame_id`."""
+    """Join blocks until they have `BLOCK_MESSAGES` messages, or until `frame_id` changes."""
     waiting: list[Block] = []
     frame_id: str | None = None
     for block in blocks:
@@ -286,7 +286,7 @@ def unstamped(stamp_ns: int) -> str:
 
 
 def clocks_apart(block: Block) -> str:
-    """Return a warning for samples with one stamp, or for a thermometer on another clock."""
+    """Return a warning for equal stamps, or for samples and readings of two clocks, or ''."""
     stamps = block.accel_stamp_ns
     if len(stamps) >= _FEWEST_READINGS and (stamps == stamps[0]).all():
         return unstamped(int(stamps[0]))
@@ -306,7 +306,7 @@ def clocks_apart(block: Block) -> str:
 def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
     """
     Turn a jump of the stamps by over an hour, forwards or backwards, into a gap of an hour.
-    A clock that is set during a recording leaves a gap of years, too long for a grid over time. A
+    A clock that is set during a recording can leave a gap of years, too long for a time grid. A
     gap of an hour suffices: after it the thermal state is unknown. RecordingError for more than
     `_MOST_JUMPS` jumps, or if the recording is too sparse (`_SPARSE_NS`, `_SPARSEST_NS`).
     """

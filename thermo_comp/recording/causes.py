@@ -17,7 +17,7 @@ _WITH_GRAVITY, _WITHOUT_GRAVITY = (0.8, 1.25), 0.3
 
 
 class CauseCounter:
-    """Counts the samples that a working accelerometer at rest does not send, block by block."""
+    """Counts samples that a working accelerometer at rest does not send, block by block."""
 
     def __init__(self) -> None:
         self._n = self._n_zero = self._n_absent = 0
@@ -25,7 +25,7 @@ class CauseCounter:
         self._stamps_ns: set[int] = set()
 
     def add(self, block: Block) -> None:
-        """Count such samples in the next block of the recording."""
+        """Count zero samples, messages marked as without acceleration, and stamps of a block."""
         imu = getattr(block, 'imu', None)
         covariance = getattr(imu, 'linear_acceleration_covariance', None)
         self._n += len(block.accel_stamp_ns)

@@ -3,9 +3,9 @@
 """
 Owns the spans of an MCAP file that hold messages: decompresses them and finds their messages.
 
-The size that a chunk or frame declares is only used as an upper limit. The message index of a
-chunk is only used if its records fill the chunk without gap or overlap; otherwise the records of
-the chunk are read one by one. https://mcap.dev/spec
+A complete chunk must expand to the size that it declares, at most 64 MiB. The message index of a
+chunk is only used if the messages in the index fill the chunk without gap or overlap; otherwise
+the records of the chunk are read one by one. https://mcap.dev/spec
 """
 
 import bz2
@@ -63,7 +63,7 @@ class DamagedError(Exception):
 
 @contextmanager
 def translated(path: Path, *, is_foreign: bool = False) -> Iterator[None]:
-    """Turn errors of other libraries into a RecordingError that names the file."""
+    """Turn errors of reading (if `is_foreign`, any error) into RecordingErrors with the path."""
     try:
         yield
     except RecordingError as error:

@@ -32,7 +32,7 @@ _NEVER_NS = 2**63 - 1
 _LEFT = re.compile(r'\.(?P<number>\d+)\.(?P<process>\d+)-[0-9a-f]+\.partial\.mcap')
 _SHARE = 0.2  # largest share of time spent reading the growing bag
 
-#: A new block with its serialized messages, and the bag that it comes from.
+#: A new block with its serialized messages, and a description of its bag (None: live topics).
 News = tuple[Block, RecordingInfo | None]
 
 
@@ -81,7 +81,7 @@ def _size(path: Path) -> int:
 
 
 def numbered_bags(folder: Path) -> list[Path]:
-    """List the bags of a folder, in the order of their numbers."""
+    """List the bags of a folder that are named by a number, in the order of the numbers."""
     bags = {int(path.stem): path for path in folder.glob('*.mcap') if path.stem.isdecimal()}
     return [bags[number] for number in sorted(bags)]
 
@@ -98,8 +98,8 @@ def leftovers(folder: Path) -> dict[Path, int]:
 
 def finish(path: Path, number: int) -> Path | None:
     """
-    Copy an unfinished bag to a bag with `number` (the next free number if this is taken), and
-    delete the unfinished bag; None for a bag without messages. RecordingError if it is unreadable.
+    Copy an unfinished bag to a bag with `number` (if taken, the next after all), and delete
+    the unfinished bag; None for a bag without messages. RecordingError for an unreadable bag.
     """
     with open_recording(path, require=()) as reader:
         numbers = {int(bag.stem) for bag in numbered_bags(path.parent)}

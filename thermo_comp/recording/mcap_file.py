@@ -64,7 +64,7 @@ _new_stream: Any = ReadDataStream  # type hints differ between versions of the `
 
 
 class McapFile(BagFile):
-    """An open MCAP file; `spans` are the parts that hold messages, in the order of the file."""
+    """An open MCAP file; `spans` are its parts that hold messages, in file order."""
 
     def __init__(self, path: Path, name: Path) -> None:
         super().__init__(name)
@@ -80,7 +80,7 @@ class McapFile(BagFile):
             opened.pop_all()
 
     def read(self, channels: Collection[int]) -> Iterator[Messages]:
-        """Read the messages of some channels in reading order."""
+        """Read the messages of some channels in the order of their log times."""
         order = sorted(range(len(self.spans)), key=lambda row: self.spans[row].start_ns)
         spans = [self.spans[row] for row in order]
         loaded = map(partial(self._load, channels), spans)

@@ -63,7 +63,7 @@ class Survey:
 def thermal_findings(
     thermometers: Mapping[str, ThermometerSurvey], candidates: Sequence[str] = ()
 ) -> list[str]:
-    """List faults of thermometers; `candidates` are unused topics that may hold a temperature."""
+    """List faults and lacks of thermometers; `candidates`: unused topics of temperatures."""
     findings = []
     among = f': {", ".join(candidates)}' if candidates else ''
     board = thermometers.get('board')

@@ -100,7 +100,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(error.message, key=shown(f'{topic}:{path}')) from error
 
     def _open(self, path: Path) -> RecordingInfo:
-        """Open the files; files that rosbag2 has compressed are expanded to temporary files."""
+        """Open the files; files that rosbag2 has compressed as a whole are expanded before."""
         described = _described(path)
         folder = ''
         if described.compression == 'file':
@@ -146,7 +146,7 @@ class RecordingReader(ExitStack):
         )
 
     def blocks(self, *, raw: bool = False) -> Iterator[Block]:
-        """Read the bag from its beginning, in blocks."""
+        """Read the selected part of the bag (`Topics.part`), in blocks."""
         return self._cut(self._blocks(raw))
 
     def _blocks(self, raw: bool = False) -> Iterator[Block]:
@@ -203,7 +203,7 @@ class RecordingReader(ExitStack):
                     yield file.path, channels, messages
 
     def blocks_on_one_clock(self) -> Iterator[Block]:
-        """Read the bag with jumps of the stamps shortened to an hour, for a grid over time."""
+        """Read the bag with jumps of the stamps by over an hour shortened to an hour."""
         if self._part.is_stamped:
             return without_jumps(self.blocks(), self.info.path)
         return self._cut(without_jumps(self._blocks(), self.info.path))
@@ -380,7 +380,7 @@ class ForeignFile(BagFile):
                     self.definitions[link.msgtype] = kind, link.msgdef.data
 
     def read(self, channels: Collection[int]) -> Iterator[Messages]:
-        """Read the messages of some channels (connections of `rosbags`) in reading order."""
+        """Read the messages of some channels (connections of `rosbags`), sorted by log time."""
         chosen = [self._reader.connections[number] for number in channels]
         known = {(link.topic, link.msgtype): n for n, link in zip(channels, chosen, strict=True)}
         batch: list[tuple[bytes, int, int]] = []

@@ -8,7 +8,7 @@ Two tests are relative to the noise of the bag's quiet cells: the variance insid
 interval, because a tilt by a microradian already changes a sample by a micro-g. Temperature also
 tilts a unit at rest, so a steady change over several cells of at most 50 micro-g/s is a drift and
 not a step. Two tests have absolute limits, because the quietest tenth of a flight is not a rest:
-at rest the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its level.
+at rest the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ..typing import Bools, Floats, Ints
 from .coloured_noise import roughest_at_rest, spread_of_variances
 from .glitches import is_glitch
 
-#: Largest ratio of the variance of a cell at rest (30 samples or more) to the quiet level: noise
+#: Largest variance of a cell at rest (30 samples or more) / the bag's noise variance: white noise
 #: exceeds 4 with a probability below 1e-11, and vibration that must be cut out is far above 4.
 VARIANCE_RATIO = 4.0
 #: Largest sd of samples at rest [g]: above the noise of the noisiest sensors, below the scatter
@@ -256,7 +256,7 @@ def widened(full_scale: float, samples: Floats) -> float:
 
 
 def _part_of(window_s: float, least: float) -> float:
-    """Return a cell length of at least `least` [ns] such that whole cells fill 1 to 60 windows."""
+    """Return a cell length [ns] of which whole cells fill 1 to 60 windows, or `least` [ns]."""
     for stretch in STRETCHES:
         n_cells = int(stretch * window_s * 1e9 / least * (1.0 + 1e-6))
         if n_cells:
@@ -307,7 +307,7 @@ def still_runs(
 ) -> list[list[tuple[int, int]]]:
     """
     Return the runs of still cells of any length for each value of `ratios`, the largest ratio of a
-    still cell's variance to the quiet level; `still_sd` is the largest sd at rest [g].
+    still cell's variance to the noise variance; `still_sd` is the largest sd at rest [g].
     """
     full = _is_full(cells)
     plausible = full & is_under(cells, still_sd) & ~_is_turning(cells)
@@ -344,8 +344,8 @@ def still_runs(
 
 def without_rotation(cells: Cells) -> Cells:
     """
-    Subtract from the angular rate of each cell the median rate of the last 10 s, so that a unit at
-    a constant angular rate counts as at rest, and a unit whose rate changes does not.
+    Subtract from the angular rate of each cell its median over the 10 s up to it: a unit at a
+    constant angular rate counts as at rest, and a unit whose rate changes does not.
     """
     n = max(1, round(_ROTATION_S / cells.cell_s)) if cells.cell_s else 1
     if len(cells.rate) <= n or not cells.rate.any():

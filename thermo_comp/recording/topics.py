@@ -22,8 +22,8 @@ from .blocks import Input, Role
 PLAIN = {TEMPERATURE: '', 'std_msgs/msg/Float32': 'data', 'std_msgs/msg/Float64': 'data'}
 
 _TYPES = {key: topic.type for key, topic in INPUTS.items()}
-#: Topic imu/data_raw: the driver's output in REP 145, and also the node's output. Other topics of
-#: the bag show whether the driver or the node published it.
+#: Topic imu/data_raw: the driver's output in REP 145, and also the node's output. Other topics,
+#: or metadata, of the bag show whether the driver or the node published imu/data_raw.
 _RAW = IMU_OUT.name
 #: Parts of the names of vector topics that hold no specific force.
 _NO_FORCE = re.compile('mag|gyr|angular|veloc|free|euler|rpy|dq|dv')
@@ -77,7 +77,7 @@ class BagPart:
         return begin, inf if self.end is None else origin + round(self.end * 1e9)
 
     def __str__(self) -> str:
-        """Return the limits of the part as a suffix of a bag's name, like ``[10:60]``."""
+        """Return the limits as a suffix of a bag's name, like ``[10:60]``; '' for a whole bag."""
         begin, end = ('' if limit is None else f'{limit:.12g}' for limit in (self.begin, self.end))
         return '' if self == WHOLE else f'[{begin}:{end}]'
 
@@ -90,9 +90,9 @@ class Topics:
     """
     Topics of the inputs in a bag, the choice of counts or Imu, and the part to read.
     A name matches with or without its leading slash and, if only one topic fits, with any
-    namespace. If no topic has the default name of an input, imu/data_raw is used, or else the
-    bag's only topic of the input's type, preferably an Imu. Further thermometers are given in
-    `further`, or found as ``temperature/<name>`` in the namespace of the board's topic. The
+    namespace. If no topic has the default name of an input (not `case`), imu/data_raw or else the
+    bag's only topic of the input's type is used, preferably an Imu. Further thermometers are given
+    in `further`, or found as ``temperature/<name>`` in the namespace of the board's topic. The
     reading of a thermometer may be a field, ``TOPIC:FIELD``, as for ``ros2 topic echo --field``.
     """
 

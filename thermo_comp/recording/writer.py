@@ -4,8 +4,8 @@
 Owns the writing of columns to a rosbag2 directory or a bare MCAP file, or block by block to a
 table in CSV or Parquet (with the optional dependency ``parquet``).
 
-The file gets its name only when `BagWriter.close` succeeds; if writing fails, an older file of
-this name stays.
+A bag or table gets its name only when it is complete; if writing fails, an older file of this name
+stays.
 """
 
 import csv
@@ -144,7 +144,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 self._file.append(batches)
 
     def close(self) -> None:
-        """Finish the bag and rename it to the target; on failure OutputError, and no bag there."""
+        """Finish the bag and rename it to the target; if this fails, the target is unchanged."""
         if self._file is None:
             return
         try:
@@ -164,7 +164,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
             raise
 
     def abort(self) -> None:
-        """Delete the unfinished bag; an older file of the target's name stays."""
+        """Delete the unfinished bag, unless `is_precious`; a file of the target's name stays."""
         file, self._file = self._file, None
         if file is not None:
             with suppress(OSError):
@@ -245,7 +245,7 @@ def _as_times(name: str, values: ArrayLike, n: int | None = None) -> Ints:
         raise ValueError(f'`{name}` must have {n} values, got {len(times)}')
     checked: Ints = times.astype(np.int64, copy=False)
     if len(checked) and int(np.min(checked)) < 0:
-        raise ValueError(f'`{name}` must not be negative, got {int(np.min(checked))}')
+        raise ValueError(f'`{name}` must not be negative, got {int(np.min(checked))} ns')
     return checked
 
 
