@@ -358,7 +358,7 @@ def slow_drift(number: int) -> Iterator[Study]:
 
 
 def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
-    """Add a bias walk of 20 ug per root hour, and a tilt or a decaying bias if `kind` says so."""
+    """Add a drift by `kind`: bias walk ('bias'), tilt ('support'), decaying bias ('power-on')."""
     force = np.ones((len(bag.samples), 1)) * bag.force
     if kind == 'power-on':
         decay = 1e3 * UG * rng_of('decay', unit.bias.tolist()).standard_normal(3)

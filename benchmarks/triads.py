@@ -168,8 +168,8 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
 
 def sibling(unit: UnitModel, seed: int, spread: float = 0.15) -> UnitModel:
     """
-    Return a unit of the type of `unit` whose constants and misalignment differ from it; thermal
-    coefficients, widths and heat capacities each differ by a factor of 1 +- `spread` at most.
+    Return a unit of the type of `unit` with other constants and misalignment; its thermal
+    coefficients, widths and heat capacities are those of `unit` times 1 +- `spread` at most.
     """
     rng = generator(seed, Stream.SIBLING)
 

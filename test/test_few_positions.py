@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to few positions: determined parameters are right, undetermined ones keep their prior."""
+"""In fits to few positions, parameters are right or, if undetermined, keep their prior."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The gravity check accepts good calibrations, reports aged ones, and ignores motion."""
+"""The gravity check accepts good calibrations, reports aged calibrations, and ignores motion."""
 
 import math
 

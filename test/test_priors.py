@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to little data with an earlier calibration, or with units of the type, as a prior."""
+"""Fits to little data are right with a prior: an earlier calibration, or units of the type."""
 
 from dataclasses import replace
 from functools import cache

@@ -97,11 +97,11 @@ def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
 
 
-def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_plot(real_data, work):
+def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_the_slope_of_a(real_data, work):
     topics = Topics(part=BagPart(47.5, 358.5))
     result = fit(fit_sources([freezer_bag(real_data, work)], topics)[0], OPTIONS)
     z = result.calibration.static.z
-    # The slope of |a| in the plot is 1.61 mg/K from 36 to 15 degC.
+    # In the freezer run the slope of |a| over temperature is 1.61 mg/K from 36 to 15 degC.
     slope = np.diff(z.bias_function.value(np.array([-4.0, 14.0])))[0] / 18.0 / MG
     assert slope == pytest.approx(1.61, abs=0.2)
     assert result.residuals[-1].fitted.rms / MG < 0.75

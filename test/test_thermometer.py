@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates of temperature and rate agree with the true ones, also if readings are outliers."""
+"""Estimates of temperature and rate agree with the truth, also if some readings are outliers."""
 
 import math
 

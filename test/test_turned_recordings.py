@@ -76,7 +76,7 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     assert rms(error) < 0.25 * rms(of_lag)
 
 
-def test_the_claimed_sd_of_a_single_turn_on_is_that_of_its_grade():
+def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
     # WHY: one recording does not show how much the bias changes at a turn-on. The claimed sd was
     # too small: a MEMS that changes by 0.6 mg erred by 5 times its claimed sd after a turn-on.
     rng = np.random.default_rng(3)
