@@ -322,9 +322,7 @@ def slow_thermometer(number: int) -> Iterator[Study]:
 
 
 def coarse_thermometer(number: int) -> Iterator[Study]:
-    """
-    Record a MEMS unit whose thermometer has steps of 0.1 to 1 K or a noise of 1 K.
-    """
+    """Record a MEMS unit whose thermometer has steps of 0.1 to 1 K or a noise of 1 K."""
     for label, step_k, interval_s, sd_k in (
         ('1 K each second', 1.0, 1.0, 0.02),
         ('0.5 K each minute', 0.5, 60.0, 0.02),

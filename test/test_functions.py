@@ -37,7 +37,7 @@ temperatures = st.floats(-15.0, 15.0)
 
 
 @given(st.integers(0, 2**32), st.integers(1, 40), st.integers(1, 5), st.integers(1, 5))
-def test_the_bits_of_a_sum_do_not_depend_on_the_other_axes(seed, size, before, after):
+def test_in_order_adds_the_values_along_an_array_axis_one_by_one(seed, size, before, after):
     values = np.random.default_rng(seed).standard_normal((before, size, after))
     for order in 'CF':
         total = in_order(np.array(values, order=order), 1)

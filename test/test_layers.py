@@ -53,7 +53,7 @@ HOMES = {
     'rich': {'cli', '__main__'},
 }  # fmt: skip
 
-# Packages of mathematics, which must not read a clock.
+# Packages of mathematics, which must not read a clock, except for the files `CLOCK_EXCEPTIONS`.
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {
