@@ -225,7 +225,7 @@ def test_a_damaged_file_gives_a_calibration_or_a_calibration_error(data):
 
 
 def test_a_written_file_that_is_cut_at_any_line_is_refused():
-    # WHY: a reload of a file that was still being copied lost columns and covariance silently.
+    # WHY: a file that was still being copied was loaded, without its last columns and covariance.
     lines = dump_calibration(rich_calibration()).splitlines(keepends=True)
     for n in range(1, len(lines)):
         with pytest.raises(CalibrationError, match='the file is cut'):

@@ -131,7 +131,7 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'took no part' in note
         # The slope of bag r4 above the knee is greater than that of the others by 100 ug/K on x
-        # and y and 50 ug/K on z; the board is up to 11 K above the knee: an error up to 1.1 mg.
+        # and y and 50 ug/K on z; the board is up to 11 K above the knee: up to 1.1 mg of bias.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 1100.0
     # A new bag with the bias slope of the first four bags is not reported as another environment.

@@ -176,7 +176,7 @@ def test_parameters_without_variance_give_no_sd():
 
 
 def test_the_bias_in_a_soak_includes_the_gradient_by_self_heating():
-    # WHY: the certificate left out the gradient in a soak, here 3 K, an error of 50 ug at 16 ug/K.
+    # WHY: the bias in the certificate lacked the gradient in a soak: 50 ug for 3 K and 16 ug/K.
     unit = calibration(
         response=(
             term('gradient', (30.0, 0.0, 0.0), scale=(0.0, 2e-5, 0.0)),

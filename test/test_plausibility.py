@@ -56,7 +56,7 @@ def test_the_first_reading_of_a_sensor_may_be_wrong():
 @pytest.mark.parametrize('wrong', [85.0, 24.2, -40.0])
 @pytest.mark.parametrize('sensor', ['board', 'case'])
 def test_a_wrong_first_reading_does_not_change_later_thermal_states(sensor, wrong):
-    # WHY: one reading of 85 degC after power-on caused errors of 1 mg for 20 min.
+    # WHY: one reading of 85 degC after power-on caused force errors of 1 mg for 20 min.
     memory = MemorySpec(lags=(('board', 900.0), ('case', 600.0)))
     tracker, without = tracker_of(memory=memory), tracker_of(memory=memory)
     for second in range(0, 900, 5):
