@@ -160,7 +160,7 @@ def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
 
 
-def test_a_refusal_stops_the_fit_unless_it_is_allowed():
+def test_a_refusal_stops_the_fit_unless_the_user_allows_the_refusal():
     refusal = Finding('swapped', 'refusal', 'the board leads')
     with pytest.raises(FitError, match=r'the board leads \(override with --allow swapped\)'):
         enforce([refusal], FitOptions(gravity=9.81))
