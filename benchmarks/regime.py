@@ -84,7 +84,7 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
             'CUSUM median',
             'CUSUM 95 %',
             'missed',
-            'flips',
+            'static before the end',
             'ramps',
         ]
     ]
@@ -111,7 +111,7 @@ def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, SOAK_H, seed + k) for scene in scenes for k in range(runs)]
     soaks = pool.map(run_soak, jobs, chunksize=1)
-    rows = [['sensor', 'hours', 'openings', 'switches', 'switches per hour']]
+    rows = [['sensor', 'hours', 'to dynamic', 'switches', 'switches per hour']]
     for sensor in [*dict.fromkeys(each[0] for each in soaks), 'all']:
         mine = [each for each in soaks if sensor in {each[0], 'all'}]
         span = SOAK_H * sum(each[3] for each in mine)
