@@ -269,7 +269,7 @@ def test_a_changed_curve_is_detected_and_corrected():
 
 
 def test_the_sd_of_a_bias_slope_that_no_rest_observes_grows_by_1_ug_per_k_and_root_year():
-    # Upright rests do not show the x axis: the sd of its bias slope grows by 1 ug/K per root year.
+    # Upright rests do not observe the x axis: its bias slope's sd grows by 1 ug/K per root year.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )

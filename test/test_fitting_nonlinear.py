@@ -208,7 +208,7 @@ def test_a_force_given_by_the_user_overrides_the_force_in_the_bag(tmp_path):
         read('a', ForceOptions(str(tmp_path / 'bad.txt')))
 
 
-def test_a_constant_rotation_counts_as_a_rest_and_a_changing_one_does_not(rng):
+def test_a_constant_rotation_counts_as_a_rest_and_a_changing_rotation_does_not(rng):
     time = np.arange(0.0, 240.0, 0.02)
     rate = np.interp(time, [0, 80, 100, 180, 190], [0.0, 0.0, 3.0, 3.0, 0.0])
     force = np.column_stack((0.0 * time, rate**2, 9.8 + 0.0 * time))

@@ -46,7 +46,7 @@ def test_in_order_adds_the_values_along_an_array_axis_one_by_one(seed, size, bef
 
 
 def test_a_polynomial_agrees_with_hand_numbers():
-    # Eq. (10): the fourth term is a4 t^4; Golovach's paper prints a4 t.
+    # Eq. (10): the term with a4 is a4 t^4; Golovach's paper prints a4 t.
     assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 
