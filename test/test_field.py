@@ -102,7 +102,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
         assert abs(solved.shift[scale] - expected) < 0.2 * np.sqrt(solved.posterior[scale, scale])
 
 
-def test_updates_of_ageing_units_have_small_errors_within_the_claimed_sd():
+def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms():
     # Units in level and in carried platforms age by random walks, turn-on offsets and one shock.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):

@@ -214,7 +214,7 @@ def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
     assert per_kelvin == pytest.approx(STEEPEST[0])
 
 
-def test_true_parameters_of_a_table_agree_with_the_fit_within_the_claimed_sd(noisy):
+def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
     regression, chosen, truth = noisy
     errors = truth.errors(regression, chosen.posterior)
     # Weights that the fit pruned have no sd and no entry here.
