@@ -179,7 +179,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
     # WHY: a calibration was refused, but samples were corrected with its bias.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # As the detector settings of the two files differ, the node must build a new compensator.
+    # As the detector settings of the files differ, every part of the correction is built anew.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)

@@ -52,8 +52,8 @@ def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
     (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), None)
     assert [point.temperature_c for point in lack] == pytest.approx([-40, -31, -22, -13, -4])
     for point in lack:
-        # The curve of a scale holds up to 4 K, a tenth of its range, beyond the range; farther out
-        # its slope is assumed to have an sd of 5 ppm/K, half of the slope.
+        # The curve of a scale is used to 4 K (a tenth of its range) beyond its range; farther out
+        # the slope of the scale is assumed to have an sd of 5 ppm/K, half of the fitted slope.
         sd = 0.5e-5 * 10.0 * (-4.0 - point.temperature_c)
         assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
     (finding,) = unseen_axes.judge_unseen_axes(fit, None)
