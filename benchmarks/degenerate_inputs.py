@@ -109,7 +109,7 @@ def imu(
 
 
 def _by_turns(force: np.ndarray) -> np.ndarray:
-    """Set every second sample to zero, as in a log in which rows of the gyroscope alternate."""
+    """Set every second sample to zero, as in a log with alternate rows for the gyroscope."""
     return force * (np.arange(len(force)) % 2)[:, None]
 
 
@@ -136,7 +136,7 @@ def _leaning(force: np.ndarray) -> np.ndarray:
 
 
 def _later(size_ns: int, every: int = 0) -> Callable[[np.ndarray], np.ndarray]:
-    """Add a jump [ns] to the stamps: once in the middle or, with `every`, at every such stamp."""
+    """Add a jump [ns] to the stamps: in the middle or, if `every` > 0, after each `every` rows."""
 
     def change(stamp_ns: np.ndarray) -> np.ndarray:
         row = np.arange(len(stamp_ns))

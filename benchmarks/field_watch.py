@@ -115,8 +115,8 @@ def main() -> None:
             print(
                 f'{kind:12} {name}: {len(rows)} units, {100 * shares.mean():.0f} % of the futures '
                 f'in 10 .. 90 %; median {np.median(printed):.0f} days, true '
-                f'{np.median(true):.0f}, ratio {np.exp(np.median(factor)):.2f} (of a unit: factor '
-                f'{np.exp(np.std(factor)):.1f})'
+                f'{np.median(true):.0f}, ratio {np.exp(np.median(factor)):.2f} (scatter over the '
+                f'units: factor {np.exp(np.std(factor)):.1f})'
             )
     for kind in KINDS[:2]:
         verdicts(kind, arguments.units, arguments.days)

@@ -226,9 +226,9 @@ def overhead(folder: Path, n_units: int) -> None:
     print(f'elapsed {cost.seconds:.1f} s, tasks {busy:.1f} s on both workers')
     print(f'idle workers: {100.0 * (1.0 - busy / (2.0 * cost.seconds)):.2f} % of their time')
     print(
-        f"scheduler and client: {100.0 * cost.own_cpu_s / busy:.2f} % of the tasks' processor "
-        f'time; {1e3 * cost.per_task_s:.2f} ms per unit, and {100.0 * cost.rest_cpu:.1f} % of a '
-        'processor while no task runs'
+        f'processor time of scheduler and client: {100.0 * cost.own_cpu_s / busy:.2f} % of the '
+        f'time of the tasks; {1e3 * cost.per_task_s:.2f} ms per unit, and '
+        f'{100.0 * cost.rest_cpu:.1f} % of a processor while no task runs'
     )
     print(f'network: {cost.n_bytes / n_units / 1e3:.1f} kB per unit, all connections together')
     paper(cost)

@@ -84,7 +84,7 @@ def onset_table(pool: Pool, is_quick: bool, seed: int) -> Rows:
             'CUSUM median',
             'CUSUM 95 %',
             'missed',
-            'flips',
+            'static before the end',
             'ramps',
         ]
     ]
@@ -111,7 +111,7 @@ def soak_table(pool: Pool, hours: float, seed: int) -> Rows:
     scenes = [Scene(0.5, 900.0, noise, quantum, 1.0) for noise, quantum in SENSORS]
     jobs = [(scene, SOAK_H, seed + k) for scene in scenes for k in range(runs)]
     soaks = pool.map(run_soak, jobs, chunksize=1)
-    rows = [['sensor', 'hours', 'openings', 'switches', 'switches per hour']]
+    rows = [['sensor', 'hours', 'to dynamic', 'switches', 'switches per hour']]
     for sensor in [*dict.fromkeys(each[0] for each in soaks), 'all']:
         mine = [each for each in soaks if sensor in {each[0], 'all'}]
         span = SOAK_H * sum(each[3] for each in mine)
@@ -146,7 +146,7 @@ def run_matrix(
 
 def rate_table(matrix: Matrix) -> Rows:
     """Count ramps, missed ramps, and ramps in which the flag returns to static, by rate."""
-    rows = [['readings', 'ramps', 'missed', 'missed of >= 0.2 K/min', 'with a flip']]
+    rows = [['readings', 'ramps', 'missed', 'missed, >= 0.2 K/min', 'static before the end']]
     for rate in dict.fromkeys(scene.rate_hz for scene, _ in matrix):
         mine = [(scene, result) for scene, result in matrix if scene.rate_hz == rate]
         rows.append(

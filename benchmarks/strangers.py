@@ -268,7 +268,7 @@ def run(
     done : dict of str to Calibration
         Fits of this unit by study, for studies with a prior; the new fit is added.
     earlier : mapping of (str, int) to mapping of str to Score
-        Scores of the baselines by title and unit, from an earlier run; others are computed.
+        Scores of baselines from an earlier run, by title and unit; missing scores are computed.
 
     Returns
     -------

@@ -322,9 +322,7 @@ def slow_thermometer(number: int) -> Iterator[Study]:
 
 
 def coarse_thermometer(number: int) -> Iterator[Study]:
-    """
-    Record a MEMS unit whose thermometer has steps of 0.1 to 1 K or a noise of 1 K.
-    """
+    """Record a MEMS unit whose thermometer has steps of 0.1 to 1 K or a noise of 1 K."""
     for label, step_k, interval_s, sd_k in (
         ('1 K each second', 1.0, 1.0, 0.02),
         ('0.5 K each minute', 0.5, 60.0, 0.02),
@@ -358,7 +356,7 @@ def slow_drift(number: int) -> Iterator[Study]:
 
 
 def _drifting(bag: Bag, unit: Unit, kind: str, rng: np.random.Generator) -> Bag:
-    """Add a bias walk of 20 ug per root hour, and a tilt or a decaying bias if `kind` says so."""
+    """Add a drift by `kind`: bias walk ('bias'), tilt ('support'), decaying bias ('power-on')."""
     force = np.ones((len(bag.samples), 1)) * bag.force
     if kind == 'power-on':
         decay = 1e3 * UG * rng_of('decay', unit.bias.tolist()).standard_normal(3)

@@ -97,7 +97,7 @@ def blocks_of(bag: Bag, name: str) -> dict[int, Bag]:
 
 
 def cats(path: Path) -> Iterator[Study]:
-    """Hold out the odd blocks of the real unit's recording, the even blocks, each of its rests."""
+    """Hold out the real unit's rests in odd blocks, its rests in even blocks, and each rest."""
     whole = real_unit(path)
     rests = [part(whole, rows, f'rest{k}') for k, rows in enumerate(rests_of(whole))]
     still: tuple[list[Bag], list[Bag]] = ([], [])

@@ -434,7 +434,7 @@ def flicker_noise(n: int, interval_s: float, floor: float, rng: np.random.Genera
 
 
 def lagged(node: Floats, tau_s: float) -> Floats:
-    """Return a node's temperature after a first-order lag; it is linear in time between steps."""
+    """Return a node's temperature, which is linear between steps, after a first-order lag."""
     if not tau_s:
         return node
     decay = np.exp(-STEP_S / tau_s)

@@ -158,7 +158,7 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
         FlowEffect('case', 'board', 2.0, bias=draw.signed(0.2, 1.0)),
         FlowEffect('case', 'board', 1.25, bias=draw.normal(2.0), bias_curvature=draw.normal(0.05)),
     ],
-    # Leakage doubles every 7 to 10 K; at the reference temperature it is 1 to 5 ug.
+    # Leakage doubles every 7 to 10 K, from 1 to 5 ug at the reference temperature.
     'convection': lambda draw: [
         LeakageEffect('board', draw.between(10.0, 14.5), bias=draw.signed(1.0, 5.0))
     ],
@@ -168,8 +168,8 @@ _EXTRA: dict[str, Callable[[Specimen], list[Effect]]] = {
 
 def sibling(unit: UnitModel, seed: int, spread: float = 0.15) -> UnitModel:
     """
-    Return a unit of the type of `unit` whose constants and misalignment differ from it; thermal
-    coefficients, widths and heat capacities each differ by a factor of 1 +- `spread` at most.
+    Return a unit of the type of `unit` with other constants and misalignment; its thermal
+    coefficients, widths and heat capacities are those of `unit` times 1 +- `spread` at most.
     """
     rng = generator(seed, Stream.SIBLING)
 

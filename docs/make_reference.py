@@ -38,16 +38,16 @@ AXES = ('x', 'y', 'z')
 CALIBRATION_HEAD = """\
 # The calibration file
 
-A calibration file describes one unit in YAML, and is written by `thermo_comp fit`.
+A calibration file describes one unit in YAML, and is written by `thermo_comp fit`, `update` or `import`.
 `config/calibration.example.yaml` is an annotated example, `config/calibration.schema.json` the JSON
 Schema; this page is generated from the schema.
 
 A file is refused if it has unknown or missing keys, text in place of a number, NaN or infinity,
-ranges that do not rise, functions that are not normalised at the reference temperature, a scale that
-could reach zero within its ranges, a posterior of the wrong size, another `format_version`, YAML
+ranges that do not rise, functions that are not normalised at the reference temperature, a relative scale
+that could leave 0.1 to 10, a posterior of the wrong size, another `format_version` than 2, YAML
 aliases or tags, or more than 8 MiB. The error names the file, the key, the value and the expected
-value. Numbers are written with all digits and the posterior in single precision, so that a file
-that is read and written is not changed. The last line of a written file is `...`: a written file that is cut, for
+value. Numbers are written with all digits and the posterior in single precision, so that no number
+changes if a file is read and written. The last line of a written file is `...`: a written file that is cut, for
 example by a copy that has not ended, is refused.
 
 The main keys:

@@ -127,7 +127,7 @@ def test_faults_of_a_position_are_reported(stream):
     assert account.positions[-1].n_rests == 2
 
 
-def test_the_same_direction_does_not_count_twice(stream):
+def test_a_position_that_repeats_a_direction_is_not_good(stream):
     for up in ((0, 0, 1), (1, 0, 0), (0, 0.03, 1)):
         stream.rest(up, 40.0)
         stream.turn()

@@ -132,7 +132,7 @@ def test_twenty_clients_that_set_parameters_at_once_are_all_answered(peer, tmp_p
         assert node._loop.n_failures == 0
 
 
-def test_a_link_that_replaces_a_folder_gives_no_calibration_from_outside(tmp_path):
+def test_a_link_that_replaces_a_folder_gives_no_calibration_from_another_folder(tmp_path):
     # A folder may be replaced by a link after the node has checked a path in it.
     pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
     from thermo_comp.ros.reader import read

@@ -97,7 +97,7 @@ def test_beyond_the_range_curves_follow_their_tangent_for_a_quarter_of_the_range
             np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_beyond_its_narrower_range_a_set_follows_the_curve_of_the_other_set():
+def test_outside_its_range_a_set_follows_the_curve_of_the_other_set():
     # The static set has a range of 5 to 35 degC, the dynamic set of 0 to 30 degC.
     unit = calibration(
         static=regime_set(axis_set(BENT)),
@@ -164,7 +164,7 @@ def test_the_claimed_sd_grows_with_the_distance_from_the_range():
         assert (np.sqrt(variances[3]) > 3.0 * np.abs(slopes)).all()
 
 
-def test_with_lags_the_sd_in_a_ramp_does_not_grow_with_the_distance_from_the_rates():
+def test_with_lags_the_sd_in_a_ramp_does_not_depend_on_the_calibrated_rates():
     # WHY: after bags of soaks, with rates below 0.1 K/min, the variance in a ramp was multiplied
     # by several hundred, although it already contained the variance of the lag in the ramp.
     axis = axis_set(residual_sd_m_s2=1e-5)
@@ -176,8 +176,8 @@ def test_with_lags_the_sd_in_a_ramp_does_not_grow_with_the_distance_from_the_rat
         state[BOARD], state[RATE] = 20.0, 2.0 / 60.0
         line = correction.line(state, state, np.zeros(N_ROWS), 0.0)
         sds.append(math.sqrt(line[VARIANCES[0]] - correction.noise[0]))
-    # The ramp is 19 half ranges beyond the calibrated rates, which adds variance without lags
-    # only.
+    # The ramp is 19 half ranges beyond the calibrated rates, which adds variance to the output of
+    # the unit without lags only.
     assert sds == pytest.approx([1e-5 * math.hypot(1.0, 19.0), 1e-5], rel=1e-6)
 
 

@@ -225,7 +225,7 @@ def test_a_damaged_file_gives_a_calibration_or_a_calibration_error(data):
 
 
 def test_a_written_file_that_is_cut_at_any_line_is_refused():
-    # WHY: a reload of a file that was still being copied lost columns and covariance silently.
+    # WHY: a file that was still being copied was loaded, without its last columns and covariance.
     lines = dump_calibration(rich_calibration()).splitlines(keepends=True)
     for n in range(1, len(lines)):
         with pytest.raises(CalibrationError, match='the file is cut'):
@@ -274,7 +274,7 @@ def test_paths_that_are_no_regular_file_are_refused(tmp_path):
         ('[1.0, 7.7e-05]', '[1.0, -0.05]', 'static.x.scale_function', 'must stay above 0.1'),
     ],
 )
-def test_functions_that_overflow_are_refused(old, new, key, message):
+def test_impossible_curves_and_temperatures_are_refused(old, new, key, message):
     text = (REPOSITORY / 'config' / 'calibration.example.yaml').read_text()
     text = text.replace('e_fold_k: [18.0]', 'e_fold_k: [1.0]')
     assert old in text
@@ -307,7 +307,7 @@ def test_a_posterior_with_wrong_numbers_is_refused(key, value, message):
     assert caught.value.key.startswith('posterior.')
 
 
-def test_a_posterior_of_another_size_is_refused():
+def test_a_posterior_with_fewer_variances_than_parameters_is_refused():
     n = parameter_layout(RICH).n_parameters
     with pytest.raises(
         ValueError, match=rf'`posterior.diagonal` .*per parameter \({n + 6}\), got {n}'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node's own conversion of serialized messages gives the same bytes as rclpy."""
+"""The node's conversion of serialized messages gives the bytes that conversion by rclpy gives."""
 
 import struct
 
@@ -81,7 +81,7 @@ def test_counts_are_converted_to_an_imu_message(order, sec, nanosec, frame, valu
     override=st.sampled_from(['', 'other_link']),
     values=st.lists(floats, min_size=37, max_size=37),
 )
-def test_other_fields_of_an_imu_are_copied_bit_for_bit(order, frame, override, values):
+def test_imu_fields_except_acceleration_are_copied_bit_for_bit(order, frame, override, values):
     converter = SampleConverter(Imu, override)
     (written,) = convert(converter, cdr(order, (5, 7), frame, values))
     assert converter.traffic.n_fallback == (order == '>')

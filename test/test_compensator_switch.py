@@ -36,7 +36,7 @@ def test_a_switch_of_sets_causes_no_step():
     # The blend is limited to 1 ug/s: 102 s for sets that differ by 0.3 counts = 102 ug.
     [(0.01, 30.0, 30.0), (0.3, 30.0, 1e-3 / 9.80665e-6), (0.3, 5.0, 50.0), (0.3, 0.0, 0.0)],
 )
-def test_a_switch_of_sets_that_differ_much_takes_longer(delta, given_s, expected_s):
+def test_a_transition_time_above_0_limits_the_change_to_1_ug_per_s(delta, given_s, expected_s):
     unit = calibration(dynamic=regime_set(axis_set(delta=delta)))
     compensator = Compensator(unit, CompensatorConfig(transition_time_s=given_s))
     assert compensator.thermal.tracker.config.transition_time_s == pytest.approx(expected_s)

@@ -238,7 +238,7 @@ def test_samples_compensated_by_px4_are_left_out(tmp_path, rng, begin):
     np.testing.assert_array_equal(read.accel[part], force[part])
 
 
-def test_the_report_on_a_log_at_1_hz_states_what_it_is_sufficient_for(tmp_path, rng, cli):
+def test_the_report_on_a_log_at_1_hz_names_fits_for_which_1_hz_is_sufficient(tmp_path, rng, cli):
     log = UlogWriter(OLD_ACCEL)
     number = log.subscribe('sensor_accel', 0)
     for k, force in enumerate(still(rng)):

@@ -39,7 +39,7 @@ UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def full_bank(rng, size=1.0, axes=(0, 1, 2), posterior=False):
-    """Draw a unit with random weights of all columns that two further thermometers allow."""
+    """Draw a unit with random weights of all columns for a board and two further thermometers."""
     terms = []
     for column in bank(SENSORS):
         # At the edge of its range a column adds some counts of bias and 1e-4 of scale.

@@ -104,7 +104,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert (tmp_path / 'site' / 'index.html').is_file()
 
 
-def test_the_tutorial_prints_what_it_shows(monkeypatch):
+def test_the_tutorial_prints_the_output_stored_in_the_notebook(monkeypatch):
     mpl.use('Agg')
     monkeypatch.chdir(ROOT / 'docs')
     names = {}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node and `record` read temperatures from number fields of any message, also unstamped."""
+"""The node and `record` read temperatures from number fields of stamped and unstamped messages."""
 
 import threading
 import time

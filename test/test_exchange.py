@@ -310,7 +310,7 @@ def turn(notes):
 RAW = np.array([[36400.0, 33100.0, 33300.0], [32500.0, 29000.0, 32000.0], [1.0, 65535.0, 30000.0]])
 
 
-def test_the_formula_of_imu_tk_gives_the_same_correction(tumbled):
+def test_the_formula_of_imu_tk_gives_the_correction_of_the_calibration(tumbled):
     # A file of imu_tk has 9 numbers of T, 9 of K and 3 of B for the formula X' = T K (X - B).
     file = export_calibration(tumbled, 'imu_tk')
     numbers = [float(cell) for cell in file.text.split()]
@@ -326,7 +326,7 @@ def test_the_formula_of_imu_tk_gives_the_same_correction(tumbled):
     )
 
 
-def test_formulas_of_imu_calib_and_kalibr_give_the_same_correction(tumbled):
+def test_formulas_of_imu_calib_and_kalibr_give_the_correction_of_the_calibration(tumbled):
     data = yaml.safe_load(export_calibration(tumbled, 'imu_calib').text)
     theirs = RAW @ np.reshape(data['SM'], (3, 3)).T - data['bias']
     np.testing.assert_allclose(theirs, ours(tumbled, RAW), rtol=1e-10)

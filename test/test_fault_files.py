@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""After a full disk or a killed command, an output is the complete old or complete new file."""
+"""A full disk or a kill leaves no partial file as the output of a command except `record`."""
 
 import os
 import re

@@ -4,7 +4,7 @@
 The published covariance covers faults at any time of a ramp (tested without DDS).
 
 WHY: the covariance was large enough for a fault in the middle of a ramp, but not for an equal
-fault at the start of a ramp, nor if the readings of a sensor returned with another value.
+fault at the start of a ramp, nor if a sensor had another temperature after the fault than before.
 Every published sample must have an error below five claimed standard deviations.
 """
 

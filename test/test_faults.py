@@ -128,7 +128,7 @@ def test_fault_row_without_dds(row, reference):
     assert late.any() == np.isfinite(row.recovered)
 
 
-def test_fault_row_over_dds_gives_the_same_samples(tmp_path):
+def test_fault_rows_over_dds_give_the_samples_without_dds(tmp_path):
     save_calibration(unit(), tmp_path / 'unit.yaml')
     rows = [row for row in ROWS if row.fault in OVER_DDS]
     assert len(rows) == len(OVER_DDS)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to few positions: determined parameters are right, undetermined ones keep their prior."""
+"""In fits to few positions, parameters are right or, if undetermined, keep their prior."""
 
 from dataclasses import replace
 from functools import cache
@@ -388,7 +388,7 @@ def test_the_sd_of_turn_ons_in_a_prior_is_used_for_six_positions(rng):
     assert 2e-4 < helped.static.x.residual_sd_m_s2 < 4e-4
 
 
-def test_an_update_by_three_positions_has_errors_within_the_claimed_sd(rng):
+def test_an_update_by_three_positions_has_errors_near_the_claimed_sd(rng):
     # WHY: a change of the scale was attributed to the bias, and errors were 2.4 claimed sd RMS.
     known = fit([turned(rng, positions(18, 3))], replace(OPTIONS, mounting_sd=1e-5)).calibration
     scale, bias = 1.0 + 2e-3 * rng.standard_normal(3), 1e-2 * rng.standard_normal(3)

@@ -102,7 +102,7 @@ def test_an_update_with_the_true_variances_equals_a_kalman_filter():
         assert abs(solved.shift[scale] - expected) < 0.2 * np.sqrt(solved.posterior[scale, scale])
 
 
-def test_updates_of_ageing_units_have_small_errors_within_the_claimed_sd():
+def test_updates_of_ageing_units_have_small_errors_of_at_most_1_4_claimed_sd_rms():
     # Units in level and in carried platforms age by random walks, turn-on offsets and one shock.
     squares, ratios = [], []
     for kind, seed in (('level', 1), ('level', 2), ('level', 4), ('carried', 1)):
@@ -269,7 +269,7 @@ def test_a_changed_curve_is_detected_and_corrected():
 
 
 def test_the_sd_of_a_bias_slope_that_no_rest_observes_grows_by_1_ug_per_k_and_root_year():
-    # Upright rests do not show the x axis: the sd of its bias slope grows by 1 ug/K per root year.
+    # Upright rests do not observe the x axis: its bias slope's sd grows by 1 ug/K per root year.
     unit = known(
         static=field_units.calibration().static, dynamic=field_units.calibration().dynamic
     )

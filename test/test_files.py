@@ -142,7 +142,7 @@ def test_an_output_of_a_command_is_recognised_as_its_kind(folder, cli):
 
 
 @pytest.mark.parametrize('kind', [MCAP, BAG], ids=lambda kind: kind.name)
-def test_of_two_writers_one_wins(tmp_path, kind):
+def test_of_eight_simultaneous_writers_one_writes_the_output(tmp_path, kind):
     start = threading.Barrier(8)
     won = []
     lost = []
@@ -207,7 +207,7 @@ def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path):
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
 
 
-def test_a_link_is_written_through(tmp_path):
+def test_an_output_that_is_a_link_is_written_to_the_target_of_the_link(tmp_path):
     (tmp_path / 'store').mkdir()
     link = tmp_path / 'current.yaml'
     link.symlink_to('store/unit.yaml')

@@ -49,8 +49,8 @@ def test_a_knee_in_the_curve_of_the_bias_is_found():
     knees = [term.knee_k for term in unit.response if term.group == 'bend']
     # The fit tries knees every 1 K, and uses the two that are next to the true knee.
     assert min(abs(20.0 + knee - KNEE_C) for knee in knees) < 1.0
-    # Two knees instead of the true one between them give an error of at most 20 ug/K times 0.25 K
-    # = 5 ug, and only in 1 K of the range of 22 K.
+    # Two knees, 1 K apart, in place of the true knee between them give an error of at most 20 ug/K
+    # times 0.25 K = 5 ug, and only in 1 K of the range of 22 K.
     assert left < 1.5
 
 
@@ -131,9 +131,9 @@ def test_a_bag_of_another_environment_is_excluded_and_increases_the_claimed_sd()
         (note,) = [note for note in unit.provenance.notes if note.startswith('environment: r4')]
         assert 'did not use these data' in note
         # The slope of bag r4 above the knee is greater than that of the others by 100 ug/K on x
-        # and y and 50 ug/K on z; the board is up to 11 K above the knee: an error up to 1.1 mg.
+        # and y and 50 ug/K on z; the board is up to 11 K above the knee: up to 1.1 mg of bias.
         more = sd_of_a_correction(unit) ** 2 - sd_of_a_correction(alone) ** 2
         assert 100.0 < np.sqrt(more.min()) < np.sqrt(more.max()) < 1100.0
-    # A new bag with the same slope as the first four is not reported as another environment.
+    # A new bag with the bias slope of the first four bags is not reported as another environment.
     again = tc.fit(columns_of([SLOPE] * 5)[-1:], gravity=G, input='m/s^2', prior=alone)
     assert not [note for note in again.provenance.notes if note.startswith('environment')]

@@ -86,7 +86,7 @@ def pulls(found, unit):
 
 
 @pytest.mark.slow
-def test_the_constants_of_a_fit_are_within_their_claimed_sd(response):
+def test_errors_of_fitted_constants_are_below_4_claimed_sd(response):
     # The errors of the nine constants are correlated, so one may reach 4 claimed sd.
     pull = pulls(response, OWN_LAGS)
     assert np.abs(pull).max() < 4.0

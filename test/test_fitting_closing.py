@@ -61,7 +61,7 @@ def test_the_evidence_selects_the_condition_that_ends_the_dynamic_regime(end_con
         records.append(replace(record, counts=record.counts + step))
     result = fit(sources_of(records), FitOptions(gravity=STANDARD_GRAVITY, **options))
     assert result.calibration.detector.end_condition == end_condition
-    # The fit estimates the detector settings, so its switches differ slightly from the true ones.
+    # The fit estimates the detector settings; with the true settings the switches differ slightly.
     last = result.residuals[-1]
     assert last.fitted.rms < 0.35 * last.raw.rms
 

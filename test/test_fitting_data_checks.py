@@ -160,7 +160,7 @@ def test_geometry_is_the_largest_sd_of_nine_parameters_per_sd_of_the_norm(rng):
     assert geometry(up, with_misalignment=True) == pytest.approx(scatter, rel=0.05)
 
 
-def test_a_refusal_stops_the_fit_unless_it_is_allowed():
+def test_a_refusal_stops_the_fit_unless_the_user_allows_the_refusal():
     refusal = Finding('swapped', 'refusal', 'the board leads')
     with pytest.raises(FitError, match=r'the board leads \(override with --allow swapped\)'):
         enforce([refusal], FitOptions(gravity=9.81))
@@ -204,7 +204,7 @@ def test_the_residual_of_the_fit_is_reported():
     ('given', 'name', 'message'),
     [
         ((500.0, 400.0, 300.0, 500.0), 'misfit', 'temperature does not explain'),
-        # Temperatures with stamps one hour late left 878 ug on left-out data, 692 ug raw.
+        # With temperatures stamped one hour late |f| - g was 878 ug on left-out data, 692 ug raw.
         ((692.0, 520.0, 9.0, 878.0), 'left out', 'left-out residuals exceed the raw residual'),
         ((1.1, 1.0, 0.1, 1.0), 'compensated', 'already compensated?'),
         # WHY: noise, a temperature range of 0.3 K and turn-on offsets each gave wrong advice.
@@ -214,7 +214,7 @@ def test_the_residual_of_the_fit_is_reported():
         ((100.0, 1.0, 0.2, 1.5), 'units', 'expected near 1'),
     ],
 )
-def test_residuals_too_large_for_a_good_fit_are_reported(given, name, message):
+def test_the_advice_about_residuals_follows_from_their_sizes(given, name, message):
     options = {'input': 'm/s^2'} if name == 'units' else {}
     assert message in judged(*given, **options)[name].message
 
@@ -258,7 +258,7 @@ def test_the_gradient_of_a_soak_does_not_depend_on_the_ramps(good, rng):
     [((1.0, 1.2, 0.53), 3, True), ((1.0, 1.2, 0.53), 6, False), ((0.9, 1.1, 1.2), 3, False)],
 )
 def test_implausible_scale_factors_from_few_attitudes_are_refused(kappa, n, is_refused):
-    # WHY: a fit to three attitudes found scale factors of 1.04, 1.19 and 0.53, an error of 0.3 g.
+    # WHY: a fit to three attitudes found scale factors of 1.04, 1.19, 0.53: force errors of 0.3 g.
     state = SimpleNamespace(kappa=np.array(kappa), up=positions(n, 3))
     prior = SimpleNamespace(informative=None, scale_mean=np.ones(3), scale_sd=0.05)
     fit = SimpleNamespace(posterior=SimpleNamespace(state=state, prior=prior))

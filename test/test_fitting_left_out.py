@@ -25,7 +25,7 @@ def score(drift, norms=(), by_thermometer=0.0):
 def test_few_norms_that_both_models_predict_do_not_select_the_model():
     # WHY: a MEMS was recorded in six faces at three temperatures. Only four left-out values of |f|
     # could be predicted both with and without a curve over temperature. The curve reduced their
-    # errors by less than two standard errors, so the fit left it out: an error of 7 mg.
+    # errors by less than two standard errors, so the fit left it out: the force error was 7 mg.
     constants = score(20.0, [22.4, 457.7, 54.6, 26.1])
     curve = score(20.0, [16.8, 21.0, 22.5, 25.2])
     assert not is_better(constants, curve)
@@ -51,7 +51,7 @@ def test_a_larger_model_must_not_explain_the_errors_of_a_coarse_thermometer():
 
 def test_a_fit_with_large_mounting_offsets_must_not_increase_left_out_norms():
     # WHY: a fit with mounting offsets of 5 mg attributed a random walk of the bias (20 ug in an
-    # hour) to scale factors: its evidence was larger, but its error was 5 mg.
+    # hour) to scale factors: the evidence of this fit was larger, but its force error was 5 mg.
     def trial(norm, log_evidence):
         posterior = SimpleNamespace(
             prior=SimpleNamespace(offset_scale=0.0, informative=None),

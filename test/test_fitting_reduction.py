@@ -64,7 +64,7 @@ def test_the_reduction_does_not_depend_on_how_samples_are_divided_into_blocks(rn
         other = reduced(split(whole, n_parts))
         for a, b in zip(at_once.intervals, other.intervals, strict=True):
             np.testing.assert_array_equal(a.count, b.count)
-            # Sums over blocks have a different order of additions, so a different rounding.
+            # The order of additions, and therefore the rounding, depends on the blocks.
             np.testing.assert_allclose(a.mean, b.mean, rtol=1e-13, atol=1e-11)
             np.testing.assert_allclose(a.time, b.time, rtol=1e-12)
         np.testing.assert_array_equal(at_once.board.value, other.board.value)
@@ -386,7 +386,7 @@ def test_the_detector_settings_follow_the_slowest_ramp(rng):
     readings = Readings(stamps(n, 1.0), celsius)
     bag = reduced([block(still(rng, 30.0, (0.0, 0.0, 3000.0)))])
     slow = learn_detector([replace(bag, temperatures={'board': readings, 'case': readings})])
-    # The detector's setting for the smallest ramp is 0.7 of the slowest ramp, 0.15 K/min.
+    # The setting `smallest_ramp_k_min` is 0.7 of the rate of the slowest ramp, 0.15 K/min.
     assert slow.smallest_ramp_k_min == pytest.approx(0.105, rel=0.05)
     assert slow.relaxed_rate_k_min < slow.smallest_ramp_k_min / 1.5
 

@@ -126,7 +126,7 @@ def test_a_group_that_explains_one_bag_or_section_is_not_chosen(where, is_chosen
 
 
 @pytest.mark.parametrize(('n_positions', 'step_s'), [(10, 120.0), (12, 60.0), (12, 240.0)])
-def test_a_lag_is_found_although_a_curve_without_it_does_not_help(n_positions, step_s):
+def test_a_lag_is_found_although_a_curve_without_the_lag_is_rejected(n_positions, step_s):
     # WHY: a bias that depends only on a lagged temperature needs the groups 'curve' and 'board'
     # together; the group 'curve' without 'board' was rejected, and so the lag was not found.
     slope = 2e-5 * np.array([1.0, -2.0, 1.5])
@@ -140,7 +140,7 @@ def test_a_lag_is_found_although_a_curve_without_it_does_not_help(n_positions, s
     assert chosen.score.rms < 1.2 * truth.sigma[0]
 
 
-def test_estimated_noise_parameters_agree_with_the_true_ones(noisy):
+def test_estimated_noise_parameters_agree_with_the_truth(noisy):
     _, chosen, truth = noisy
     prior = chosen.posterior.prior
     assert {'curve', 'board'} <= chosen_groups(chosen)
@@ -214,7 +214,7 @@ def test_the_prior_sd_of_a_slope_stays_below_the_steepest_plausible_slope():
     assert per_kelvin == pytest.approx(STEEPEST[0])
 
 
-def test_true_parameters_of_a_table_agree_with_the_fit_within_the_claimed_sd(noisy):
+def test_errors_of_fitted_parameters_in_claimed_sd_have_an_rms_near_1(noisy):
     regression, chosen, truth = noisy
     errors = truth.errors(regression, chosen.posterior)
     # Weights that the fit pruned have no sd and no entry here.
@@ -330,7 +330,7 @@ def test_quantised_window_means_are_not_down_weighted_as_outliers():
     np.testing.assert_array_equal(np.delete(changed, 100), 1.0)
 
 
-def test_of_two_almost_equal_columns_the_true_one_is_selected():
+def test_of_two_almost_equal_columns_the_column_with_an_effect_is_selected():
     truth = Truth()
     windows, up = table_of(truth, 12, np.random.default_rng(6), n_windows=50)
     columns = windows.columns.copy()

@@ -357,7 +357,7 @@ def with_stuck_bit(bit):
 
 @pytest.mark.slow
 def test_units_with_a_stuck_bit_are_not_fitted_again_with_the_prior(client, tmp_path):
-    # WHY: with the prior the claimed sd was larger, so a unit with a stuck bit was judged valid.
+    # WHY: the prior increased the claimed sd, so a unit with a stuck bit was judged valid.
     kind = unit_preset('mems', 1)
     faults = {0: with_stuck_bit(7), 4: with_stuck_bit(10)}
     for number in range(5):

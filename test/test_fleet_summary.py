@@ -68,7 +68,7 @@ class TestOutliers:
         assert serials == {f'S{i:03d}' for i in range(5)}
 
     @pytest.mark.parametrize('n', [10, pytest.param(40, marks=pytest.mark.slow)])
-    def test_fleets_without_outliers_give_a_false_alarm_in_5_percent(self, n, rng):
+    def test_fewer_than_a_fifth_of_fleets_without_outliers_give_a_false_alarm(self, n, rng):
         n_alarms = sum(bool(summarise(fleet_of(n, rng)).outliers) for _ in range(60))
         # With a rate of 5 %, 60 fleets give 3 false alarms on average, and 12 with p < 1e-4.
         assert n_alarms < 12
@@ -146,7 +146,7 @@ class TestUndetermined:
         assert 'm_10_urad' not in names
         assert 'm_20_urad' in names
 
-    def test_a_parameter_is_compared_if_at_least_eight_units_determine_it(self, rng):
+    def test_a_parameter_that_only_seven_units_determine_is_not_compared(self, rng):
         rows = self.with_few_positions(30, rng)[:37]
         rows[-1] = {**rows[-1], 'bias_slope_z_ug_k': 1e6}
         assert spread_of('bias_slope_z', rows).limit == float('inf')

@@ -37,7 +37,7 @@ temperatures = st.floats(-15.0, 15.0)
 
 
 @given(st.integers(0, 2**32), st.integers(1, 40), st.integers(1, 5), st.integers(1, 5))
-def test_the_bits_of_a_sum_do_not_depend_on_the_other_axes(seed, size, before, after):
+def test_in_order_adds_the_values_along_an_array_axis_one_by_one(seed, size, before, after):
     values = np.random.default_rng(seed).standard_normal((before, size, after))
     for order in 'CF':
         total = in_order(np.array(values, order=order), 1)
@@ -46,7 +46,7 @@ def test_the_bits_of_a_sum_do_not_depend_on_the_other_axes(seed, size, before, a
 
 
 def test_a_polynomial_agrees_with_hand_numbers():
-    # Eq. (10): the fourth term is a4 t^4; Golovach's paper prints a4 t.
+    # Eq. (10): the term with a4 is a4 t^4; Golovach's paper prints a4 t.
     assert Polynomial((1.0, 2.0, 0.5, 0.25, 1.0)).value(3.0) == 1 + 6 + 4.5 + 6.75 + 81
 
 
@@ -176,7 +176,7 @@ def test_parameters_without_variance_give_no_sd():
 
 
 def test_the_bias_in_a_soak_includes_the_gradient_by_self_heating():
-    # WHY: the certificate left out the gradient in a soak, here 3 K, an error of 50 ug at 16 ug/K.
+    # WHY: the bias in the certificate lacked the gradient in a soak: 50 ug for 3 K and 16 ug/K.
     unit = calibration(
         response=(
             term('gradient', (30.0, 0.0, 0.0), scale=(0.0, 2e-5, 0.0)),

@@ -108,7 +108,7 @@ def test_the_corrected_rate_of_a_mems_gyroscope_has_only_noise(unit, fitted, hel
 
 
 @pytest.mark.slow
-def test_left_out_residuals_of_a_gyroscope_are_near_the_fitted_ones(fitted):
+def test_left_out_residuals_of_a_gyroscope_are_near_its_fitted_residuals(fitted):
     row = fitted.rates[-1]
     assert row.section == 'all'
     assert row.raw.rms > 100.0 * FLOOR

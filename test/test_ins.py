@@ -12,7 +12,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.mark.parametrize('axis', [0, 1])
 def test_a_bias_causes_a_schuler_oscillation(axis):
-    # A bias b from levelling on causes the position error b R / g (1 - cos(w t)), w^2 = g / R.
+    # A bias b causes the position error b / w^2 (1 - cos(w t)), w^2 = g / radius of the Earth.
     bias, dt, minutes = 1e-4, 0.5, 84
     force = G * UP
     force[axis] += bias

@@ -136,7 +136,7 @@ class TestWindows:
         for start_ns, mean in zip(windows.start_ns, windows.force, strict=True):
             inside = (stamps >= start_ns) & (stamps < start_ns + 60 * 10**9)
             assert inside.sum() == 600
-            # The judgement takes the correction as linear over 10 s: an error below 0.001 ug.
+            # The judgement takes the correction as linear over 10 s: a force error < 0.001 ug.
             np.testing.assert_allclose(mean, force[inside].mean(axis=0), atol=1e-8)
 
     @pytest.mark.parametrize('rate_hz', [0.5, 1.0, 3.0, 4.0, 50.0])
@@ -266,7 +266,7 @@ class TestVerdict:
         assert 'limit 100 ug' in judgement.reason
 
     def test_the_verdict_on_bags_of_the_fit_states_the_left_out_error_first(self):
-        # WHY: the verdict stated 61 ug, the error in fitted attitudes; that in others was 1091 ug.
+        # WHY: the verdict stated |f| - g in fitted attitudes, 61 ug, not 1091 ug in new attitudes.
         fitted = ResidualSummary('all', 40, 1e-3, 5e-4, 1e-3, left_out_rms_m_s2=300.0 * MICRO_G)
         unit = dataclasses.replace(CLAIMING, provenance=Provenance(residuals=(fitted,)))
         windows = made(50.0, 1000.0, 60.0)

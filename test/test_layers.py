@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Packages import from lower layers only; certain libraries are imported by few packages only."""
+"""No package imports from a higher layer; certain libraries are imported by few packages only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from conftest import ran
 
 PACKAGE = Path(__file__).resolve().parent.parent / 'thermo_comp'
 
-# Layer of each package (a folder or file in thermo_comp): a package imports lower layers only.
+# Layer of each package (a folder or file in thermo_comp): a package imports no higher layer.
 LAYERS = {
     '__init__': 0,  # public names, imported for type checkers
     'errors': 0,
@@ -53,7 +53,7 @@ HOMES = {
     'rich': {'cli', '__main__'},
 }  # fmt: skip
 
-# Packages of mathematics, which must not read a clock.
+# Packages of mathematics, which must not read a clock, except for the files `CLOCK_EXCEPTIONS`.
 PURE = {'thermal', 'unit', 'online', 'simulation', 'fitting', 'field'}
 CLOCKS = {'time', 'datetime', 'sched', 'threading', 'asyncio'}
 CLOCK_EXCEPTIONS = {
@@ -104,7 +104,7 @@ def own_unit(name):
 
 
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_packages_import_from_lower_layers_only(path):
+def test_no_package_imports_from_a_higher_layer(path):
     unit, file = unit_of(path), path.relative_to(PACKAGE).as_posix()
     assert unit in LAYERS, f'{unit} has no layer: give it one in {Path(__file__).name}'
     wrong = []
@@ -145,7 +145,7 @@ def circle(uses):
 
 @pytest.mark.parametrize('by', ['package', 'file'])
 def test_imports_between_packages_and_between_files_form_no_circle(by):
-    # Imports for type annotations only may form circles, as they are not executed.
+    # Imports that serve only type annotations may form circles, as they are not executed.
     uses = {}
     for path in SOURCES:
         text = '.'.join(path.relative_to(PACKAGE).with_suffix('').parts)

@@ -141,18 +141,18 @@ def test_the_lag_of_a_part_coupled_to_board_and_case_agrees_with_a_solver(rng):
 def test_the_lag_of_a_part_agrees_with_a_solver_if_the_thermometer_lags(rng, second_s):
     times = np.arange(0.0, 3600.0, 30.0)
     board = 20.0 + np.cumsum(0.2 * rng.standard_normal(len(times)))
-    own = 60.0
+    thermometer_s = 60.0
 
     def slope(t, nodes):
         u = np.interp(t, times, board)
         ahead = nodes[1] if second_s else u
         return [
-            (u - nodes[0]) / own,
+            (u - nodes[0]) / thermometer_s,
             (u - nodes[1]) / (second_s or 1.0),
             (ahead - nodes[2]) / 900.0,
         ]
 
-    lag = Lag('board', 900.0, second_s, lead_s=own)
+    lag = Lag('board', 900.0, second_s, lead_s=thermometer_s)
     fine = np.arange(0.0, times[-1], 1.0)
     reading, _, part = solve_ivp(slope, (0.0, fine[-1]), [board[0]] * 3, t_eval=fine, rtol=1e-9,
                                  atol=1e-9, max_step=1.0).y  # fmt: skip
@@ -164,7 +164,7 @@ def test_the_lag_of_a_part_agrees_with_a_solver_if_the_thermometer_lags(rng, sec
         memory.board_step(round(time * 1e9), celsius)
     streamed = memory.at(round(fine[-1] * 1e9), reading[-1], [0.0])
     assert streamed[0] == pytest.approx(behind[-1], abs=1e-9)
-    assert lag.by_board == pytest.approx(1.0 if second_s else 1.0 - own / 900.0)
+    assert lag.by_board == pytest.approx(1.0 if second_s else 1.0 - thermometer_s / 900.0)
     assert sum(lag.shares) == pytest.approx(lag.by_board)
 
 

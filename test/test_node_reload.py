@@ -111,7 +111,7 @@ def test_a_reload_while_samples_flow_loses_no_sample(peer, tmp_path):
         assert values[0].double_value == 30.0
         assert flow.bias(flow.more() - 1) == 2.0
 
-        # Setting the same path reads the file again; an integer is accepted for a float parameter.
+        # Setting the present path reads its file again; a float parameter accepts an integer.
         save_calibration(of_bias(3.0), second)
         result = peer.set_atomically(transition_time=5, calibration_file=str(second))
         assert result.successful, result.reason
@@ -179,7 +179,7 @@ def test_a_change_that_fails_at_any_line_is_not_applied(tmp_path):
     # WHY: a calibration was refused, but samples were corrected with its bias.
     first, second = tmp_path / 'first.yaml', tmp_path / 'second.yaml'
     save_calibration(of_bias(1.0), first)
-    # If detector settings differ, the node must build all parts of the correction again.
+    # As the detector settings of the files differ, every part of the correction is built anew.
     save_calibration(of_bias(2.0, detector=DetectorSettings(dwell_s=61.0)), second)
     context = Context()
     rclpy.init(args=['--ros-args', '-p', f'calibration_file:={first}'], context=context)

@@ -26,7 +26,7 @@ from thermo_comp.fitting.rests import poses_of
 @pytest.mark.parametrize('unit', [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_rests_in_one_pose_at_four_temperatures_determine_the_drift_of_level_axes(unit, poses):
     # WHY: if the attitude of each rest is free, only the warm-up of the board determines the bias
-    # curve. The sensor lags the board, which caused errors of 1 to 4 mg between the rests.
+    # curve. The sensor lags the board, which caused bias errors of 1 to 4 mg between the rests.
     study = list(returned(unit))[poses - 1]
     calibration = strangers.fitted(study)
     (held,) = map(slow, study.tests[''])

@@ -51,7 +51,7 @@ SOAKS = tuple(program(celsius, 25.0) for celsius in (8.0, 19.0, 34.0))
 
 
 def study_of(*name, up=9, corners=HALF, held=HELD, grade=navigation, **given):
-    """Record a unit for a fit in `up` (number of positions or directions), and in two held-out."""
+    """Record bags of a fit in `up` (directions, or their number), and held-out bags, of a unit."""
     rng = rng_of(*name)
     unit = grade(rng, **given)
     is_mems = grade is not navigation
@@ -105,7 +105,7 @@ def judged(calibration, study):
 
 def test_the_fitted_lag_of_each_axis_is_that_of_its_part(parts):
     unit, study, calibration, _ = parts
-    # A part with 10 ug/K lags by 10 K in a ramp: 1 % of its time constant is an error of 1 ug.
+    # A part with 10 ug/K lags by 10 K in a ramp: 1 % of its time constant is a bias of 1 ug.
     assert np.array(taus_of(calibration)) == pytest.approx(unit.part_s[:, None], rel=0.01)
     # The noise of |f| in a mean over 60 s is 0.65 ug.
     assert judged(calibration, study).norm < 2.0
@@ -130,7 +130,7 @@ def test_lags_of_parts_coupled_to_board_and_case_are_fitted():
 @pytest.mark.parametrize('sensors', [('board',), ('board', 'case')])
 def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
     # WHY: without the thermometer lag in the model the fit chose a bank of time constants instead
-    # of one per part; in a held-out program the error was 57 ug, the claimed sd 2 ug.
+    # of one per part; in a held-out program the error of |f| was 57 ug, the claimed sd 2 ug.
     given = {'part_s': PARTS_S, 'thermometer_s': 60.0, 'sensors': sensors}
     unit, study = study_of('slow thermometer', **given)
     calibration = strangers.fitted(study)
@@ -150,12 +150,12 @@ def test_lags_of_the_thermometers_themselves_are_fitted(sensors):
 @pytest.mark.slow
 def test_slow_tilts_of_a_support_are_not_fitted_by_a_second_stage_of_a_lag():
     # WHY: tilts of 60 urad within 4 h were fitted by second stages of lags and offsets of 5 mg: in
-    # a held-out program the error was 5.8 mg, that of a cubic 0.27 mg.
+    # a held-out program the force error was 5.8 mg, that of a cubic 0.27 mg.
     _, study, _ = slow_drift(2)
     calibration = strangers.fitted(study)
     parts = {part.part for part in calibration.response if part.kind == 'board'}
     assert {part.second_tau_s for part in parts} == {0.0}
-    # The tilts of one position cause a drift of 40 ug RMS; a mean over 12 positions has less.
+    # The tilts cause a drift of 40 ug RMS in each position, and less in the mean of 12 positions.
     tests = {'': [minutes(bag) for bag in study.tests['']]}
     assert strangers.scored(study, calibration, tests)[''].vector < 40.0
 
@@ -175,7 +175,7 @@ def test_with_a_coarse_or_noisy_thermometer_the_fit_is_as_good_as_a_cubic_by_sci
 
 @pytest.mark.slow
 def test_bags_that_only_warm_up_predict_a_cool_down():
-    # WHY: the lags fitted to warm-ups did not hold in a cool-down, which had an error of 180 ug.
+    # WHY: the lags fitted to warm-ups did not hold in a cool-down: the force error was 180 ug.
     warm, cool = program(5, 20, (35, 0.8, 40)), program(33, 20, (10, 0.8, 40))
     given = {'corners': warm, 'held': cool, 'part_s': PARTS_S / 2.0}
     _, study = study_of('only warm', up=10, **given)
@@ -184,8 +184,7 @@ def test_bags_that_only_warm_up_predict_a_cool_down():
 
 @pytest.mark.slow
 def test_lags_of_a_noisy_sensor_are_fitted_to_bags_of_one_warm_up():
-    # WHY: the fit chose a spline of 60 nodes, a lag of twice the true lag, and had errors of 80
-    # ug.
+    # WHY: the fit chose a spline of 60 nodes and twice the true lag: the force error was 80 ug.
     thaw = program(-18.0, 5.0, (22.0, 40.0, 100.0)), program(-18.0, 5.0, (22.0, 40.0, 80.0))
     rng = rng_of('noisy thaw', 2)
     unit = navigation(rng, part_s=np.array([657.0, 797.0, 1389.0]))
@@ -246,7 +245,7 @@ def test_no_lag_is_fitted_to_a_unit_without_lags():
 @pytest.mark.slow
 def test_the_lags_of_parts_are_found_beside_an_effect_of_the_gradient():
     # WHY: an effect of the gradient was fitted by a lag of 223 s instead of 163 s; in a soak the
-    # error was 167 ug, the claimed sd 15 ug.
+    # force error was 167 ug, the claimed sd 15 ug.
     (study,) = gradient(1)
     calibration = strangers.fitted(study)
     assert {term.group for term in calibration.response} == {'part', 'gradient'}
@@ -309,8 +308,8 @@ def test_norms_of_soaks_determine_the_curve_over_temperature(grade):
 
 @pytest.mark.slow
 def test_six_faces_in_three_soaks_determine_the_curve_at_other_temperatures():
-    # WHY: misalignments of 0.3 rad fitted the norms of six faces. A fit had errors of 40 mg for
-    # drifts of 10 mg, and divided by zero if `mounting_sd` was stated.
+    # WHY: misalignments of 0.3 rad fitted the norms of six faces: the force error was 40 mg for
+    # drifts of 10 mg, and the fit divided by zero if `mounting_sd` was stated.
     _, study = study_of(
         'faces in soaks', 1, up=FACES.repeat(3, axis=0), corners=SOAKS, held=program(19.0, 90.0),
         grade=lambda rng: replace(consumer_grade(rng), misalignment=np.zeros(3)),
@@ -332,7 +331,7 @@ def test_the_claimed_sd_between_two_soaks_includes_the_undetermined_curve():
 
 @pytest.mark.slow
 def test_the_claimed_sd_includes_a_curve_that_soaks_do_not_determine():
-    # WHY: each axis is vertical at one temperature only; the error was 15 times the claimed sd.
+    # WHY: each axis is vertical at one temperature only; force errors were 15 claimed sd.
     _, study = study_of('confounded soaks', up=np.vstack((FACES, np.eye(3))), corners=SOAKS)
     assert judged(strangers.fitted(study), study).ratio < 1.5
 
@@ -352,7 +351,7 @@ def test_one_bag_of_ramps_beside_soaks_determines_the_lags():
 @pytest.mark.slow
 def test_a_bias_decay_after_power_on_is_not_fitted_by_a_lag():
     # WHY: all bags of the fit start at 22 degC, and lags were fitted to a decay of the bias after
-    # power-on: bags that start at other temperatures had errors of 1.7 mg.
+    # power-on: in bags that start at other temperatures the force error was 1.7 mg.
     rng = rng_of('power-on', 4)
     unit = consumer_grade(rng)
 

@@ -56,7 +56,7 @@ def test_the_first_reading_of_a_sensor_may_be_wrong():
 @pytest.mark.parametrize('wrong', [85.0, 24.2, -40.0])
 @pytest.mark.parametrize('sensor', ['board', 'case'])
 def test_a_wrong_first_reading_does_not_change_later_thermal_states(sensor, wrong):
-    # WHY: one reading of 85 degC after power-on caused errors of 1 mg for 20 min.
+    # WHY: one reading of 85 degC after power-on caused force errors of 1 mg for 20 min.
     memory = MemorySpec(lags=(('board', 900.0), ('case', 600.0)))
     tracker, without = tracker_of(memory=memory), tracker_of(memory=memory)
     for second in range(0, 900, 5):
@@ -111,8 +111,8 @@ def test_a_frozen_sensor_is_detected_by_changes_of_the_second_sensor(sensor, fro
     other = tracker.checks['case'] if frozen == 'board' else tracker.checks['board']
     assert other.fault == Fault.NONE
     seen = getattr(tracker, frozen)
-    # Before its detection a frozen board has an error of up to 4 quanta + 2 K, a frozen case of
-    # 10 K more.
+    # Until a frozen board thermometer is detected its error is up to 4 quanta + 2 K, that of a
+    # frozen case thermometer up to 4 quanta + 12 K.
     lead = 10.0 if frozen == 'case' else 0.0
     off = (board if frozen == 'board' else case) - seen.temperature
     assert abs(off) < 4.0 * quantum + 2.0 + lead
@@ -178,7 +178,7 @@ def test_no_fault_is_reported_of_a_working_unit_in_a_chamber(preset, sensor):
         assert tracker.checks['case'].fault == Fault.NONE
 
 
-# The preset 'mems' is left out: its board follows the case in seconds, so it leads by below 1 K.
+# The preset 'mems' is left out: its board lags the case by seconds, a difference below 1 K.
 @pytest.mark.parametrize(
     ('preset', 'sensor'),
     [

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fits to little data with an earlier calibration, or with units of the type, as a prior."""
+"""Fits to little data are right with a prior: an earlier calibration, or units of the type."""
 
 from dataclasses import replace
 from functools import cache
@@ -100,8 +100,8 @@ def test_a_population_has_the_mean_of_its_units_and_their_scatter():
 
 
 def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
-    # WHY: on one axis three siblings had nearly equal biases by chance; with their prior a fit of
-    # nine positions had an error of 363 ug, without a prior 77 ug.
+    # WHY: on one axis three siblings had nearly equal biases by chance; with their prior the force
+    # error of a fit to nine positions was 363 ug, without a prior 77 ug.
     layout = parameter_layout(rich_calibration())
     deviations = rng.standard_normal((3, layout.n_parameters))
     level = layout.bias[1].static
@@ -112,8 +112,8 @@ def test_the_scatter_of_an_axis_is_averaged_over_the_axes_of_three_units(rng):
 
 
 def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng):
-    # WHY: a fit of one position with a prior from twelve units had an error of 4.7 mg; the claimed
-    # sd was 0.9 mg.
+    # WHY: the force error of a fit to one position with a prior from twelve units was 4.7 mg; the
+    # claimed sd was 0.9 mg.
     layout = parameter_layout(rich_calibration())
     n = layout.n_parameters
 
@@ -138,8 +138,8 @@ def test_chance_correlations_between_parameters_of_twelve_units_are_reduced(rng)
 
 @pytest.mark.slow
 def test_equal_curves_of_both_sets_stay_equal_in_a_population():
-    # WHY: in the prior the correlations between equal curves of both sets were reduced: a fit of
-    # nine positions had an error of 3.1 ug with this prior, and 0.7 ug without a prior.
+    # WHY: in the prior the correlations between equal curves of both sets were reduced: the error
+    # of a fit to nine positions was 3.1 ug with this prior, and 0.7 ug without a prior.
     prior = population(siblings())
     covariance, layout = prior.posterior.covariance(), parameter_layout(prior)
     for block in (*layout.bias, *layout.scale):
@@ -173,8 +173,8 @@ def helped():
 @pytest.mark.slow
 def test_a_fit_begins_with_the_widest_of_its_priors():
     # WHY: a fit that began with the narrow prior of three units found mounting offsets of 190 ug,
-    # a local minimum: the held-out error was 271 ug instead of 0.9 ug. WHAT: a fit begins with the
-    # prior that has the largest variance in all directions.
+    # a local minimum: |f| - g of a held-out bag was 271 ug, not 0.9 ug. WHAT: a fit begins with
+    # the prior that has the largest variance in all directions.
     *tried, widest = (prior.root.T @ prior.root for prior in helped()[1])
     assert len(tried) > 2
     root = np.sqrt(np.diag(widest))

@@ -97,11 +97,11 @@ def test_the_freezer_run_is_refused_for_its_jumps(real_data, work):
     assert [float(size) for _, size in jumps] == pytest.approx([20.0, 17.0, 2.0], abs=4.0)
 
 
-def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_plot(real_data, work):
+def test_the_bias_slope_of_the_freezer_run_before_its_jumps_is_that_of_the_norm(real_data, work):
     topics = Topics(part=BagPart(47.5, 358.5))
     result = fit(fit_sources([freezer_bag(real_data, work)], topics)[0], OPTIONS)
     z = result.calibration.static.z
-    # The slope of |a| in the plot is 1.61 mg/K from 36 to 15 degC.
+    # In the freezer run the slope of |a| over temperature is 1.61 mg/K from 36 to 15 degC.
     slope = np.diff(z.bias_function.value(np.array([-4.0, 14.0])))[0] / 18.0 / MG
     assert slope == pytest.approx(1.61, abs=0.2)
     assert result.residuals[-1].fitted.rms / MG < 0.75
@@ -156,8 +156,8 @@ def test_the_gyroscope_error_of_the_freezer_run_in_215_s_held_out(real_data, wor
     assert section.raw_rms > 1.7 * floor
     assert section.rms < 1.3 * floor
     assert 0.3 < section.ratio < 2.0
-    # The data sheet of the MPU-6050 has 5 mdeg/s/sqrt(Hz); samples at 12.7 Hz without an
-    # anti-aliasing filter have a larger density.
+    # The data sheet of the MPU-6050 has 5 mdeg/s/sqrt(Hz); the density of samples at 12.7 Hz
+    # without an anti-aliasing filter is larger than that.
     assert 30.0 < np.degrees(density) * 1e3 < 45.0
 
 

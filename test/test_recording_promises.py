@@ -73,7 +73,7 @@ def test_a_topic_that_only_the_metadata_list_is_reported(tmp_path, storage):
     assert inspect_recording(bag).truncated == '/gone: 0 of 7 listed messages are in the bag'
 
 
-def test_missing_messages_are_reported_at_the_end(tmp_path):
+def test_missing_messages_are_reported_at_the_end_of_the_first_reading(tmp_path):
     write_mcap(tmp_path / 'bag.mcap', regular_messages(40))
     with open_recording(tmp_path / 'bag.mcap') as reader:
         kind = reader.info.topics[ACCEL][0]

@@ -213,7 +213,7 @@ def test_too_many_overlapping_chunks_are_refused(tmp_path, monkeypatch):
         read(tmp_path / 'bag.mcap')
 
 
-def test_raw_messages_of_overlapping_chunks_are_in_order_too(tmp_path):
+def test_raw_messages_of_overlapping_chunks_are_in_order_of_log_time(tmp_path):
     messages = regular_messages(60)
     shuffled = [m for pair in zip(messages[1::2], messages[::2], strict=False) for m in pair]
     for row, message in enumerate(messages):

@@ -90,7 +90,7 @@ def test_rosbags_and_mcap_read_the_written_messages(
             assert rosbag.message_count == len(wanted)
             assert {c.topic for c in rosbag.connections} == set(names)
             listed = [(log_ns, names[c.topic]) for c, log_ns, _ in rosbag.messages()]
-        # Versions of rosbags sort messages with equal log times in different chunks differently.
+        # The order of messages with equal log times in two chunks depends on rosbags' version.
         assert [log_ns for log_ns, _ in listed] == sorted(log_ns for log_ns, _ in wanted)
         assert sorted(listed) == sorted(wanted)
         if counts[-1] and len(counts) == 1:

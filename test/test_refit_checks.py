@@ -90,10 +90,10 @@ def test_if_the_second_fit_is_refused_the_first_is_kept(rng, monkeypatch):
 
 @pytest.mark.slow
 def test_slowly_tilting_supports_are_fitted_with_an_attitude_per_hour():
-    # WHY: tilts of 60 urad within 4 h caused errors of 12 to 15 ug in another temperature program.
+    # WHY: tilts of 60 urad within 4 h caused force errors of 12 to 15 ug in a held-out program.
     _, study, _ = slow_drift(1)
     calibration = strangers.fitted(study)
     assert any('may tilt from hour to hour' in note for note in calibration.provenance.notes)
     tests = {'': [minutes(bag) for bag in study.tests['']]}
-    # The tilts of 42 ug RMS, averaged over twelve positions, leave an error of 12 ug.
+    # A position drifts by 42 ug RMS due to its tilt, the mean of twelve positions by 12 ug.
     assert strangers.scored(study, calibration, tests)[''].vector < 12.0

@@ -45,7 +45,7 @@ def case_and_board(t, corners, lag=LAG_S, start=20.0):
 
 
 def onsets(noise, quantum, rate_k_min, lag, n, *, dt=1.0, end_s=1500.0, soak_s=1500.0):
-    """Run n ramps; return the switches after each onset, and the number of runs static before."""
+    """Run n ramps; return switches after each onset, and the number of runs static at onset."""
     settings = detector_settings(noise, quantum, lag)
     collected, n_static = [], 0
     for seed in range(n):
@@ -141,9 +141,9 @@ def test_each_ramp_switches_the_regime_to_dynamic_once(noise, quantum, rate_k_mi
         '10 mK, 62.5 mK steps',
     ],
 )
-def test_three_soaks_of_5_h_have_at_most_two_false_switches(sensor):
-    # The setting allows 0.05 switches per hour, two per false alarm: more than two false alarms in
-    # 15 h have a probability below 1 %.
+def test_three_soaks_of_5_h_have_at_most_two_false_alarms(sensor):
+    # The default setting allows 0.02 false alarms per hour: more than two false alarms in 15 h
+    # have a probability of 0.4 %.
     noise, quantum = SENSORS[sensor]
     n_openings = 0
     for seed in range(3):
@@ -291,7 +291,8 @@ def test_the_dynamic_regime_ends_by_the_case_or_the_board(sensor):
     assert [regime for _, regime, _ in early] == [STATIC, DYNAMIC, STATIC]
     assert early[1] == late[1]
     assert late[2][0] - early[2][0] == pytest.approx(earlier, abs=300.0)
-    # The end condition `case` acts like a missing board; without a case it acts like `board`.
+    # The end condition `case` acts like a missing board thermometer; without a case thermometer
+    # both end conditions use the board thermometer.
     assert early == switches(board_too, t, case, None)
     t, board = t[:3000], board[:3000]
     assert switches(case_alone, t, None, board) == switches(board_too, t, None, board)

@@ -70,7 +70,7 @@ def test_rounding_changes_a_value_by_at_most_half_a_digit(value, expanded):
     assert abs(float(text.replace('−', '-')) - value) <= 0.0501 * expanded + 1e-9 * abs(value)
 
 
-def test_statements_of_a_laboratory_are_printed_and_other_fields_blank(tmp_path):
+def test_statements_of_a_laboratory_are_printed_and_missing_statements_are_blank(tmp_path):
     info = load_certificate_info(lab(tmp_path), 'thermostatted-0001')
     page = render_report(evidence(), figures=[], info=info)
     for text in (

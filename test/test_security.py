@@ -73,7 +73,7 @@ def test_metadata_with_nested_aliases_is_refused(tmp_path):
         inspect_recording(bag)
 
 
-def test_metadata_of_a_bag_opens_no_file_outside(tmp_path):
+def test_metadata_of_a_bag_opens_no_file_outside_the_folder_of_the_bag(tmp_path):
     secret, bag = one_reading(tmp_path / 'secret.mcap'), one_reading(tmp_path / 'bag')
     metadata = bag / 'metadata.yaml'
     (name,) = (file.name for file in bag.glob('*.mcap'))

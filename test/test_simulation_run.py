@@ -73,7 +73,7 @@ def test_stamps_are_the_ends_of_the_cycles(unit):
     )
 
 
-def test_a_further_error_source_does_not_change_the_other_random_numbers(unit):
+def test_a_further_error_source_does_not_change_the_random_numbers_of_other_sources(unit):
     """Thermometer noise does not change counts; drifts of the unit do not change their noise."""
     plain = simulate(unit, SHORT, UP)
     noisy = simulate(replace(unit, board=replace(unit.board, noise_sd=0.05)), SHORT, UP)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates of temperature and rate agree with the true ones, also if readings are outliers."""
+"""Estimates of temperature and rate agree with the truth, also if some readings are outliers."""
 
 import math
 
@@ -78,7 +78,7 @@ PARTS = {
 
 @pytest.mark.parametrize('part', PARTS)
 @pytest.mark.parametrize('sensor', SENSORS)
-def test_claimed_variances_are_within_a_factor_of_10_of_squared_errors(errors, sensor, part):
+def test_squared_errors_are_on_average_below_5_claimed_variances(errors, sensor, part):
     # In soaks and ramps the claimed variance is a few times the mean squared error, because it
     # allows for the onset or end of a ramp at any time. Sensors with steps have few independent
     # errors, whose mean square is uncertain by a factor of 2.
@@ -129,7 +129,7 @@ def test_equal_coarse_readings_leave_the_sd_of_their_quantum():
 
 
 @pytest.mark.parametrize(('quantum', 'lag_s'), [(0.1, 120.0), (0.5, 180.0), (1.0, 600.0)])
-def test_equal_readings_each_minute_keep_the_estimate_within_a_quantum(quantum, lag_s):
+def test_equal_readings_each_minute_keep_the_error_below_1_5_quanta(quantum, lag_s):
     # WHY: when the predicted temperature was more than a quantum from the reading, equal readings
     # had no weight, and the claimed sd rose to 24 K within an hour of soak.
     t = np.arange(-3600.0, 9000.0, 60.0)

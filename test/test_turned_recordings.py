@@ -55,7 +55,7 @@ def rms(values):
 @pytest.mark.slow
 def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     # WHY: a fit with products and squares of a lag, but without the lag itself, had small errors
-    # in left-out data, but an error of over 1.7 mg in ramps of twice the rate.
+    # in left-out data, but force errors of over 1.7 mg in ramps of twice the rate.
     rng = np.random.default_rng(2)
     up = (0.0, -20.0), (1200.0, -20.0), (9000.0, 45.0), (10200.0, 45.0)
     down = tuple((t, 25.0 - celsius) for t, celsius in up)
@@ -76,7 +76,7 @@ def test_a_lag_is_corrected_at_twice_the_rates_of_the_fit():
     assert rms(error) < 0.25 * rms(of_lag)
 
 
-def test_the_claimed_sd_of_a_single_turn_on_is_that_of_its_grade():
+def test_the_claimed_sd_of_a_mems_with_a_single_turn_on_is_0_3_to_1_5_mg():
     # WHY: one recording does not show how much the bias changes at a turn-on. The claimed sd was
     # too small: a MEMS that changes by 0.6 mg erred by 5 times its claimed sd after a turn-on.
     rng = np.random.default_rng(3)

@@ -52,8 +52,8 @@ def test_axes_never_along_gravity_at_some_temperatures_have_a_larger_sd():
     (lack, _) = unseen_axes.with_unseen_axes(fit, ((), ()), None)
     assert [point.temperature_c for point in lack] == pytest.approx([-40, -31, -22, -13, -4])
     for point in lack:
-        # The curve of a scale holds for another tenth of its range of 40 K; beyond, its slope is
-        # assumed to have an sd of half its value of 10 ppm/K.
+        # The curve of a scale is used to 4 K (a tenth of its range) beyond its range; farther out
+        # the slope of the scale is assumed to have an sd of 5 ppm/K, half of the fitted slope.
         sd = 0.5e-5 * 10.0 * (-4.0 - point.temperature_c)
         assert point.sd_m_s2 == pytest.approx((0.0, sd, sd), abs=1e-12)
     (finding,) = unseen_axes.judge_unseen_axes(fit, None)
@@ -94,7 +94,7 @@ def kinked(bag, unit):
 @pytest.mark.parametrize('number', [1, 2])
 @pytest.mark.parametrize('is_prior', [False, True])
 def test_after_one_cold_bag_the_claimed_sd_covers_the_scale_errors_of_all_axes(number, is_prior):
-    # WHY: after a cold bag of one position the vector error was 138 ug, its claimed sd 14 ug.
+    # WHY: after a cold bag of one position the force error was 138 ug, its claimed sd 14 ug.
     rng = rng_of('unseen axes', number)
     unit = navigation(rng)
     warm = positions(unit, WARM, spread(12, rng), rng)
