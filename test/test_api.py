@@ -65,7 +65,7 @@ def test_arrays_have_the_bits_of_a_replayed_bag(root, tmp_path, fitted):
 
 
 def test_all_of_5000_readings_of_two_thermometers_are_used(rng):
-    # WHY: `correct` passed all readings before the first sample, and the queue dropped some.
+    # WHY: `correct` queued all readings ahead of the samples; the full queue dropped some.
     time_s = np.arange(5000) * 0.1
     readings = {name: 20.0 + rng.normal(0.0, 0.01, 5000) for name in ('board', 'case')}
     counts = rng.normal([5.0, -3.0, 2940.0], 2.0, (5000, 3)).round()

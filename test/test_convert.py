@@ -369,7 +369,7 @@ class TestFreezer:
         report = write_log(table_log(path, columns), tmp_path / 'bag')
         assert report.rows == report.messages['accel'] == 24514
         assert report.findings['clipped'].count == 7
-        # The log starts at 1.5 s; the unit was moved before 49 s and after 1945 s.
+        # The log starts at 1.5 s; the unit was moved before 49 s and after 1944 s.
         first, last = report.stillness.moving_ns[0], report.stillness.moving_ns[-1]
         assert first[0] == report.log.stamp_ns[0]
         assert first[1] * 1e-9 == pytest.approx(49.0, abs=3.0)

@@ -332,7 +332,7 @@ def test_saturated_samples_are_refused(rng):
 
 @pytest.mark.slow
 def test_misalignments_of_a_mems_unit_are_determined_by_nine_positions():
-    # WHY: mounting offsets of 5 mg fit the norms of nine positions as well as misalignments.
+    # WHY: mounting offsets of 5 mg fit nine positions' norms as well as misalignments do.
     unit = unit_preset('mems', 0).with_thermometers(rate_hz=0.25)
     records = arrays(unit, plan('chamber-9'), 0, rate_hz=1.0)
     # A fit with only the groups of the simulated unit takes half the time.

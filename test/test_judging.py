@@ -418,7 +418,7 @@ def test_an_axis_that_repeats_one_value_in_a_rest_is_named(tmp_path):
     density = (5.0 / K * np.sqrt(0.1),) * 3
     noisy = corrected_by(SLOPE, noise_density_m_s2_sqrt_hz=density)
     noisy = dataclasses.replace(noisy, unit=dataclasses.replace(noisy.unit, cycle_time_s=0.1))
-    with pytest.raises(RecordingError, match=r'dead\.mcap: y reads exactly 0 for 0\.'):
+    with pytest.raises(RecordingError, match=r'dead\.mcap: dead axis: y reads exactly 0 for 0\.'):
         judged(bag, noisy)
     # An axis with less noise than a step of the converter may repeat values and is not reported.
     assert judged(bag, dataclasses.replace(noisy, noise_density_m_s2_sqrt_hz=(1e-5,) * 3))

@@ -142,7 +142,7 @@ def edited(draw):
 
 
 def changed(which, place, value):
-    """Return a calibration file with one replaced value."""
+    """Return the tree of a calibration file with one value replaced."""
     tree = Edited(json.loads(json.dumps(TREES[which])))
     branch = tree
     for key in place[:-1]:

@@ -13,7 +13,7 @@ import thermo_comp as tc
 GRAVITY, MICRO_G = 9.80665, 9.80665e-6
 FACES = np.concatenate((np.eye(3), -np.eye(3)))
 NOISE = 2.5e-3
-#: Lag of the part that determines the bias of each axis behind the board [s].
+#: Lag behind the board of the part that determines the bias of each axis [s].
 LAGS_S = 180.0, 300.0, 120.0
 #: Time from the begin of a turn to that of the next turn, and duration of a turn [s].
 DWELL_S, TURN_S = 400, 8

@@ -93,7 +93,7 @@ _PREPARED: dict[str, Bounds] = {
     'value of a column': _between(-1e10, 1e10, 'of the column', 'the cube of 1273 K is 2e9'),
     'span of a column': _positive(1e-9, 2e10, 'of the column', 'a millionth of 0.1 K/min, in K/s'),
     'share': _between(-10.0, 10.0, '', 'no part amplifies a temperature difference tenfold'),
-    'width': _nil_or(1e-4, 1e4, 'K', 'no thermometer resolves 0.1 mK'),
+    'width': _nil_or(1e-4, 1e4, 'K', 'a smaller width is reading noise'),
     'gradient': _between(-1273.15, 1273.15, 'K', 'the largest temperature difference'),
     'power': Bounds(at_least=0, at_most=4, why='no unit has shown a power above 3'),
     # Bounds of noises and standard deviations.

@@ -25,7 +25,7 @@ from .unknowns import State
 
 
 def lack_of_fit(fit: Fit, claim: Claim) -> tuple[tuple[LackOfFit, ...], tuple[LackOfFit, ...]]:
-    """Return the lack of fit at up to 5 temperatures, in static and in dynamic regime, or ()."""
+    """Return the lack of fit in the static and the dynamic regime, at 0 to 5 temperatures each."""
     windows, regression, selected = fit[:3]
     prior, state, position = fit.posterior.prior, fit.posterior.state, windows.data.position
     noise = prior.sigma**2 * (1.0 / regression.weight[:, None] + prior.noise.variance)

@@ -23,12 +23,12 @@ class Layout:
     Indices of the unknowns in the vector of parameters; the unknowns of the unit come first. The
     names are those of `State`.
 
-    axis: kappa, bias, active weights and active nonlinear coefficients of each axis, shape (3, k)
+    axis: scale ratio kappa, bias, active weights and nonlinear coefficients of each axis, (3, k)
     weights, nonlinear: indices of the weights, shape (2, 3, m), and of the nonlinear coefficients,
         shape (3, 2 k); -1 for an inactive unknown
     start, turn_on: unknowns of each bag: initial lag states, and the bias offset of its turn-on,
         shapes (n_bags, r) and (n_bags, 3) or (n_bags, 0)
-    own: unknowns of each position: up, stretch, offset, tilt, shape (n_positions, k)
+    own: attitude, error of |f|, bias offset and tilts of each position, shape (n_positions, k)
     pose_of: number of each position's pose, -1 without one
     bag: number of each position's bag
     n_unit, n: number of unknowns of the unit, and number of all unknowns

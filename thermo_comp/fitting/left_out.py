@@ -106,7 +106,7 @@ class Folds:
         return max(estimates, key=lambda estimate: abs(estimate[0]) / max(estimate[1], 1e-12))
 
     def is_noise(self, other: Folds, noise: float) -> bool:
-        """Whether white noise explains the errors in the folds that are scored for both models."""
+        """Whether white noise explains this model's errors in the folds scored for both models."""
         known = np.isfinite(self.square) & np.isfinite(other.square)
         square = np.average(self.square[known], weights=self.windows[known])
         return bool(square <= (_NOISE_RATIO * noise) ** 2)
@@ -186,7 +186,7 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
-    # The drift of positions, or of sections, need not decrease if white noise explains it, because
+    # The drift of left-out positions or sections need not decrease if white noise explains it:
     # left-out bags of soaks contain no effects of ramps.
     must_gain = [
         gain

@@ -91,7 +91,7 @@ def open_bags(
                 path=str(path),
             )
         if calibrations and (dead := _dead_axes(bag, calibrations[0])):
-            raise RecordingError(f'{dead}: the axis is dead there', path=str(path))
+            raise RecordingError(f'dead axis: {dead}', path=str(path))
         bags.append(bag)
     return joined(bags)
 

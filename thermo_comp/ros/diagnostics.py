@@ -66,9 +66,7 @@ _FAULTS = {
     Fault.LOOSE: 'is {:.1f} K farther from that of the case than in the fit: thermometer loose?',
 }
 
-_BEYOND_FORCE = (
-    'above the largest |f| of the fit: the nonlinear terms are extrapolated, the covariance grows'
-)
+_BEYOND_FORCE = 'above the largest |f| of the fit: the covariance grows'
 
 Finding = tuple[int, str]  # level and text
 

@@ -251,8 +251,8 @@ class ChangeDetector:
 
     def _learn_swing(self, dt: float) -> None:
         """
-        Update the swing: the largest deviation of the rate from its trend in each half period of
-        an oscillation.
+        Update the swing: an upper estimate of the amplitude of an oscillation of the rate about
+        its trend.
         """
         rate = self.rate
         trend = self._trend

@@ -130,7 +130,7 @@ class Column:
     power: Annotated[int, QUANTITIES['power'], 'Exponent of the factor T_board - T_ref.'] = 0
     during: Annotated[
         Literal['always', 'static', 'dynamic'],
-        'Factor of the value: 1 (always), 1 - w (static), w (dynamic); w: dynamic weight.',
+        'Factor: 1 (always), 1 - w (static), w (dynamic); w: weight of the dynamic set, 0 to 1.',
     ] = 'always'
     range: Annotated[
         tuple[_Value, _Value],

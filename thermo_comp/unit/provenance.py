@@ -44,7 +44,7 @@ class Source:
 @dataclass(frozen=True)
 class ResidualSummary:
     """
-    ``|f| - g`` over one section of the fitted data, before (raw) and after the correction.
+    ``|f| - g`` of the fitted data in one regime, or of all; raw: corrected with constants alone.
     """
 
     section: str
