@@ -203,15 +203,14 @@ def _of_time(evidence: Evidence) -> Iterator[tuple[Any, ...]]:
         'Readings of the case and the board thermometer. The board lags behind the case, so a '
         f'ramp begins first at the case. {read} 3 of the paper.',
     )
-    window_s = 0.0 if windows is None else windows.window_s
+    means = '' if windows is None else f', means over {windows.window_s:g} s at rest'
     yield (
         'When do the readings drift, and does the regime flag mark these times?',
         of_bags.draw_dynamics,
-        f'(a) change of each axis’ reading, means over {window_s:g} s at rest; (b) estimated '
-        f'rates of the temperatures and, below, the second derivative of the {shown.leader} '
-        'temperature, which has a pulse at the start and the end of a ramp; (c) regime and '
-        'direction, unknown until the detector has enough readings. '
-        f'{read} 4 of the paper.',
+        f'(a) change of each axis’ reading{means}; (b) estimated rates of the temperatures '
+        f'and, below, the second derivative of the {shown.leader} temperature, which has a '
+        'pulse at the start and the end of a ramp; (c) regime and direction, unknown until the '
+        f'detector has enough readings. {read} 4 of the paper.',
     )
     if windows is None or not evidence.residuals or not (windows.bag == shown.index).any():
         return
