@@ -83,13 +83,13 @@ class Contradiction(NamedTuple):
 
     bags: numbers of the bags whose drift the calibration does not explain with any lag states at
         start; if these are more than half of the bags, numbers of all bags
-    is_updated: whether the bags can update the calibration: ``|f| - g`` is far above the drift and
+    may_update: whether the bags can update the calibration: ``|f| - g`` is far above the drift and
         the claimed sd of |f|, so that bias or scale has changed, too, or the bags have the six
         attitudes that determine bias and scale
     """
 
     bags: list[int]
-    is_updated: bool
+    may_update: bool
 
 
 def contradiction(
@@ -124,13 +124,13 @@ def contradiction(
     norm = _norm_errors(regression, state)
     along = regression.at(state, prior).norms_by_unit @ inverse
     usual = np.mean(drift**2) + np.mean(np.sum(along**2, axis=1)) + offset_sd_of(known) ** 2
-    is_changed = bool(_is_far_above(float(np.mean(norm**2)), usual))
+    may_update = bool(_is_far_above(float(np.mean(norm**2)), usual))
     is_far = _is_far_above(mean, 1.0)
     if np.mean(is_far) > 0.5:
         # All bags are of one environment, whose effect on drifts is small in some attitudes.
         is_far[:] = True
-    is_changed |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
-    return Contradiction(np.flatnonzero(is_far).tolist(), is_changed)
+    may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
+    return Contradiction(np.flatnonzero(is_far).tolist(), may_update)
 
 
 def _at_calibration(

@@ -218,8 +218,8 @@ def _fit_one_environment(
             return _refined(first, bags, options, progress)
         refit = _refined(refit, kept, options, progress)
     elif known is not None and not is_updated:
-        # If all bags contradict the prior's effects of temperature, and bias and scale have not
-        # changed, the bags were recorded in another environment and cannot update the prior.
+        # All bags contradict the prior's effects of temperature and may not update them: the bags
+        # count as recorded in another environment, and the prior is kept.
         provenance = first.calibration.provenance
         refit = replace(first, calibration=replace(known, provenance=provenance))
     others = 'the other bags' if known is None else 'the prior'

@@ -325,10 +325,7 @@ def _is_determined(by_others: float, by_all: float) -> bool:
 def _is_drift_determined(
     point: Point, posterior: PosteriorMode, root: Floats, rows: slice
 ) -> bool:
-    """
-    Whether a fit without a position, with the covariance ``root @ root.T`` of the unit, determines
-    the drift of the position, whose windows are `rows`.
-    """
+    """Whether a fit of covariance ``root @ root.T`` determines the left-out drift in `rows`."""
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True
