@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermo_comp.convert.column_map import ColumnMap, table_log
-from thermo_comp.convert.log import NO_STAMP, write_log
+from thermo_comp.convert.log import NO_STAMP, naming, write_log
 from thermo_comp.convert.table import Format, Stamp, exact_ns, layout, read_parquet, read_text
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
@@ -119,7 +119,7 @@ def test_the_delimiter_is_that_which_gives_equal_numbers_of_cells():
 )
 def test_bad_tables_are_refused(tmp_path, text, column, message):
     path = write(tmp_path / 'log.csv', text)
-    with pytest.raises(RecordingError, match=message) as caught:
+    with pytest.raises(RecordingError, match=message) as caught, naming(path):
         read_text(path, [column], ROWS_ALONE)
     assert str(path) in str(caught.value)
 

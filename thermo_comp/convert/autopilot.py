@@ -82,8 +82,8 @@ def read_autopilot(
             imus, baros, compensated = read(path)
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
         # The messages of a damaged file do not have the declared formats.
-        raise RecordingError(f'damaged: {failure}', path=path) from failure
-    rows = _instance(imus, imu, 'IMU', path)
+        raise RecordingError(f'damaged: {failure}') from failure
+    rows = _instance(imus, imu, 'IMU')
     correction = compensated.get(min(imus, default=0) if imu is None else imu)
     if correction and not allow_compensated:
         rows = _uncorrected(rows, correction)
@@ -92,15 +92,14 @@ def read_autopilot(
     if still.noise <= _NO_NOISE * still.magnitude:
         raise RecordingError(
             'the accelerometer at rest has no noise at all: this is a log of a simulator (SITL), '
-            'which cannot calibrate a real sensor',
-            path=path,
+            'which cannot calibrate a real sensor'
         )
     heard = {number: _reported(readings) for number, readings in baros.items()}
     if baro is None:
         heard = {number: readings for number, readings in heard.items() if len(readings.celsius)}
     readings = [_reported(temperature) for temperature in rows.temperatures.values()]
     if heard or baro is not None:
-        readings.append(_instance(heard, baro, 'barometer', path))
+        readings.append(_instance(heard, baro, 'barometer'))
     thinned = (thermometer.thinned() for thermometer in readings if len(thermometer.celsius))
     named = zip(('board', 'case'), thinned, strict=False)
     return replace(rows, temperatures=dict(named))
@@ -114,25 +113,18 @@ def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
     reason = 'the autopilot has already corrected the thermal drift of these samples'
     if is_corrected.all():
         raise RecordingError(
-            f'{name} was 1: {reason}; {advice}; or accept these samples with --allow-compensated',
-            path=rows.path,
+            f'{name} was 1: {reason}; {advice}; or accept these samples with --allow-compensated'
         )
     if not is_corrected.any():
         return rows
     share = 100.0 * float(is_corrected.mean())
-    kept = ~is_corrected
-    return replace(
-        rows,
-        stamp_ns=rows.stamp_ns[kept],
-        accel=rows.accel[kept],
-        gyro=None if rows.gyro is None else rows.gyro[kept],
-        chosen=f'{name} was 1 for {share:.0f} % of the samples, which are left out: {reason}',
-    )
+    chosen = f'{name} was 1 for {share:.0f} % of the samples, which are left out: {reason}'
+    return replace(rows.take(~is_corrected), chosen=chosen)
 
 
 def _ulog(path: Path) -> _Held:
     with open_regular(path) as file:
-        log = _read('pyulog', 'ULog', 'px4', 'a ULog file', path, file, list(_TOPICS))
+        log = _read('pyulog', 'ULog', 'px4', 'a ULog file', file, list(_TOPICS))
     by_topic: dict[str, dict[int, _Columns]] = {topic: {} for topic in _TOPICS}
     for data in log.data_list:
         if len(data.data.get('timestamp', ())):  # in a damaged file the time stamps may be missing
@@ -218,8 +210,7 @@ def _matched(stamp_ns: Ints, columns: _Columns | None) -> Floats | None:
     gyro_ns, gyro = _stamps(columns), _vectors(columns, _AXES)
     use = gyro_ns != NO_STAMP
     gyro_ns, gyro = gyro_ns[use], gyro[use]
-    is_sparse = not len(gyro_ns) or 2 * len(gyro_ns) < len(stamp_ns)
-    if is_sparse or not np.isfinite(gyro).all():
+    if len(gyro_ns) < max(len(stamp_ns) / 2, 1) or not np.isfinite(gyro).all():
         return None
     at, where = (stamp_ns - stamp_ns[0]) * 1e-9, (gyro_ns - stamp_ns[0]) * 1e-9
     return np.column_stack([np.interp(at, where, gyro[:, i]) for i in range(3)])
@@ -230,10 +221,10 @@ def _dataflash(path: Path) -> _Held:
         magic = file.read(2)
     if magic != b'\xa3\x95':
         raise RecordingError(
-            'not a DataFlash log of ArduPilot: it does not begin with the bytes a3 95', path=path
+            'not a DataFlash log of ArduPilot: it does not begin with the bytes a3 95'
         )
     reader = _read(
-        'pymavlink.DFReader', 'DFReader_binary', 'ardupilot', 'a DataFlash log', path, str(path)
+        'pymavlink.DFReader', 'DFReader_binary', 'ardupilot', 'a DataFlash log', str(path)
     )
     imus: dict[int, ForeignLog] = {}
     baros: dict[int, Readings] = {}
@@ -245,7 +236,7 @@ def _dataflash(path: Path) -> _Held:
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):
                 continue
-            table, n_short = _messages(reader, name, path)
+            table, n_short = _messages(reader, name)
             stamp_us = table.get('TimeUS', table.get('TimeMS', np.empty(0)) * 1000.0)
             if name == 'PARM' and table.keys() >= {'Name', 'Value'}:
                 for at, label, value in zip(stamp_us, table['Name'], table['Value'], strict=False):
@@ -282,19 +273,17 @@ def _dataflash(path: Path) -> _Held:
     return imus, baros, compensated
 
 
-def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
+def _messages(reader: Any, name: str) -> tuple[_Columns, int]:
     """Return the columns of a message type, and the number of its truncated messages."""
     number = reader.name_to_id[name]
     layout = reader.formats[number]
     codes = re.findall(r'(\d*)([a-zA-Z])', layout.msg_struct)  # type codes of module `struct`
     kinds = [f'S{size or 1}' if code == 's' else f'<{code}' for size, code in codes]
     if len({*layout.columns}) < len(layout.columns):
-        raise RecordingError(f'damaged: the format of {name} has a column twice', path=path)
+        raise RecordingError(f'damaged: the format of {name} has a column twice')
     kind = np.dtype(list(zip(layout.columns, kinds, strict=False)))
     if _HEADER_BYTES + kind.itemsize > layout.len:
-        raise RecordingError(
-            f'damaged: the format of {name} is longer than its stated length', path=path
-        )
+        raise RecordingError(f'damaged: the format of {name} is longer than its stated length')
     offsets = reader.offsets[number]
     begins = [at + _HEADER_BYTES for at in offsets if at + layout.len <= reader.data_len]
     content = b''.join(reader.data_map[at : at + kind.itemsize] for at in begins)
@@ -306,24 +295,24 @@ def _messages(reader: Any, name: str, path: Path) -> tuple[_Columns, int]:
     return columns, len(offsets) - len(begins)
 
 
-def _read(module: str, name: str, extra: str, what: str, path: Path, *arguments: Any) -> Any:
+def _read(module: str, name: str, extra: str, what: str, *arguments: Any) -> Any:
     """Read a file with class `name` of a library that is an optional dependency."""
-    read = getattr(import_extra(module, extra, what, path), name)
+    read = getattr(import_extra(module, extra, what), name)
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         # On damaged files the libraries raise any type of exception.
         try:
             return read(*arguments)
         except Exception as failure:
-            raise RecordingError(f'not {what} ({failure})', path=path) from failure
+            raise RecordingError(f'not {what} ({failure})') from failure
 
 
-def _instance(present: Mapping[int, T], wanted: int | None, what: str, path: Path) -> T:
+def _instance(present: Mapping[int, T], wanted: int | None, what: str) -> T:
     if not present:
-        raise RecordingError(f'the log holds no {what}', path=path)
+        raise RecordingError(f'the log holds no {what}')
     number = min(present) if wanted is None else wanted
     if number not in present:
         numbers = ', '.join(map(str, sorted(present)))
-        raise RecordingError(f'the log holds no {what} {number}; there are: {numbers}', path=path)
+        raise RecordingError(f'the log holds no {what} {number}; there are: {numbers}')
     return present[number]
 
 

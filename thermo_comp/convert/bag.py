@@ -14,7 +14,6 @@ from typing import Literal
 import numpy as np
 
 from ..errors import RecordingError
-from ..recording.chunks import translated
 from ..recording.reader import inspect_recording, read_recording
 from ..recording.topics import Present, Topics, choice_note
 from ..topics import IMU, TEMPERATURE
@@ -34,8 +33,7 @@ def bag_log(
 ) -> ForeignLog:
     """Read a bag; search for the topics given as None; `unit`: unit of the Imu's acceleration."""
     present = inspect_recording(path).topics
-    with translated(path):
-        inputs = find_topics(present, imu, board, case)
+    inputs = find_topics(present, imu, board, case)
     chosen = []
     for (role, name), given in zip(inputs.items(), (imu, board, case), strict=True):
         among = 'only' if role == 'imu' else 'nearest'

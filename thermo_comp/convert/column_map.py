@@ -50,8 +50,7 @@ _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than that of the row before
 #: A step from the uppermost to the lowest tenth of a counter's range is an overflow.
 _WRAP_EDGE = 0.1
-_A_MAP = 'a column map: --columns MAP'
-_GIVE_MAP = f'give {_A_MAP}'
+_GIVE_MAP = 'give a column map: --columns MAP'
 
 
 @dataclass(frozen=True)
@@ -237,12 +236,14 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     if table.headings:
         named = read_headings(table.headings, is_plausible)
     else:
-        named = _unnamed(path, len(table.values))
+        named = _unnamed(len(table.values))
     if named is None or (named.time is None and rate_hz is None):
-        lacks, instead = ('accelerometer', '') if named is None else ('time', '--rate-hz, or ')
+        lacks, give = 'accelerometer', _GIVE_MAP
+        if named is not None:
+            lacks, give = 'time', _GIVE_MAP.replace('give', 'give --rate-hz, or')
         listed = ', '.join(map(repr, table.headings[:20]))
         problem = f'its headings name no {lacks}: {listed}' if listed else 'the table has no times'
-        raise RecordingError(f'{problem}; give {instead}{_A_MAP}', path=path)
+        raise RecordingError(f'{problem}; {give}')
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
@@ -251,8 +252,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         unit, reason = infer_unit(still.magnitude)
         if unit == 'unknown':
             raise RecordingError(
-                f'the unit of the accelerometer cannot be guessed, {reason}: {_GIVE_MAP}',
-                path=path,
+                f'the unit of the accelerometer cannot be guessed, {reason}: {_GIVE_MAP}'
             )
     gyro = None
     if named.gyro is not None and unit != 'counts':
@@ -267,7 +267,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     times = None if named.time is None else values([named.time])[:, 0]
     span = max((_span(values([item.column])) for item in thermometers.values()), default=0.0)
     return ColumnMap(
-        _stamp(path, named, times, rate_hz, accel, span),
+        _stamp(named, times, rate_hz, accel, span),
         build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output}),
         thermometers.pop('board', None),
         thermometers.pop('case', None),
@@ -277,13 +277,12 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     )
 
 
-def _unnamed(path: Path, width: int) -> Headings:
+def _unnamed(width: int) -> Headings:
     """Return the columns ``[t] ax ay az [wx wy wz]``, by their numbers."""
     if width not in (3, 4, 6, 7):
         raise RecordingError(
             f'{width} columns without headings cannot be identified, only 3, 4, 6 or 7 columns '
-            f'[t] ax ay az [wx wy wz]: {_GIVE_MAP}',
-            path=path,
+            f'[t] ax ay az [wx wy wz]: {_GIVE_MAP}'
         )
     x = int(width in (4, 7))
     gyro = (x + 3, x + 4, x + 5) if width > 4 else None
@@ -323,21 +322,14 @@ def _span(values: Floats) -> float:
 
 
 def _stamp(
-    path: Path,
-    named: Headings,
-    times: Floats | None,
-    rate_hz: float | None,
-    accel: Floats,
-    span: float,
+    named: Headings, times: Floats | None, rate_hz: float | None, accel: Floats, span: float
 ) -> Stamp:
     """Guess the unit of times by heading, or size and interval; `span`: temperature range [K]."""
     if times is None:
         return Stamp(rate_hz=rate_hz)
+    column = f'its column {named.time!r}'
     if rate_hz is not None:
-        raise RecordingError(
-            f'its column {named.time!r} has the times of the samples: leave out --rate-hz',
-            path=path,
-        )
+        raise RecordingError(f'{column} has the times of the samples: leave out --rate-hz')
     times = times[np.isfinite(times)]
     if not len(times):
         return Stamp(named.time, 'iso')
@@ -345,40 +337,32 @@ def _stamp(
         return build(Stamp, {'column': named.time, 'unit': named.time_unit})
     if named.time_unit:
         raise RecordingError(
-            f'its column {named.time!r} is in {named.time_unit}: the times must be in s, ms, us '
-            'or ns, or dates',
-            path=path,
+            f'{column} is in {named.time_unit}: the times must be in s, ms, us or ns, or dates'
         )
     steps = np.diff(times)
-    if len(steps) and (steps > 0.0).mean() > _RISING and (steps >= 0.0).mean() > 0.9:
-        step, first = float(np.median(steps[steps > 0.0])), float(times[0])
-        # Shortest possible duration of the log [s]: temperatures change by `_FASTEST_K_S` at most.
-        shortest_s = span / _FASTEST_K_S
-        longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
-        # Take the largest unit that gives a plausible interval between samples (5 ms, not 5 s).
-        for unit, exponent in STAMP_EXPONENTS.items():
-            size = 10.0 ** (exponent - 9)
-            begin, step_s = first * size, step * size
-            is_date = _SINCE_1970_S[0] <= begin < _SINCE_1970_S[1] and step_s < _SINCE_1970_STEP_S
-            is_next_too_short = step_s * len(times) / 1000.0 < shortest_s
-            if is_date or (_STEPS_S[0] < step_s and (step_s < longest or is_next_too_short)):
-                return Stamp(named.time, unit)
-    raise RecordingError(_no_time(named.time, steps), path=path)
-
-
-def _no_time(column: Column | None, steps: Floats) -> str:
-    if len(steps) and (steps > 0.0).mean() <= _RISING and (steps >= 0.0).mean() > 0.9:
-        shown = f'{(steps == 0.0).mean():.0%}'
-        return (
-            f'its column {column!r} has the same time as the row before in {shown} of rows: '
-            f'give {_A_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
+    if not len(steps) or (steps >= 0.0).mean() <= 0.9:
+        raise RecordingError(f'{column} is not a rising time: {_GIVE_MAP}')
+    if (steps > 0.0).mean() <= _RISING:
+        raise RecordingError(
+            f'{column} has the same time as the row before in {(steps == 0.0).mean():.0%} of '
+            f'rows: {_GIVE_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
         )
-    if len(steps) and (steps >= 0.0).mean() > 0.9:
-        return (
-            f'its column {column!r} rises by {np.median(steps):.3g} from row to row, which is no '
-            f'plausible interval of samples in s, ms, us or ns: {_GIVE_MAP}'
-        )
-    return f'its column {column!r} is not a rising time: {_GIVE_MAP}'
+    step, first = float(np.median(steps[steps > 0.0])), float(times[0])
+    # Shortest possible duration of the log [s]: temperatures change by `_FASTEST_K_S` at most.
+    shortest_s = span / _FASTEST_K_S
+    longest = _SLOW_S if _turns_at_once(accel) else _STEPS_S[1]
+    # Take the largest unit that gives a plausible interval between samples (5 ms, not 5 s).
+    for unit, exponent in STAMP_EXPONENTS.items():
+        size = 10.0 ** (exponent - 9)
+        begin, step_s = first * size, step * size
+        is_date = _SINCE_1970_S[0] <= begin < _SINCE_1970_S[1] and step_s < _SINCE_1970_STEP_S
+        is_next_too_short = step_s * len(times) / 1000.0 < shortest_s
+        if is_date or (_STEPS_S[0] < step_s and (step_s < longest or is_next_too_short)):
+            return Stamp(named.time, unit)
+    raise RecordingError(
+        f'{column} rises by {np.median(steps):.3g} from row to row, which is no plausible '
+        f'interval of samples in s, ms, us or ns: {_GIVE_MAP}'
+    )
 
 
 def _turns_at_once(accel: Floats) -> bool:

@@ -7,7 +7,10 @@ At rest the norm of the specific force is gravity in any attitude. A log whose s
 contradicts gravity is refused: otherwise a factor of 9.8 would remain in the calibration.
 """
 
-from collections.abc import Callable, Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -78,6 +81,11 @@ class ForeignLog:
     guessed: Any = None  # column map, if it was guessed
     hint: str = ''  # advice on how to log better data
 
+    def take(self, rows: Bools) -> ForeignLog:
+        """Select samples; all temperatures are kept."""
+        gyro = None if self.gyro is None else self.gyro[rows]
+        return replace(self, stamp_ns=self.stamp_ns[rows], accel=self.accel[rows], gyro=gyro)
+
 
 @dataclass(frozen=True)
 class Stillness:
@@ -111,15 +119,23 @@ class ConversionReport:
     stillness: Stillness
 
 
-def import_extra(module: str, extra: str, what: str, path: Path) -> Any:
+def import_extra(module: str, extra: str, what: str) -> Any:
     """Import a module of the optional dependency `extra`; RecordingError if it is missing."""
     try:
         return import_module(module)
     except ImportError as failure:
         package = module.partition('.')[0]
-        raise RecordingError(
-            f"{what} needs {package}: pip install 'thermo_comp[{extra}]'", path=path
-        ) from failure
+        reason = f"{what} needs {package}: pip install 'thermo_comp[{extra}]'"
+        raise RecordingError(reason) from failure
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Add the path of a log to RecordingErrors that name no file."""
+    try:
+        yield
+    except RecordingError as error:
+        raise RecordingError(error.message, error.path or path, error.key) from error
 
 
 def write_log(
@@ -145,15 +161,10 @@ def write_log(
     line = np.arange(1, len(usable) + 1) if log.line is None else log.line
     not_numeric = _finding(~holds_numbers, line)
     out_of_range = _finding(holds_numbers & ~usable, line)
-    log = replace(
-        log,
-        stamp_ns=log.stamp_ns[usable],
-        accel=log.accel[usable],
-        gyro=None if log.gyro is None else log.gyro[usable],
-        temperatures={
-            name: part.take(_is_in_range(part.stamp_ns)) for name, part in log.temperatures.items()
-        },
-    )
+    temperatures = {
+        name: part.take(_is_in_range(part.stamp_ns)) for name, part in log.temperatures.items()
+    }
+    log = replace(log.take(usable), temperatures=temperatures)
     line, stamp_ns = line[usable], log.stamp_ns
     stillness = find_stillness(stamp_ns, log.accel)
     _refuse_wrong_units(log, stillness)

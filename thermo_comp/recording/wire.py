@@ -72,7 +72,9 @@ def decode_blocks(
             if role in topics and topics[role].encoding == 'ros1':
                 taken = as_cdr(taken, topics[role].type)
             if role in fields:
-                taken = _as_temperatures(taken, *fields[role].read(taken))
+                read_ns, values = fields[role].read(taken)
+                rows = encode_stamped(read_ns, '', N_NUMBERS[kind], [(0, values[:, None])])
+                taken = Messages.of_rows(rows, taken.channel, taken.log_ns)
             stamp_ns, numbers, frame = decode_stamped(taken, kind)
         except RecordingError as error:
             raise RecordingError(error.message, key=shown(topics[role].name)) from error
@@ -103,14 +105,6 @@ def decode_blocks(
             raw,
         )
     ]
-
-
-def _as_temperatures(messages: Messages, stamp_ns: Ints, values: Floats) -> Messages:
-    """Serialize readings as Temperature messages with the channels and log times of `messages`."""
-    rows = encode_stamped(stamp_ns, '', N_NUMBERS[TEMPERATURE], [(0, values[:, None])])
-    size = np.full(len(rows), rows.shape[1])
-    begins = np.cumsum(size) - size
-    return Messages(rows.ravel(), begins, size, messages.channel, messages.log_ns)
 
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:

@@ -201,10 +201,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 )
             pieces.append((at, numbers))
         rows = encode_stamped(stamps, frame_id, N_NUMBERS[kind], pieces)
-        size = np.full(len(rows), rows.shape[1])
-        channel = np.zeros(len(rows), np.uint16)
-        messages = Messages(rows.ravel(), np.cumsum(size) - size, size, channel, times)
-        self._add(topic, kind, messages)
+        self._add(topic, kind, Messages.of_rows(rows, np.zeros(len(rows), np.uint16), times))
 
     def _add(
         self, topic: str, kind: str, messages: Messages, definition: tuple[str, str] | None = None
