@@ -77,8 +77,8 @@ class RecordingReader(ExitStack):
                 self.fields = dict(self._fields(selected))
             bare = [role for role, field in self.fields.items() if not field.has_stamp]
             note = f'no stamps in {", ".join(bare)}: a reading gets the stamp of the sample before'
-            chosen = '; '.join(filter(None, (selected.chosen, note if bare else '')))
-            self.info = replace(self.info, input=selected.input, chosen=chosen or None)
+            chosen = _notes(selected.chosen, note if bare else '')
+            self.info = replace(self.info, input=selected.input, chosen=chosen)
         except BaseException as error:
             self.close()
             if isinstance(error, OSError):
@@ -106,18 +106,15 @@ class RecordingReader(ExitStack):
         if described.compression == 'file':
             folder = self.enter_context(TemporaryDirectory(prefix='thermo_comp-'))
         notes = [described.note]
+        is_packed = described.compression == 'message'
         for name in described.files:
             file = name
             if folder:
                 file = Path(folder, name.stem)
                 with translated(name):
                     notes.append(expand(name, file))
-            is_packed = described.compression == 'message'
-            opened: McapFile | ForeignFile
-            if described.storage == 'mcap' and not is_packed:
-                opened = McapFile(file, name)
-            else:
-                opened = ForeignFile(file, name, is_packed=is_packed)
+            is_foreign = described.storage != 'mcap' or is_packed
+            opened = ForeignFile(file, name, is_packed) if is_foreign else McapFile(file, name)
             self.callback(opened.close)
             self._files.append(opened)
             if opened.truncated is not None:
@@ -128,10 +125,10 @@ class RecordingReader(ExitStack):
             channels.setdefault(topic.name, []).append(topic)
         topics = {
             name: (
-                ' | '.join(dict.fromkeys(o.type for o in carriers)),
-                sum(o.n_messages for o in carriers),
+                ' | '.join(dict.fromkeys(c.type for c in each)),
+                sum(c.n_messages for c in each),
             )
-            for name, carriers in channels.items()
+            for name, each in channels.items()
         }
         for wanted, n_promised in described.counts.items():
             notes.append(_loss(wanted, topics.get(wanted, ('', 0))[1], n_promised))
@@ -141,7 +138,7 @@ class RecordingReader(ExitStack):
             topics,
             min((f.start_ns for f in self._files if f.start_ns is not None), default=0),
             max((f.end_ns for f in self._files if f.end_ns is not None), default=0),
-            '; '.join(filter(None, notes)) or None,
+            _notes(*notes),
             dict(ChainMap(*(f.metadata for f in self._files[::-1]), described.custom)),
         )
 
@@ -171,13 +168,12 @@ class RecordingReader(ExitStack):
                 n_read[role] += len(block.log_ns[role])
             if block.n_messages:
                 yield block
-        chosen = '; '.join(filter(None, (self.info.chosen, self.apart)))
-        self.info = replace(self.info, chosen=chosen or None)
+        info = replace(self.info, chosen=_notes(self.info.chosen, self.apart))
         for role, topic in self.topics.items():
-            loss = _loss(topic, n_read[role], self.info.topics[topic][1])
-            if loss and loss not in (self.info.truncated or ''):
-                losses = '; '.join(filter(None, (self.info.truncated, loss)))
-                self.info = replace(self.info, truncated=losses)
+            loss = _loss(topic, n_read[role], info.topics[topic][1])
+            if loss and loss not in (info.truncated or ''):
+                info = replace(info, truncated=_notes(info.truncated, loss))
+        self.info = info
 
     def raw(self, topics: Collection[str]) -> Iterator[tuple[Topic, Messages]]:
         """Read serialized messages of topics (the bag's names) in batches, each split by topic."""
@@ -217,8 +213,8 @@ class RecordingReader(ExitStack):
         last_ns = n_kept = 0
         for block in blocks:
             if len(block):
-                last_ns = int(block.accel_stamp_ns[-1])
                 first_ns = int(block.accel_stamp_ns[0]) if first_ns == inf else first_ns
+                last_ns = int(block.accel_stamp_ns[-1])
             begin, end = self._part.limits_ns(first_ns)
             left = block.take(
                 {role: (ns >= begin) & (ns < end) for role, ns in block.stamp_ns.items()}
@@ -340,19 +336,20 @@ def _place_of(file: Path) -> tuple[int, str]:
     return (int(number[1]) if number else 0, file.name)
 
 
-def _loss(topic: str, n_read: int, n_promised: int) -> str | None:
-    if n_read >= n_promised:
-        return None
-    return f'{shown(topic)}: {n_read} of {n_promised} listed messages are in the bag'
+def _notes(*notes: str | None) -> str | None:
+    """Join notes; None if all are missing or empty."""
+    return '; '.join(filter(None, notes)) or None
+
+
+def _loss(topic: str, n_read: int, n_promised: int) -> str:
+    text = f'{shown(topic)}: {n_read} of {n_promised} listed messages are in the bag'
+    return text if n_read < n_promised else ''
 
 
 class ForeignFile(BagFile):
-    """
-    A file that `rosbags` reads: sqlite3, ROS 1, or MCAP with messages that are compressed one by
-    one (`is_packed`).
-    """
+    """A file read by `rosbags`: sqlite3, ROS 1, MCAP with compressed messages (`is_packed`)."""
 
-    def __init__(self, path: Path, name: Path, *, is_packed: bool = False) -> None:
+    def __init__(self, path: Path, name: Path, is_packed: bool) -> None:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
 
