@@ -38,13 +38,6 @@ class NodeTopic:
     is_reliable: bool = True
     is_latched: bool = False  # a late subscriber gets the last message (transient local)
 
-    @property
-    def qos(self) -> str:
-        """Return the QoS as text for the reference page."""
-        words = ['reliable' if self.is_reliable else 'best effort']
-        words += ['transient local'] * self.is_latched
-        return ', '.join([*words, f'keep last {self.depth}'])
-
 
 def _bool_flag(_stamp_ns: int, is_dynamic: bool, _serial: str) -> bytes:
     """Serialize a std_msgs/Bool."""

@@ -71,10 +71,7 @@ _VECTORS = ('AccX', 'AccY', 'AccZ', 'GyrX', 'GyrY', 'GyrZ')
 def read_autopilot(
     path: Path, imu: int | None = None, baro: int | None = None, allow_compensated: bool = False
 ) -> ForeignLog:
-    """
-    Read an IMU and a barometer of a PX4 (``.ulg``) or ArduPilot log, by default those with the
-    lowest numbers. ArduPilot's IMUs are counted from 0: the old type ``IMU2`` has the number 1.
-    """
+    """Read an IMU and a barometer, by default those with the lowest numbers, counted from 0."""
     read = _ulog if path.suffix.lower() == '.ulg' else _dataflash
     try:
         # Ignore overflows of integer conversions: `_stamps` finds impossible time stamps.
@@ -243,7 +240,7 @@ def _dataflash(path: Path) -> _Held:
                     title = label.decode('ascii', 'replace')
                     changes.setdefault(title, []).append((int(at) * 1000, float(value)))
                 continue
-            old = int(name[-1]) - 1 if name[-1].isdigit() else 0
+            old = int(name[-1]) - 1 if name[-1].isdigit() else 0  # `IMU2` has the number 1
             table |= {'timestamp': stamp_us, 'I': table.get('I', np.full(len(stamp_us), old))}
             for number in np.unique(table['I'][: len(stamp_us)]).tolist():
                 columns = {title: column[table['I'] == number] for title, column in table.items()}

@@ -48,7 +48,8 @@ _FASTEST_K_S = 0.5
 # sensors in a column alternate from row to row, so these numbers change in a larger share of rows.
 _FEW_CHANGES = 0.1
 _RISING = 0.7  # smallest share of rows with a later time than that of the row before
-#: A step from the uppermost to the lowest tenth of a counter's range is an overflow.
+#: A step from the uppermost to the lowest tenth of the range of a 32-bit counter of time, such as
+#: Arduino's micros(), is an overflow (after 71.6 min).
 _WRAP_EDGE = 0.1
 _GIVE_MAP = 'give a column map: --columns MAP'
 
@@ -199,10 +200,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
 
 
 def _without_wraps(table: Table, unit: TimeUnit | None) -> tuple[Ints, tuple[int, ...]]:
-    """
-    Continue the times of a 32-bit counter that overflows, as Arduino's micros() does after
-    71.6 min; return the stamps, and the numbers of the lines that come first after an overflow.
-    """
+    """Continue 32-bit times after an overflow; return stamps, and lines just after overflows."""
     stamp_ns, rows = table.stamp_ns.copy(), np.flatnonzero(table.stamp_ns != NO_STAMP)
     if unit not in ('ms', 'us') or not len(rows):
         return stamp_ns, ()
@@ -300,10 +298,7 @@ def column_map_text(columns: ColumnMap) -> str:
 
 
 def _reads_temperature(values: Floats, unit: str) -> bool:
-    """
-    Whether the values of a column can be temperatures: most values are in the plausible range.
-    Whole numbers, which may number boards or tests, must change, but in under 10 % of rows.
-    """
+    """Whether the values of a column can be temperatures in a unit of `_CELSIUS`."""
     slope, offset = _CELSIUS[unit]
     celsius = values[np.isfinite(values)] * slope + offset
     if not len(celsius):

@@ -40,6 +40,7 @@ _OTHER = re.compile('mag|mfield|orient|euler|quat|angle|lin|free|user|grav|pos|v
 _TEMPERATURE = re.compile(
     'temp|tmp|celsius|(^|_)t_?c($|_)|^t_(board|case|imu|die|chip|sensor|air|amb|room|baro)'
 )
+# Places that are not on the board.
 _OUTSIDE = re.compile('case|air|amb|baro|bmp|aht|room|hous|env')
 # Unit of a temperature at the end of a heading; words in headings that are not of a temperature.
 _DEGREES_END = re.compile('(^|_)(deg_?[cfk]|kelvin|fahrenheit)$')
@@ -132,17 +133,13 @@ def _thermometers(
         elif _PLACE.fullmatch(name) and is_plausible(heading, unit):
             places.append(heading)
     result: dict[str, tuple[str, str]] = {}
-    for heading in sorted((*warm, *places), key=_is_outside):
-        usual = 'case' if result and (_is_outside(heading) or heading in warm) else 'board'
+    outside = {heading for heading in headings if _OUTSIDE.search(_plain(heading))}
+    for heading in sorted((*warm, *places), key=outside.__contains__):
+        usual = 'case' if result and (heading in outside or heading in warm) else 'board'
         if usual in result and heading in places:
             continue
         result[usual if usual not in result else f't{len(result)}'] = heading, units[heading]
     return result
-
-
-def _is_outside(heading: str) -> bool:
-    """Whether the heading of a thermometer names a place that is not on the board."""
-    return _OUTSIDE.search(_plain(heading)) is not None
 
 
 def map_lines(columns: Any) -> list[str]:

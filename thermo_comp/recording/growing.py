@@ -39,10 +39,7 @@ News = tuple[Block, RecordingInfo | None]
 def growing_blocks(
     path: Path, topics: Topics, wait: Callable[[float], bool]
 ) -> Iterator[News | None]:
-    """
-    Yield the new blocks of a bag, and None at the end of each pass, until the bag is complete;
-    `wait` waits for a time [s] and returns whether to end.
-    """
+    """Yield new blocks until the bag is complete or `wait(s)` is true; None after each pass."""
     if not path.exists():
         raise RecordingError('no such file or directory', path)
     n_seen: Counter[Role] = Counter()

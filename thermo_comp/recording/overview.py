@@ -45,15 +45,12 @@ class ThermometerSurvey:
 
 @dataclass(frozen=True)
 class Survey:
-    """
-    Summary of a recording. The sample rate is the inverse of the median interval between samples;
-    still intervals last at least 3 s; findings describe obstacles to a fit.
-    """
+    """Summary of a recording; still intervals last 3 s or more, findings name obstacles to a fit."""
 
     info: RecordingInfo
     n: int
     duration_s: float
-    rate_hz: float
+    rate_hz: float  # inverse of the median interval between samples
     n_still: int
     still_s: float
     thermometers: Mapping[str, ThermometerSurvey]

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ..typing import Bools, Floats, Ints
-from .coloured_noise import roughest_at_rest, spread_of_variances
-from .glitches import is_glitch
+from .noise import is_glitch, roughest_at_rest, spread_of_variances
 
 #: Largest variance of a cell at rest (30 samples or more) / the bag's noise variance: white noise
 #: exceeds 4 with a probability below 1e-11, and vibration that must be cut out is far above 4.
@@ -377,9 +376,8 @@ def why_restless(cells: Cells, still_sd: float = STILL_SD) -> str:
 
 
 def _is_full(cells: Cells) -> Bools:
-    if not len(cells.count):
-        return np.zeros(0, dtype=bool)
-    return np.asarray(cells.count >= max(2.0, 0.5 * float(np.median(cells.count))))
+    usual = float(np.median(cells.count)) if len(cells.count) else 0.0
+    return np.asarray(cells.count >= max(2.0, 0.5 * usual))
 
 
 def _one_g(cells: Cells) -> float:

@@ -108,10 +108,7 @@ def decode_blocks(
 
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
-    """
-    Decode messages of `kind`, a key of `N_NUMBERS` (a header and k float64 numbers), to stamps,
-    numbers, shape (n, k), and values of `frame_id`.
-    """
+    """Decode a header and k float64 numbers to stamps, numbers, shape (n, k), and frame_ids."""
     n, n_numbers, size = len(messages), N_NUMBERS[kind], messages.size
     if not n:
         return size, np.empty((0, n_numbers)), np.empty(0, 'S1')
