@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 from thermo_comp.quantities import QUANTITIES, Bounds
 from thermo_comp.ros.parameters import NodeConfig
-from thermo_comp.topics import INPUTS, OUTPUTS, NodeTopic, STATUS
+from thermo_comp.topics import INPUTS, OUTPUTS, STATUS, NodeTopic
 from thermo_comp.unit.calibration import Calibration
 from thermo_comp.unit.schema import fields_of, plain
 

@@ -45,7 +45,7 @@ class ThermometerSurvey:
 
 @dataclass(frozen=True)
 class Survey:
-    """Summary of a recording; still intervals last 3 s or more, findings name obstacles to a fit."""
+    """Summary of a recording: still intervals of 3 s or more, findings on obstacles to a fit."""
 
     info: RecordingInfo
     n: int

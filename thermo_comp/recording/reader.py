@@ -75,7 +75,7 @@ class RecordingReader(ExitStack):
                 selected = select_topics(self.info.topics, topics, require, self.info.metadata)
                 self.topics: Mapping[Role, str] = selected.topics
                 self.fields = dict(self._fields(selected))
-            bare = [role for role, field in self.fields.items() if not field.has_stamp]
+            bare = [role for role, field in self.fields.items() if not field.header]
             note = f'no stamps in {", ".join(bare)}: a reading gets the stamp of the sample before'
             chosen = _notes(selected.chosen, note if bare else '')
             self.info = replace(self.info, input=selected.input, chosen=chosen)
