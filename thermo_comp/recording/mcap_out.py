@@ -72,8 +72,7 @@ class McapOutput:
         name: str,
     ) -> None:
         self._name, self._metadata, self._chunk_bytes = name, metadata, chunk_bytes
-        self._compression = compression
-        self._level = level
+        self._compression, self._level = compression, level
         self._schemas: dict[str, records.Schema] = {}
         self._channels: dict[str, records.Channel] = {}
         self._counts: Counter[int] = Counter()
@@ -100,16 +99,9 @@ class McapOutput:
             schema = records.Schema(len(self._schemas) + 1, text.encode(), encoding, kind)
             self._schemas[kind] = schema
             self._put_record(schema)
-        channel = records.Channel(
-            id=len(self._channels) + 1,
-            topic=topic,
-            message_encoding='cdr',
-            schema_id=schema.id,
-            metadata={
-                'offered_qos_profiles': dump_yaml([_offered_qos(topic)]).strip(),
-                'topic_type_hash': type_hash,
-            },
-        )
+        qos = dump_yaml([_offered_qos(topic)]).strip()
+        facts = {'offered_qos_profiles': qos, 'topic_type_hash': type_hash}
+        channel = records.Channel(len(self._channels) + 1, topic, 'cdr', facts, schema.id)
         self._channels[topic] = channel
         self._counts[channel.id] = 0
         self._put_record(channel)
@@ -117,10 +109,7 @@ class McapOutput:
 
     def append(self, batches: Sequence[Messages]) -> None:
         """Add messages in log-time order; write full chunks, hold the rest for the next chunk."""
-        messages = join_messages([*self._tail, *batches])
-        n_old = sum(map(len, self._tail))
-        order = np.argsort(messages.log_ns[n_old:], kind='stable')
-        messages = messages.take(np.concatenate([np.arange(n_old), n_old + order]))
+        messages = join_messages([*self._tail, join_messages(batches).in_order()])
         ends = np.cumsum(messages.size + MESSAGE_HEAD_BYTES)
         begin = n_done = 0
         while len(ends) and ends[-1] - n_done >= self._chunk_bytes:
@@ -212,13 +201,8 @@ class McapOutput:
         scatter(data, at, heads.view(np.dtype((np.void, MESSAGE_HEAD_BYTES))))
         packed = _COMPRESSORS[self._compression](data.data, self._level)
         name = '' if self._compression == 'none' else self._compression
-        start, end = int(np.min(log_ns)), int(np.max(log_ns))
-        begin, n_bytes, checksum = self._at, len(data), zlib.crc32(data.data)
-        head = (Opcode.CHUNK, 40 + len(name) + len(packed), start, end, n_bytes, checksum)
-        self._put(
-            struct.pack(f'<BQQQQII{len(name)}sQ', *head, len(name), name.encode(), len(packed))
-        )
-        self._put(packed)
+        begin, start, end = self._at, int(np.min(log_ns)), int(np.max(log_ns))
+        self._put_record(records.Chunk(name, packed, end, start, zlib.crc32(data.data), len(data)))
         chunk_length = self._at - begin
         offsets: dict[int, int] = {}
         rows = np.empty(len(log_ns), _INDEX_ROW)
@@ -239,7 +223,7 @@ class McapOutput:
                 message_index_length=self._at - begin - chunk_length,
                 message_index_offsets=offsets,
                 message_start_time=start,
-                uncompressed_size=n_bytes,
+                uncompressed_size=len(data),
             )
         )
 
