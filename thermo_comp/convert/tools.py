@@ -287,11 +287,11 @@ def _read_imu_calib(text: str, _number: int | None) -> Content | None:
 
 def _read_kalibr(text: str, number: int | None) -> Content | None:
     """Read an IMU of Kalibr's YAML, by the number of the IMU; None if no IMU has a matrix."""
-    imus = {
-        str(name): _dictionary(_dictionary(part).get('accelerometers'))
-        for name, part in _mapping(text).items()
-    }
-    imus = {name: part for name, part in imus.items() if 'M' in part}
+    imus = {}
+    for name, part in _mapping(text).items():
+        sensor = _dictionary(_dictionary(part).get('accelerometers'))
+        if 'M' in sensor:
+            imus[name] = sensor
     if not imus:
         return None
     name = next(iter(imus)) if number is None else f'imu{number}'

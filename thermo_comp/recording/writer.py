@@ -9,7 +9,6 @@ stays.
 """
 
 import csv
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OutputError, RecordingError
-from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted
+from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted, sync
 from ..topics import BOOL, IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
 from ..typing import Ints
 from .blocks import ImuColumns
@@ -153,10 +152,9 @@ class BagWriter(AbstractContextManager['BagWriter']):
                 information = self._file.finish()
                 if not self._is_file:
                     text = dump_yaml({'rosbag2_bagfile_information': information})
-                    with (self._draft.partial / 'metadata.yaml').open('wb') as file:
-                        file.write(text.encode())
-                        file.flush()
-                        os.fsync(file.fileno())
+                    path = self._draft.partial / 'metadata.yaml'
+                    path.write_bytes(text.encode())
+                    sync(path)
             self._draft.publish()
             self._file = None
         except BaseException:
@@ -260,13 +258,12 @@ def table_writer(
         writer: Any = None
         if kind is CSV:
             text = stack.enter_context(partial.open('w', encoding='utf-8', newline=''))
+            lines = csv.writer(text, lineterminator='\n')
 
             def write_lines(columns: Mapping[str, NDArray[Any]]) -> None:
-                nonlocal writer
-                if writer is None:
-                    writer = csv.writer(text, lineterminator='\n')
-                    writer.writerow(columns)
-                writer.writerows(zip(*(col.tolist() for col in columns.values()), strict=True))
+                if not text.tell():
+                    lines.writerow(columns)
+                lines.writerows(zip(*(col.tolist() for col in columns.values()), strict=True))
 
             yield write_lines
             return
