@@ -4,7 +4,8 @@
 
 import numpy as np
 import pytest
-from position_helpers import START_NS, Imu, ImuBlock
+from builders import ArrayBlock
+from position_helpers import START_NS, Imu
 
 from thermo_comp.errors import FitError
 from thermo_comp.fitting import FitOptions, FitSource, fit, reduce_bag
@@ -18,10 +19,7 @@ OPTIONS = FitOptions(gravity=GRAVITY, input='m/s^2')
 
 def source(accel, gyro=None):
     stamps = START_NS + np.rint(np.arange(len(accel)) * 1e9 / RATE_HZ).astype(np.int64)
-    nothing = np.zeros(0)
-    imu = None if gyro is None else Imu(gyro)
-    block = ImuBlock(stamps, accel, nothing.astype(np.int64), nothing,
-                     nothing.astype(np.int64), nothing, imu=imu)  # fmt: skip
+    block = ArrayBlock(stamps, accel, imu=None if gyro is None else Imu(gyro))
     return FitSource('log', lambda: [block])
 
 
@@ -149,8 +147,6 @@ def test_a_drift_in_a_ramp_is_not_taken_for_a_motion(rng):
     for knock, n_rests in ((0.0, 1), (0.1, 2)):
         accel = np.array((0.0, 0.0, GRAVITY)) + 5e-3 * MG * rng.standard_normal((7200, 3))
         accel[:, :2] += ramp[:, None] + knock * MG * (time[:, None] > 3000.0)
-        nothing = np.zeros(0)
-        block = ImuBlock(stamps, accel, nothing.astype(np.int64), nothing,
-                         nothing.astype(np.int64), nothing)  # fmt: skip
+        block = ArrayBlock(stamps, accel)
         bag = reduce_bag(FitSource('slow', lambda block=block: [block]), OPTIONS)
         assert len(bag.intervals) == n_rests

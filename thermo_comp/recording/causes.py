@@ -26,13 +26,12 @@ class CauseCounter:
 
     def add(self, block: Block) -> None:
         """Count zero samples, messages marked as without acceleration, and stamps of a block."""
-        imu = getattr(block, 'imu', None)
-        covariance = getattr(imu, 'linear_acceleration_covariance', None)
         self._n += len(block.accel_stamp_ns)
-        self._n_zero += int(np.count_nonzero(~np.asarray(block.accel).any(axis=1)))
-        self._is_imu |= imu is not None
-        if covariance is not None:
-            self._n_absent += int(np.count_nonzero(covariance[:, 0] == -1.0))
+        self._n_zero += int(np.count_nonzero(~block.accel.any(axis=1)))
+        if block.imu is not None:
+            self._is_imu = True
+            is_absent = block.imu.linear_acceleration_covariance[:, 0] == -1.0
+            self._n_absent += int(np.count_nonzero(is_absent))
         if len(self._stamps_ns) < 2:  # two different stamps show that the clock runs
             self._stamps_ns |= set(np.unique(block.accel_stamp_ns)[:2].tolist())
 
@@ -48,10 +47,9 @@ class CauseCounter:
         if self._n_zero == self._n and self._n:
             return 'all samples are exactly zero: the sensor does not answer'
         if self._n_zero > _GLITCH_SHARE * self._n:
-            share = 100.0 * self._n_zero / self._n
             return (
-                f'{share:.0f} % of the samples are exactly zero, between other samples: the topic '
-                'has two sources, or messages without an acceleration'
+                f'{100.0 * self._n_zero / self._n:.0f} % of the samples are exactly zero, between '
+                'other samples: the topic has two sources, or messages without an acceleration'
             )
         return self._unit_of(cells, still_sd) if self._is_imu else ''
 
