@@ -24,11 +24,9 @@ from ..recording.blocks import Readings
 from ..recording.topics import is_thermometer
 from ..typing import Floats, Ints
 from ..unit.schema import SchemaError, build
-from .headings import Headings, read_headings
+from .headings import Column, Headings, Triple, read_headings
 from .log import NO_STAMP, PLAUSIBLE_CELSIUS, ForeignLog, Unit, find_stillness, infer_unit
-from .table import STAMP_EXPONENTS, Column, Format, Stamp, Table, TimeUnit, read_parquet, read_text
-
-Triple = tuple[Column, Column, Column]
+from .table import STAMP_EXPONENTS, Format, Stamp, Table, TimeUnit, read_parquet, read_text
 
 #: Slope and offset that convert a temperature of each unit to degC.
 _CELSIUS = {'degC': (1.0, 0.0), 'K': (1.0, -273.15), 'degF': (5 / 9, -160 / 9)}

@@ -66,7 +66,7 @@ _DEGREES = {
 _CELSIUS = ('c', '°c', 'ºc', 'degc', 'deg c', 'celsius')
 
 Column = str | int
-Columns = tuple[Column, Column, Column]
+Triple = tuple[Column, Column, Column]
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,9 @@ class Headings:
 
     time: Column | None
     time_unit: str  # a unit of a column map, or min, h, days
-    accel: Columns
+    accel: Triple
     accel_unit: str
-    gyro: Columns | None
+    gyro: Triple | None
     gyro_unit: str
     thermometers: dict[str, tuple[str, str]]  # column and unit by thermometer
 

@@ -174,7 +174,7 @@ def write_log(
     newest = np.maximum.accumulate(stamp_ns)
     steps = np.diff(newest)
     lower, upper = log.clip or (-np.inf, np.inf)
-    is_clipped = ((log.accel <= lower) | (log.accel >= upper)).any(axis=1)
+    is_clipped = np.any((log.accel <= lower) | (log.accel >= upper), axis=1)
     counts = {name: len(part.celsius) for name, part in log.temperatures.items()}
     return ConversionReport(
         log,

@@ -29,10 +29,9 @@ from ..errors import RecordingError
 from ..files import open_regular
 from ..quantities import NotNegative, Positive
 from ..typing import Floats, Ints
-from .headings import read_headings
+from .headings import Column, read_headings
 from .log import NO_STAMP, import_extra
 
-Column = str | int
 TimeUnit = Literal['s', 'ms', 'us', 'ns', 'iso']
 
 _SNIFF_BYTES = 65536
@@ -142,7 +141,6 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
 
 
 def _most_frequent(numbers: Sequence[int]) -> tuple[int, int]:
-    """Return the most frequent number and its frequency."""
     most = max(set(numbers), key=numbers.count, default=0)
     return most, numbers.count(most)
 
@@ -192,10 +190,8 @@ def _begin(rows: _Rows, width: int, has_header: bool | None) -> tuple[list[str],
 
 def _commented(head: str, delimiter: str, width: int) -> list[str]:
     """Return headings from the last comment before a table, where numpy.savetxt writes them."""
-    comments = list(
-        takewhile(lambda line: not line.strip() or _is_comment(line), head.splitlines())
-    )
-    text = next((line for line in reversed(comments) if line.strip()), '').strip().lstrip('#%/ ')
+    lines = (line.strip() for line in head.splitlines() if line.strip())
+    text = [*takewhile(_is_comment, ('#', *lines))][-1].lstrip('#%/ ')
     cells = text.split() if delimiter == ' ' else next(csv.reader([text], delimiter=delimiter), [])
     cells = [cell.strip() for cell in cells]
     return cells if len(cells) == width and read_headings(cells) is not None else []
@@ -214,8 +210,7 @@ def _numbers(cells: list[str]) -> list[float]:
     try:
         return list(map(float, cells))
     except ValueError:
-        numbers = map(_number, cells)
-        return [nan if number is None else number for number in numbers]
+        return [nan if (number := _number(cell)) is None else number for cell in cells]
 
 
 def _collect(
@@ -278,7 +273,6 @@ def _place(name: Column, headings: Sequence[str], width: int) -> int:
 
 
 def _not_used(headings: Sequence[str], width: int, used: Container[int | None]) -> tuple[str, ...]:
-    """Return the headings, or else the numbers, of the columns that are not used."""
     names = headings or [str(number) for number in range(width)]
     return tuple(name for place, name in enumerate(names) if name and place not in used)
 
@@ -312,10 +306,7 @@ def _iso_ns(text: str) -> int:
 def read_parquet(
     path: Path, columns: Sequence[Column] | None, stamp: Stamp, _style: Format | None = None
 ) -> Table:
-    """
-    Read columns of a Parquet file as `read_text` does; timestamps of Parquet state their unit.
-    If `columns` is None all columns are read, and columns without numbers become NaN.
-    """
+    """Read a Parquet file as `read_text` reads a text; of all columns, those of texts are NaN."""
     pq = import_extra('pyarrow.parquet', 'parquet', 'a Parquet file')
     import pyarrow as pa
 
@@ -342,16 +333,15 @@ def read_parquet(
         try:
             column = cells[name].cast(pa.float64(), safe=False).to_numpy()
         except (pa.ArrowException, ValueError) as failure:
-            if columns is None:
-                values[name] = np.full(table.num_rows, nan)
-                continue
-            problem = f'column {name!r} holds {cells[name].type}, expected numbers'
-            raise RecordingError(problem) from failure
+            if columns is not None:
+                problem = f'column {name!r} holds {cells[name].type}, expected numbers'
+                raise RecordingError(problem) from failure
+            column = np.full(table.num_rows, nan)
         values[name] = np.asarray(column, dtype=np.float64)
     stamp_ns = stamp.ticks(table.num_rows)
     if stamp.column is not None:
         stamps, unit = cells[stamp.column], stamp.unit
-        if pa.types.is_timestamp(stamps.type):
+        if pa.types.is_timestamp(stamps.type):  # a timestamp of Parquet states its unit
             unit, stamps = stamps.type.unit, stamps.cast(pa.int64())
         stamp_ns = np.array([exact_ns(cell, unit) for cell in stamps.to_pylist()])
     line = np.arange(1, table.num_rows + 1, dtype=np.int64)
