@@ -49,7 +49,7 @@ _RISING = 0.7  # smallest share of rows with a later time than that of the row b
 #: A step from the uppermost to the lowest tenth of the range of a 32-bit counter of time, such as
 #: Arduino's micros(), is an overflow (after 71.6 min).
 _WRAP_EDGE = 0.1
-_GIVE_MAP = 'give a column map: --columns MAP'
+_A_MAP = 'a column map: --columns MAP'
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def table_log(path: Path, columns: ColumnMap) -> ForeignLog:
     thermometers |= {thermometer.name: thermometer for thermometer in columns.further}
     used = {name: column for name, column in thermometers.items() if column is not None}
     wanted = [*accel.columns, *(gyro.columns if gyro else ()), *(t.column for t in used.values())]
-    table = _read(path, list(dict.fromkeys(wanted)), columns.stamp, columns.format)
+    table = _read(path, wanted, columns.stamp, columns.format)
     stamp_ns, continued = _without_wraps(table, columns.stamp.unit)
     known = stamp_ns != NO_STAMP
     temperatures = {}
@@ -234,12 +234,10 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     else:
         named = _unnamed(len(table.values))
     if named is None or (named.time is None and rate_hz is None):
-        lacks, give = 'accelerometer', _GIVE_MAP
-        if named is not None:
-            lacks, give = 'time', _GIVE_MAP.replace('give', 'give --rate-hz, or')
+        lacks, instead = ('accelerometer', '') if named is None else ('time', '--rate-hz, or ')
         listed = ', '.join(map(repr, table.headings[:20]))
         problem = f'its headings name no {lacks}: {listed}' if listed else 'the table has no times'
-        raise RecordingError(f'{problem}; {give}')
+        raise RecordingError(f'{problem}; give {instead}{_A_MAP}')
     accel = values(named.accel)
     unit = named.accel_unit
     if not unit:
@@ -248,7 +246,7 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
         unit, reason = infer_unit(still.magnitude)
         if unit == 'unknown':
             raise RecordingError(
-                f'the unit of the accelerometer cannot be guessed, {reason}: {_GIVE_MAP}'
+                f'the unit of the accelerometer cannot be guessed, {reason}: give {_A_MAP}'
             )
     gyro = None
     if named.gyro is not None and unit != 'counts':
@@ -278,7 +276,7 @@ def _unnamed(width: int) -> Headings:
     if width not in (3, 4, 6, 7):
         raise RecordingError(
             f'{width} columns without headings cannot be identified, only 3, 4, 6 or 7 columns '
-            f'[t] ax ay az [wx wy wz]: {_GIVE_MAP}'
+            f'[t] ax ay az [wx wy wz]: give {_A_MAP}'
         )
     x = int(width in (4, 7))
     gyro = (x + 3, x + 4, x + 5) if width > 4 else None
@@ -334,11 +332,11 @@ def _stamp(
         )
     steps = np.diff(times)
     if not len(steps) or (steps >= 0.0).mean() <= 0.9:
-        raise RecordingError(f'{column} is not a rising time: {_GIVE_MAP}')
+        raise RecordingError(f'{column} is not a rising time: give {_A_MAP}')
     if (steps > 0.0).mean() <= _RISING:
         raise RecordingError(
             f'{column} has the same time as the row before in {(steps == 0.0).mean():.0%} of '
-            f'rows: {_GIVE_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
+            f'rows: give {_A_MAP}, with `stamp: {{rate_hz: HZ}}` for samples at a fixed rate'
         )
     step, first = float(np.median(steps[steps > 0.0])), float(times[0])
     # Shortest possible duration of the log [s]: temperatures change by `_FASTEST_K_S` at most.
@@ -354,7 +352,7 @@ def _stamp(
             return Stamp(named.time, unit)
     raise RecordingError(
         f'{column} rises by {np.median(steps):.3g} from row to row, which is no plausible '
-        f'interval of samples in s, ms, us or ns: {_GIVE_MAP}'
+        f'interval of samples in s, ms, us or ns: give {_A_MAP}'
     )
 
 

@@ -95,22 +95,20 @@ def read_headings(
     times.sort(key=lambda text: _LETTER.search(_plain(text)) is None)
     found = dict(_triads(names))
     triads = {key: three for key, three in found.items() if not _OTHER.search(key)}
-    accel = next((key for key in triads if _ACCEL.search(key)), '' if '' in triads else None)
-    if accel is None:
-        accel = next((key for key in found if _ROS_ACCEL.search(key)), None)
-        triads |= {} if accel is None else {accel: found[accel]}
+    accel = next((three for key, three in triads.items() if _ACCEL.search(key)), triads.get(''))
+    accel = accel or next((three for key, three in found.items() if _ROS_ACCEL.search(key)), None)
     if accel is None:
         return None
-    gyro = next((key for key in triads if _GYRO.search(key)), None)
+    gyro = next((three for key, three in triads.items() if _GYRO.search(key)), None)
     time = times[-1] if times else ''
     taken = {time, *(heading for three in found.values() for heading in three)}
     return Headings(
         time or None,
         _stated(time, _TIMES | _LONG_TIMES),
-        triads[accel],
-        _stated(triads[accel][0], _ACCELS),
-        triads[gyro] if gyro is not None else None,
-        _stated(triads[gyro][0], _RATES) if gyro is not None else '',
+        accel,
+        _stated(accel[0], _ACCELS),
+        gyro,
+        _stated(gyro[0], _RATES) if gyro else '',
         _thermometers([text for text in headings if text not in taken], names, is_plausible),
     )
 
@@ -135,10 +133,11 @@ def _thermometers(
     result: dict[str, tuple[str, str]] = {}
     outside = {heading for heading in headings if _OUTSIDE.search(_plain(heading))}
     for heading in sorted((*warm, *places), key=outside.__contains__):
-        usual = 'case' if result and (heading in outside or heading in warm) else 'board'
-        if usual in result and heading in places:
-            continue
-        result[usual if usual not in result else f't{len(result)}'] = heading, units[heading]
+        name = 'case' if result and (heading in outside or heading in warm) else 'board'
+        if name not in result:
+            result[name] = heading, units[heading]
+        elif heading in warm:
+            result[f't{len(result)}'] = heading, units[heading]
     return result
 
 
@@ -162,9 +161,8 @@ def _is_warm(heading: str) -> bool:
     """Whether a heading names a temperature, by its words or by its unit."""
     unit, name = _UNIT.search(heading), _plain(heading)
     is_unit = unit is not None and unit[1].strip().lower() in {*_DEGREES, *_CELSIUS}
-    if is_unit or _DEGREES_END.search(name):
-        return True
-    return _TEMPERATURE.search(name) is not None and _NO_READING.search(name) is None
+    is_name = _TEMPERATURE.search(name) and not _NO_READING.search(name)
+    return bool(is_unit or _DEGREES_END.search(name) or is_name)
 
 
 def _plain(heading: str) -> str:
