@@ -45,16 +45,15 @@ T = TypeVar('T')
 
 
 class _Correction(NamedTuple):
-    """A parameter that is 1 while the autopilot corrects thermal drift; times of its values."""
+    """A parameter that is 1 while the autopilot corrects thermal drift."""
 
     parameter: str
-    since_ns: Sequence[int]
-    values: Sequence[float]
+    course: Sequence[tuple[int, float]]  # times since boot [ns] and the values from then on
     advice: str
 
 
-#: Content of a log: IMUs, barometers and the thermal corrections of the IMUs, by instance number.
-_Held = tuple[Mapping[int, ForeignLog], Mapping[int, Readings], Mapping[int, _Correction]]
+#: Content of a log: IMUs with their thermal corrections, and barometers, by instance number.
+_Held = tuple[Mapping[int, tuple[ForeignLog, _Correction | None]], Mapping[int, Readings]]
 _Columns = dict[str, npt.NDArray[Any]]
 
 _CENTURY_US = 100 * 366 * 86400 * 10**6
@@ -76,12 +75,11 @@ def read_autopilot(
     try:
         # Ignore overflows of integer conversions: `_stamps` finds impossible time stamps.
         with np.errstate(invalid='ignore', over='ignore'):
-            imus, baros, compensated = read(path)
+            imus, baros = read(path)
     except (ArithmeticError, LookupError, TypeError, ValueError) as failure:
         # The messages of a damaged file do not have the declared formats.
         raise RecordingError(f'damaged: {failure}') from failure
-    rows = _instance(imus, imu, 'IMU')
-    correction = compensated.get(min(imus, default=0) if imu is None else imu)
+    rows, correction = _instance(imus, imu, 'IMU')
     if correction and not allow_compensated:
         rows = _uncorrected(rows, correction)
     stamped = rows.stamp_ns != NO_STAMP
@@ -104,7 +102,8 @@ def read_autopilot(
 
 def _uncorrected(rows: ForeignLog, correction: _Correction) -> ForeignLog:
     """Drop samples that the autopilot has corrected; RecordingError if no sample is left."""
-    name, since_ns, values, advice = correction
+    name, course, advice = correction
+    since_ns, values = zip(*course, strict=True)
     at = np.searchsorted(np.array(since_ns, np.int64), rows.stamp_ns, 'right') - 1
     is_corrected = np.array(values)[np.maximum(at, 0)] == 1.0
     reason = 'the autopilot has already corrected the thermal drift of these samples'
@@ -135,7 +134,7 @@ def _ulog(path: Path) -> _Held:
     if log.file_corruption:
         metadata['px4_corruption'] = 'parts of the file could not be read'
     accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
-    compensated: dict[int, _Correction] = {}
+    correction = None
     if not accels:
         both = {number: _combined(pair) for number, pair in by_topic['sensor_combined'].items()}
         accels, gyros = ({number: pair[part] for number, pair in both.items()} for part in (0, 1))
@@ -144,19 +143,16 @@ def _ulog(path: Path) -> _Held:
             f'corrected by CAL_ACC*; to record raw samples, {_PROFILE}'
         )
         name = 'TC_A_ENABLE'
-        changes = [parameter for parameter in log.changed_parameters if parameter[1] == name]
-        correction = _Correction(
-            name,
-            [0, *(int(change[0]) * 1000 for change in changes)],
-            [float(log.initial_parameters.get(name, 0)), *(float(row[2]) for row in changes)],
-            f'the log has only sensor_combined: {_PROFILE}',
-        )
-        compensated = dict.fromkeys(accels, correction)
+        course = [(0, float(log.initial_parameters.get(name, 0)))]
+        course += [
+            (int(at) * 1000, float(x)) for at, key, x in log.changed_parameters if key == name
+        ]
+        correction = _Correction(name, course, f'the log has only sensor_combined: {_PROFILE}')
     imus = {}
     for number, columns in accels.items():
         stamp_ns = _stamps(columns)
         is_slow = len(stamp_ns) > 1 and np.median(np.diff(stamp_ns[:100])) > 1e9 / SLOW_HZ
-        imus[number] = ForeignLog(
+        rows = ForeignLog(
             str(path),
             stamp_ns,
             _vectors(columns, _AXES),
@@ -166,7 +162,8 @@ def _ulog(path: Path) -> _Held:
             metadata=metadata,
             hint=hint or (_PROFILE if is_slow else ''),
         )
-    return imus, baros, compensated
+        imus[number] = rows, correction
+    return imus, baros
 
 
 def _combined(columns: _Columns) -> list[_Columns]:
@@ -260,14 +257,12 @@ def _dataflash(path: Path) -> _Held:
                     )
     finally:
         reader.close()
-    compensated = {}
-    for number in imus:
+    held = {}
+    for number, rows in imus.items():
         name = f'INS_TCAL{number + 1}_ENABLE'
         course = changes.get(name) or [(0, float(reader.params.get(name, 0.0)))]
-        since_ns, values = zip(*course, strict=True)
-        advice = f'set {name} to 0 and record again'
-        compensated[number] = _Correction(name, since_ns, values, advice)
-    return imus, baros, compensated
+        held[number] = rows, _Correction(name, course, f'set {name} to 0 and record again')
+    return held, baros
 
 
 def _messages(reader: Any, name: str) -> tuple[_Columns, int]:
