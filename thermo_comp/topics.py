@@ -40,7 +40,6 @@ class NodeTopic:
 
 
 def _bool_flag(_stamp_ns: int, is_dynamic: bool, _serial: str) -> bytes:
-    """Serialize a std_msgs/Bool."""
     return _ENCAPSULATION + bytes([is_dynamic])
 
 

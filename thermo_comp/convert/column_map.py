@@ -307,7 +307,6 @@ def _reads_temperature(values: Floats, unit: str) -> bool:
 
 
 def _span(values: Floats) -> float:
-    """Return the range of a column's values without the lowest and highest 2 %."""
     low, high = np.nanquantile(values, (0.02, 0.98)) if np.isfinite(values).any() else (0.0, 0.0)
     return float(high - low)
 

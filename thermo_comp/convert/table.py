@@ -206,7 +206,6 @@ def _number(cell: str) -> float | None:
 
 
 def _numbers(cells: list[str]) -> list[float]:
-    """Read cells as numbers, NaN if a cell is not a number."""
     try:
         return list(map(float, cells))
     except ValueError:

@@ -243,7 +243,6 @@ def _write_imu_tk(content: Content, _number: int | None, _device_id: int) -> str
 
 
 def _write_imu_calib(content: Content, _number: int | None, _device_id: int) -> str:
-    """Write imu_calib's YAML: the matrix by rows, then the bias."""
     bias = content.matrix @ content.bias[:, 0]
     return f'SM: {content.matrix.ravel().tolist()}\nbias: {bias.tolist()}\n'
 

@@ -167,7 +167,6 @@ class McapOutput:
         }
 
     def _times(self) -> tuple[int, int]:
-        """Return the log times of the first and the last message."""
         start = min((chunk.message_start_time for chunk in self._chunks), default=0)
         return start, max((chunk.message_end_time for chunk in self._chunks), default=0)
 
@@ -191,7 +190,6 @@ class McapOutput:
         self._metadata_index.append(records.MetadataIndex(begin, self._at - begin, name))
 
     def _put_chunk(self, messages: Messages) -> None:
-        """Write messages as a chunk with its message indexes."""
         log_ns, channel, size = messages.log_ns, messages.channel, messages.size
         laid = messages.packed(MESSAGE_HEAD_BYTES)
         data, at = laid.data, laid.start - MESSAGE_HEAD_BYTES

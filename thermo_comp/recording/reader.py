@@ -337,7 +337,6 @@ def _place_of(file: Path) -> tuple[int, str]:
 
 
 def _notes(*notes: str | None) -> str | None:
-    """Join notes; None if all are missing or empty."""
     return '; '.join(filter(None, notes)) or None
 
 
