@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 VECTOR = 'geometry_msgs/msg/Vector3Stamped'
 IMU = 'sensor_msgs/msg/Imu'
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
-STRING = 'std_msgs/msg/String'
+STRING, BOOL = 'std_msgs/msg/String', 'std_msgs/msg/Bool'
 
 ACCEL, IMU_IN, BOARD, CASE, OTHER = (
     '/accel/counts', '/imu/uncompensated', '/temperature/board', '/temperature/case', '/chatter',
@@ -34,6 +34,10 @@ class Message:
     frame_id: str = ''
     numbers: tuple[float, ...] = field(default=())
     is_little: bool = True
+
+
+def write_bools(bag, topic, log_ns, flags):
+    bag.write_raw(topic, BOOL, log_ns, [bytes((0, 1, 0, 0, bool(flag))) for flag in flags])
 
 
 @lru_cache(maxsize=2)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from recording_helpers import START_NS, typestore
+from recording_helpers import START_NS, typestore, write_bools
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader as Reader2
 
@@ -56,7 +56,7 @@ def test_rosbags_and_mcap_read_the_written_messages(
                 bag.write_temperature('temperature/board', stamp_ns, linear[:, 0], log_ns)
                 covariance = imu.linear_acceleration_covariance
                 bag.write_imu('imu/data_raw', stamp_ns, linear, covariance, frame_id, imu, log_ns)
-                bag.write_bool('regime/dynamic', log_ns, linear[:, 0] > 0)
+                write_bools(bag, 'regime/dynamic', log_ns, linear[:, 0] > 0)
                 bag.write_raw('diagnostics', 'std_msgs/msg/String', log_ns, raw)
                 bag.flush()
                 for name in 'ctibr':  # order of calls
@@ -186,7 +186,7 @@ def test_a_raw_message_needs_a_definition(tmp_path):
             bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'])
         bag.write_raw('x', 'a/msg/B', [1], [b'\0\1\0\0\7'], ('ros2msg', 'uint8 data\n'))
         with pytest.raises(RecordingError, match='/x: already written with another type than std'):
-            bag.write_bool('x', [1], [True])
+            write_bools(bag, 'x', [1], [True])
     with AnyReader([tmp_path / 'bag.mcap']) as reader:
         ((connection, _, data),) = reader.messages()
         assert reader.deserialize(data, connection.msgtype).data == 7
@@ -269,13 +269,12 @@ def test_arguments_of_wrong_shape_or_type_are_refused(tmp_path):
             (bag.write_temperature, ([1], [1.0, 2.0]), r'`celsius` .* \(1, 1\), got \(2, 1\)'),
             (bag.write_imu, ([1], [[1.0, 2.0]], np.zeros(9)), '`linear_acceleration` must have'),
             (bag.write_imu, ([1], xyz, np.zeros((1, 3))), 'acceleration_covariance` must have'),
-            (bag.write_bool, ([1], [True, False]), '`log_ns` must have 2 values, got 1'),
             (bag.write_raw, ('std_msgs/msg/Bool', [1, 2], [b'']), '`log_ns` .* 1 values, got 2'),
         ):
             with pytest.raises(ValueError, match=reason):
                 write('a', *given)
     with pytest.raises(RecordingError, match='the bag is closed'):
-        bag.write_bool('a', [1], [True])
+        write_bools(bag, 'a', [1], [True])
 
 
 @pytest.mark.parametrize('name', ['bag', 'bag.mcap'])
@@ -283,7 +282,7 @@ def test_regime_topics_of_a_bag_have_the_qos_of_the_node(tmp_path, name):
     # WHY: a bag of `replay` had `regime/stamped` as volatile, so on playing the bag a subscriber
     # that joined later got no regime.
     with BagWriter(tmp_path / name) as bag:
-        bag.write_bool('imu0/regime/dynamic', [1], [True])
+        write_bools(bag, 'imu0/regime/dynamic', [1], [True])
         for topic in ('imu0/regime/stamped', '/diagnostics'):
             bag.write_raw(topic, STAMPED.type, [1], [FLAGS[STAMPED](1, True, 'T-1')])
     path = tmp_path / name / 'bag_0.mcap' if name == 'bag' else tmp_path / name

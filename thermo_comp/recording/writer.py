@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import OutputError, RecordingError
 from ..files import CSV, PARQUET, Draft, Kind, bag_kind, drafted, sync
-from ..topics import BOOL, IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
+from ..topics import IMU, N_NUMBERS, TEMPERATURE, VECTOR3_STAMPED
 from ..typing import Ints
 from .blocks import ImuColumns
 from .mcap_out import Compression, McapOutput, dump_yaml, known_definition
@@ -115,11 +115,6 @@ class BagWriter(AbstractContextManager['BagWriter']):
         places = zip((0, 4, 13, 16), imu._fields, imu, (4, 9, 3, 9), strict=False)
         columns += [(at, f'imu.{name}', part, width) for at, name, part, width in places]
         self._write_stamped(topic, IMU, stamp_ns, log_ns, frame_id, columns)
-
-    def write_bool(self, topic: str, log_ns: ArrayLike, values: ArrayLike) -> None:
-        """Write std_msgs/Bool messages."""
-        rows = [b'\0\1\0\0' + bytes([flag]) for flag in np.asarray(values, np.bool_).tolist()]
-        self.write_raw(topic, BOOL, log_ns, rows)
 
     def write_raw(
         self,
