@@ -7,8 +7,6 @@ Reading order is that of a ROS player: log time, and for equal log times the pos
 The files of a split bag are read in the order of its metadata.yaml.
 """
 
-from __future__ import annotations
-
 import re
 from collections import ChainMap, Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -251,6 +249,18 @@ def inspect_recording(path: str | Path, topics: Topics | None = None) -> Recordi
         return reader.info
 
 
+@dataclass(frozen=True, slots=True)
+class _Description:
+    """The files of a bag, their compression, message counts by topic, a note on missing parts."""
+
+    storage: str
+    files: tuple[Path, ...]
+    compression: str = ''
+    custom: dict[str, str] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+    note: str | None = None
+
+
 def _described(path: Path) -> _Description:
     """Find the files of a bag; RecordingError if the path is not a bag."""
     if not path.exists():
@@ -278,18 +288,6 @@ def _described(path: Path) -> _Description:
             path,
         )
     return _Description(path.suffix[1:], (path,))
-
-
-@dataclass(frozen=True, slots=True)
-class _Description:
-    """The files of a bag, their compression, message counts by topic, a note on missing parts."""
-
-    storage: str
-    files: tuple[Path, ...]
-    compression: str = ''
-    custom: dict[str, str] = field(default_factory=dict)
-    counts: dict[str, int] = field(default_factory=dict)
-    note: str | None = None
 
 
 def _read_metadata(directory: Path) -> _Description | None:

@@ -11,8 +11,6 @@ not a step. Two tests have absolute limits, because the quietest tenth of a flig
 at rest the sd of samples is below `still_sd`, and the angular rate within 1 deg/s of its median.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -84,7 +82,7 @@ class Cells:
     rate: Floats
     rate_variance: Floats
 
-    def part(self, which: slice) -> Cells:
+    def part(self, which: slice) -> 'Cells':
         """Select consecutive cells."""
         names = 'time count index mean variance roughness seam rate rate_variance'
         return replace(self, **{name: getattr(self, name)[which] for name in names.split()})

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Owns the search for the inputs' topics in a bag, and error messages for missing topics."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -104,7 +102,7 @@ class Topics:
     input: Input = 'auto'  # 'auto' prefers counts to an Imu
 
     @classmethod
-    def named(cls, names: Mapping[str, str], **others: Any) -> Topics:
+    def named(cls, names: Mapping[str, str], **others: Any) -> 'Topics':
         """
         Build from topics by input: ``counts``, ``imu``, ``board``, ``case``, ``temperature/NAME``.
         If the topic of only one of ``counts`` and ``imu`` is given, this input is read.
