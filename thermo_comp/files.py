@@ -102,8 +102,7 @@ def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> by
     PermissionError if it lies outside `within`, OSError if it is missing or not a regular file.
     """
     with open_regular(path) as file:
-        # Check the path of the opened file: a link could be exchanged between a check and the
-        # opening.
+        # Check the opened file: a link could be exchanged between a check and the opening.
         opened = Path(f'/proc/self/fd/{file.fileno()}')
         if within is not None and not opened.readlink().is_relative_to(within):
             raise PermissionError(errno.EPERM, 'outside of its folder', str(path))
@@ -179,8 +178,7 @@ class Draft:
                 except FileExistsError:
                     raise
                 except OSError:
-                    # On a file system without hard links, such as FAT, the name is reserved before
-                    # the file is moved.
+                    # Without hard links, as on FAT, reserve the name before the file is moved.
                     os.close(os.open(self._target, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
                     self.partial.replace(self._target)
             sync(self._target.parent)

@@ -123,8 +123,7 @@ def layout(head: str, delimiter: str | None = None) -> tuple[str, int]:
     """
     Return the delimiter of a text table and the number of cells per row: the delimiter that splits
     most lines into the same number of cells (a blank is any run of white space). Only the last 50
-    lines of `head` count, because a preamble may come first; the very last line, which may be cut,
-    does not count.
+    lines of `head` count, as a preamble may come first, without the last, which may be cut.
     """
     lines = [line for line in head.splitlines() if line.strip() and not _is_comment(line)]
     lines = lines[:-1] if len(lines) > 2 else lines

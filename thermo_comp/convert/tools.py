@@ -17,8 +17,7 @@ calibrate a triad at one temperature; with the reading N and the specific force 
     Kalibr      N = M a + b          M lower triangular                               (YAML)
     thermo_comp a = M K^-1 (N - b)   M lower triangular, unit diagonal; K diagonal
 
-If the matrix of a tool is not lower triangular, the frame of the tool is rotated relative to the
-frame of thermo_comp.
+If a tool's matrix is not lower triangular, the tool's frame is rotated relative to thermo_comp's.
 """
 
 import re

@@ -40,8 +40,7 @@ _MOST_JUMPS = 100
 _FEWEST_READINGS, _APART_S = 10, 10.0
 #: Time between two equal readings that `Readings.thinned` keeps [ns].
 _REPEAT_NS = 10_000_000_000
-#: Duration of a recording above which the mean interval between messages is limited, and the
-#: largest mean interval [ns].
+#: Longest recording without a limit of the mean interval between messages, and this limit [ns].
 _SPARSE_NS, _SPARSEST_NS = 10 * 86400 * 10**9, 10 * 10**9
 
 
@@ -97,9 +96,8 @@ class RecordingInfo:
 
 class ImuColumns(NamedTuple):
     """
-    The fields of sensor_msgs/Imu other than stamp and linear acceleration: quaternion x, y, z, w,
-    shape (n, 4), rates [rad/s], shape (n, 3), and covariances, shape (n, 9). For writing, a single
-    row applies to all messages.
+    Fields of sensor_msgs/Imu: quaternion x, y, z, w, shape (n, 4), rates [rad/s], shape (n, 3),
+    covariances, shape (n, 9). For writing, a single row applies to all messages.
     """
 
     orientation: Floats

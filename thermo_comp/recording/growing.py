@@ -5,8 +5,7 @@ Owns live recording: new messages of a bag that another program writes, and numb
 
 Each pass reads the growing bag from its beginning; the pause after a pass is at least five times
 as long as the pass. New messages are written with the node's topic names to numbered bags, from
-`01.mcap` on. The end of a position is recognised with a delay, so the newest messages are held in
-memory until their position is known.
+`01.mcap` on. The newest messages are held in memory until their position is known.
 """
 
 import re
@@ -49,8 +48,7 @@ def growing_blocks(
         try:
             reader = open_recording(path, topics, require=())
         except RecordingError:
-            # A recorder creates a file before it writes records, so an empty or growing file that
-            # is not a bag yet is no error.
+            # A recorder creates a file before it writes records: wait if it is empty or grows.
             files = path.iterdir() if path.is_dir() else [path]
             before, size = size, sum(file.stat().st_size for file in files)
             if n_seen or 0 < size == before:

@@ -4,8 +4,8 @@
 Owns the reading of an MCAP file chunk by chunk, in bounded memory.
 
 The summary of a complete file lists the spans that hold messages. A file without a usable summary,
-or cut off anywhere, is read record by record, and its messages are counted. Records other than
-messages are read by the `mcap` library.
+or cut off anywhere, is read record by record, and its messages are counted. The `mcap` library
+reads all other records.
 """
 
 import os
@@ -253,8 +253,7 @@ class McapFile(BagFile):
 
 def _in_order(pieces: Iterable[tuple[int, Messages, int | None]]) -> Iterator[Messages]:
     """Merge numbered pieces by log time; the third item is the next piece's first log time."""
-    # Messages before the first log time of the next piece are final, so only messages of chunks
-    # that overlap in time are held back.
+    # Messages before the first log time of the next piece are final; later messages are held.
     held: dict[int, Messages] = {}
     for row, piece, next_ns in pieces:
         held[row] = piece

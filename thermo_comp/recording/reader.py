@@ -83,8 +83,7 @@ class RecordingReader(ExitStack):
                 raise RecordingError(f'cannot be opened: {error.strerror}', path) from error
             raise
         self._part = topics.part
-        #: Time from the bag's first sample to the first sample of the selected part [s]; 0 until
-        #: this sample has been read.
+        #: Time from the bag's first sample to that of the part [s]; 0 until both are read.
         self.since_s = 0.0
         self.apart = ''  # warning about stamps that are all equal, or of a second clock
 

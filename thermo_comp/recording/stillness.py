@@ -23,8 +23,7 @@ from .noise import is_glitch, roughest_at_rest, spread_of_variances
 #: Largest variance of a cell at rest (30 samples or more) / the bag's noise variance: white noise
 #: exceeds 4 with a probability below 1e-11, and vibration that must be cut out is far above 4.
 VARIANCE_RATIO = 4.0
-#: Largest sd of samples at rest [g]: above the noise of the noisiest sensors, below the scatter
-#: in most flights.
+#: Largest sd of samples at rest [g]: above the noise of any sensor, below that of most flights.
 STILL_SD = 0.05
 # Largest sd of the angular rate within a cell at rest, and largest distance of a cell's mean rate
 # from the level [rad/s]. The level (medians over `_LEVEL_S` [s], interpolated) follows the bias.
@@ -323,8 +322,7 @@ def still_runs(
         quiet = plausible & (cells.variance <= ratio * noise + by_drift).all(axis=1)
         roughest = roughest_at_rest(cells, quiet, colour > 1.0, ratio)
         quiet &= (cells.roughness <= roughest).all(axis=1)
-        # At rest the last sample of a cell and the first sample of the next cell differ by at most
-        # `_STEP_SDS` sd of a difference of two samples.
+        # Limit of the change from the last sample of a cell to the first sample of the next cell.
         is_seamless = np.abs(cells.seam[1:]) <= _STEP_SDS * np.sqrt(2.0 * roughest / ratio)
         broken = ~(_is_joined(cells, quiet, drift) & is_seamless.all(axis=1))
         # Exclude cells adjacent to a moving cell or to a step: the motion may extend into them.
