@@ -306,9 +306,6 @@ def without_jumps(blocks: Iterable[Block], path: Path) -> Iterator[Block]:
         # Sort readings and samples in reading order: by the number of samples before them.
         places = [*(thermometer.after for thermometer in thermometers), np.arange(len(block))]
         stamps = np.concatenate([*(part.stamp_ns for part in thermometers), block.accel_stamp_ns])
-        if not len(stamps):
-            yield block
-            continue
         order = np.argsort(np.concatenate(places), kind='stable')
         read: Ints = stamps[order]
         steps = np.diff(read, prepend=read[0] if last_ns is None else last_ns)
