@@ -260,15 +260,12 @@ def guess_columns(path: Path, rate_hz: float | None = None) -> ColumnMap:
     }
     times = None if named.time is None else values([named.time])[:, 0]
     span = max((_span(values([item.column])) for item in thermometers.values()), default=0.0)
-    return ColumnMap(
-        _stamp(named, times, rate_hz, accel, span),
-        build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output}),
-        thermometers.pop('board', None),
-        thermometers.pop('case', None),
-        tuple(Further(item.column, item.unit, name=name) for name, item in thermometers.items()),
-        gyro,
-        None if table.headings else Format(header=False),
-    )
+    stamp = _stamp(named, times, rate_hz, accel, span)
+    triad = build(Accel, {'columns': list(named.accel), 'unit': unit, 'output': output})
+    board, case = thermometers.pop('board', None), thermometers.pop('case', None)
+    further = (Further(item.column, item.unit, name=name) for name, item in thermometers.items())
+    style = None if table.headings else Format(header=False)
+    return ColumnMap(stamp, triad, board, case, tuple(further), gyro, style)
 
 
 def _unnamed(width: int) -> Headings:

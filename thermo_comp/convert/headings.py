@@ -101,16 +101,12 @@ def read_headings(
         return None
     gyro = next((three for key, three in triads.items() if _GYRO.search(key)), None)
     time = times[-1] if times else ''
+    time_unit, accel_unit = _stated(time, _TIMES | _LONG_TIMES), _stated(accel[0], _ACCELS)
+    gyro_unit = _stated(gyro[0], _RATES) if gyro else ''
     taken = {time, *(heading for three in found.values() for heading in three)}
-    return Headings(
-        time or None,
-        _stated(time, _TIMES | _LONG_TIMES),
-        accel,
-        _stated(accel[0], _ACCELS),
-        gyro,
-        _stated(gyro[0], _RATES) if gyro else '',
-        _thermometers([text for text in headings if text not in taken], names, is_plausible),
-    )
+    free = [heading for heading in headings if heading not in taken]
+    thermometers = _thermometers(free, names, is_plausible)
+    return Headings(time or None, time_unit, accel, accel_unit, gyro, gyro_unit, thermometers)
 
 
 def _thermometers(

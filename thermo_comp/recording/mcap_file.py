@@ -10,7 +10,7 @@ reads all other records.
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
@@ -50,11 +50,7 @@ _CUTS = {
     -1: 'it ends inside a record; all records before it are read',
 }
 #: Record types other than messages that are read.
-_KINDS: Mapping[int, Any] = {
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.METADATA: Metadata,
-}
+_KINDS: Any = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
 #: Returns attributes of a chunk index, in the order of the fields of a `Span`.
 _SPAN_FIELDS = attrgetter(
     *('chunk_start_offset', 'chunk_length', 'message_index_length'),

@@ -149,44 +149,18 @@ def survey_recording(
     cause = causes.cause(reduced, STILL_SD) if n > 1 else ''
     surveys = ((name, survey_thermometer(parts)) for name, parts in readings.items())
     thermometers = {name: survey for name, survey in surveys if survey is not None}
-    findings = [
-        (info.truncated, f'cut off: {info.truncated}'),
-        (reader.apart, 'a fit needs one clock for the stamps of all topics'),
-        (not n, _NO_SAMPLES),
-        *((True, finding) for finding in thermal_findings(thermometers, candidates)),
-        (cause, cause),
-        (
-            n and not still and not cause,
-            f'the unit never rests for 3 s, and a fit needs rests: {why_restless(reduced)}',
-        ),
-        (
-            clock.n_backwards,
-            f'samples with a stamp not later than an earlier stamp: {clock.n_backwards}; these '
-            'samples are left out',
-        ),
-        (
-            clock.n_restarts,
-            f'the stamps go back by more than an hour ({clock.n_restarts} times): a fit takes '
-            'each jump for a pause of an hour',
-        ),
-        (
-            clock.n_gaps,
-            f'gaps between samples: {clock.n_gaps}, the longest {clock.longest_gap_s:.3g} s',
-        ),
-    ]
+    if n and not still and not cause:
+        why = why_restless(reduced)
+        cause = f'the unit never rests for 3 s, and a fit needs rests: {why}'
+    findings = [f'cut off: {info.truncated}'] * bool(info.truncated)
+    findings += ['a fit needs one clock for the stamps of all topics'] * bool(reader.apart)
+    findings += [_NO_SAMPLES] * (not n) + thermal_findings(thermometers, candidates)
+    findings += [cause] * bool(cause) + clock.findings()
+    rate_hz = 1e9 / clock.step_ns if clock.step_ns else float('nan')
     duration_s = (clock.last_ns - clock.first_ns) * 1e-9
     # The last cell may extend beyond the samples: limit the time at rest to the duration.
     still_s = min(sum((upper - lower) * reduced.cell_s for lower, upper in still), duration_s)
-    return Survey(
-        info,
-        n,
-        duration_s,
-        1e9 / clock.step_ns if clock.step_ns else float('nan'),
-        len(still),
-        still_s,
-        thermometers,
-        [text for is_so, text in findings if is_so],
-    )
+    return Survey(info, n, duration_s, rate_hz, len(still), still_s, thermometers, findings)
 
 
 @dataclass
@@ -224,6 +198,19 @@ class _Clock:
         gaps = rising[rising > _GAP_INTERVALS * self.step_ns]
         self.n_gaps += len(gaps)
         self.longest_gap_s = max(self.longest_gap_s, float(np.max(gaps, initial=0)) * 1e-9)
+
+    def findings(self) -> list[str]:
+        """List the kinds of stamps that do not rise, and the gaps."""
+        texts = {
+            f'samples with a stamp not later than an earlier stamp: {self.n_backwards}; these '
+            'samples are left out': self.n_backwards,
+            f'the stamps go back by more than an hour ({self.n_restarts} times): a fit takes '
+            'each jump for a pause of an hour': self.n_restarts,
+            f'gaps between samples: {self.n_gaps}, the longest {self.longest_gap_s:.3g} s': (
+                self.n_gaps
+            ),
+        }
+        return [text for text, count in texts.items() if count]
 
 
 def survey_thermometer(readings: Sequence[Readings]) -> ThermometerSurvey | None:

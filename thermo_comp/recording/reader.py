@@ -117,27 +117,18 @@ class RecordingReader(ExitStack):
             if opened.truncated is not None:
                 front = f'{name.name}: ' if len(described.files) > 1 else ''
                 notes.append(front + opened.truncated)
-        channels: dict[str, list[Topic]] = {}
+        kinds: dict[str, dict[str, None]] = {}  # the types of each topic, without repetitions
+        counts: Counter[str] = Counter()
         for topic in (topic for file in self._files for topic in file.topics.values()):
-            channels.setdefault(topic.name, []).append(topic)
-        topics = {
-            name: (
-                ' | '.join(dict.fromkeys(c.type for c in each)),
-                sum(c.n_messages for c in each),
-            )
-            for name, each in channels.items()
-        }
-        for wanted, n_promised in described.counts.items():
-            notes.append(_loss(wanted, topics.get(wanted, ('', 0))[1], n_promised))
-        return RecordingInfo(
-            path,
-            self._files[0].storage,
-            topics,
-            min((f.start_ns for f in self._files if f.start_ns is not None), default=0),
-            max((f.end_ns for f in self._files if f.end_ns is not None), default=0),
-            _notes(*notes),
-            dict(ChainMap(*(f.metadata for f in self._files[::-1]), described.custom)),
-        )
+            kinds.setdefault(topic.name, {})[topic.type] = None
+            counts[topic.name] += topic.n_messages
+        topics = {name: (' | '.join(types), counts[name]) for name, types in kinds.items()}
+        notes += [_loss(name, counts[name], n) for name, n in described.counts.items()]
+        start_ns = min((f.start_ns for f in self._files if f.start_ns is not None), default=0)
+        end_ns = max((f.end_ns for f in self._files if f.end_ns is not None), default=0)
+        metadata = dict(ChainMap(*(f.metadata for f in self._files[::-1]), described.custom))
+        storage, missing = self._files[0].storage, _notes(*notes)
+        return RecordingInfo(path, storage, topics, start_ns, end_ns, missing, metadata)
 
     def blocks(self, *, raw: bool = False) -> Iterator[Block]:
         """Read the selected part of the bag (`Topics.part`), in blocks."""

@@ -94,17 +94,10 @@ def decode_blocks(
         log_ns[role] = taken.log_ns
         if keep_raw and len(taken):
             raw[role] = taken.packed()
-    return [
-        Block(
-            samples_ns,
-            np.ascontiguousarray(samples[:, _IMU_ACCELERATION]) if is_imu else samples,
-            frames[0].decode('utf-8', 'replace') if len(frames) else '',
-            ImuColumns(*(samples[:, c] for c in _IMU_COLUMNS)) if is_imu else None,
-            temperatures,
-            log_ns,
-            raw,
-        )
-    ]
+    imu = ImuColumns(*(samples[:, c] for c in _IMU_COLUMNS)) if is_imu else None
+    samples = np.ascontiguousarray(samples[:, _IMU_ACCELERATION]) if is_imu else samples
+    frame_id = frames[0].decode('utf-8', 'replace') if len(frames) else ''
+    return [Block(samples_ns, samples, frame_id, imu, temperatures, log_ns, raw)]
 
 
 def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray[Any]]:
