@@ -214,9 +214,8 @@ def _finding(rows: Bools, line: Ints) -> Finding:
 def _refuse_wrong_units(log: ForeignLog, stillness: Stillness) -> None:
     reason = contradiction(log.unit, stillness.magnitude, log.counts_per_g)
     if reason is not None:
-        raise RecordingError(
-            f'the stated unit of the accelerometer is {log.unit}, but {reason}', path=log.path
-        )
+        reason = f'the stated unit of the accelerometer is {log.unit}, but {reason}'
+        raise RecordingError(reason, path=log.path)
     low, high = PLAUSIBLE_CELSIUS
     for name, readings in log.temperatures.items():
         typical = float(np.nanmedian(readings.celsius)) if len(readings.celsius) else low

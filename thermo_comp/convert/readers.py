@@ -47,10 +47,8 @@ def read_log(path: Path, **given: Any) -> ForeignLog:
             has = ', '.join(f'`{keyword}`' for keyword in KEYWORDS[kind])
             raise ValueError(f'`{name}` does not apply to a {kind}, which takes {has}')
     if others := keywords.get('topic', {}).keys() - {'imu', 'board', 'case'}:
-        raise ValueError(
-            '`topic` takes imu, board and case, which are converted, got '
-            + ', '.join(sorted(others))
-        )
+        listed = ', '.join(sorted(others))
+        raise ValueError(f'`topic` takes imu, board and case, which are converted, got {listed}')
     if keywords.keys() >= {'columns', 'rate_hz'}:
         raise ValueError('`rate_hz` does not apply if `columns` is given: the map states the rate')
     with naming(path):

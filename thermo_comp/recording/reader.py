@@ -204,9 +204,8 @@ class RecordingReader(ExitStack):
                 first_ns = int(block.accel_stamp_ns[0]) if first_ns == inf else first_ns
                 last_ns = int(block.accel_stamp_ns[-1])
             begin, end = self._part.limits_ns(first_ns)
-            left = block.take(
-                {role: (ns >= begin) & (ns < end) for role, ns in block.stamp_ns.items()}
-            )
+            is_in = {role: (ns >= begin) & (ns < end) for role, ns in block.stamp_ns.items()}
+            left = block.take(is_in)
             if len(left) and not n_kept:
                 self.since_s = (int(left.accel_stamp_ns[0]) - first_ns) * 1e-9
             n_kept += len(left)

@@ -279,9 +279,8 @@ def _text_of_corrected(name: str) -> str:
 def _text_of_unnamed(present: Present, board: str, taken: Collection[str]) -> str:
     """Return advice on unused temperature topics, one of which may be the board's, or ''."""
     names = sorted(shown(name) for name in of_kind(present, TEMPERATURE) if name not in taken)
-    text = (
-        f'no {board}: if the board thermometer is {" or ".join(names)}, give --topic board=TOPIC'
-    )
+    among = ' or '.join(names)
+    text = f'no {board}: if the board thermometer is {among}, give --topic board=TOPIC'
     return text if names else ''
 
 
@@ -347,7 +346,5 @@ def _missing(present: Present, wanted: Mapping[str, str], corrected: str = '') -
     if wanted.keys() == {'imu'} and any(is_called(name, _USUAL.counts) for name in present):
         listed += '; the calibration or --input requires an Imu in m/s^2, not counts'
     option = ' or '.join(f'--topic {key}=TOPIC' for key in wanted)
-    return RecordingError(
-        f'no such topic; the bag has {listed}; name another with {option}',
-        key=' or '.join(wanted.values()),
-    )
+    reason = f'no such topic; the bag has {listed}; name another with {option}'
+    return RecordingError(reason, key=' or '.join(wanted.values()))

@@ -121,10 +121,8 @@ def decode_stamped(messages: Messages, kind: str) -> tuple[Ints, Floats, NDArray
             return columns
     representation = int(number_at(rows, 0, '>u2')[0])
     if representation > 1:
-        raise RecordingError(
-            f'serialized with representation {representation:#06x}, '
-            'expected plain CDR (0x0000 or 0x0001)'
-        )
+        reason = f'serialized with representation {representation:#06x}, '
+        raise RecordingError(reason + 'expected plain CDR (0x0000 or 0x0001)')
     endian = '<' if representation else '>'
     frame_size = int(number_at(rows, 12, f'{endian}u4')[0])
     # The numbers start (12 + length of frame_id + 7) // 8 * 8 bytes after the encapsulation.
