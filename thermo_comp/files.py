@@ -106,12 +106,10 @@ def read_bounded(path: str | Path, limit: int, within: Path | None = None) -> by
         opened = Path(f'/proc/self/fd/{file.fileno()}')
         if within is not None and not opened.readlink().is_relative_to(within):
             raise PermissionError(errno.EPERM, 'outside of its folder', str(path))
-        size = os.fstat(file.fileno()).st_size
-        if size > limit:
-            raise ValueError(f'the file has {size} bytes, at most {limit} are accepted')
         content = file.read(limit + 1)
+        size = os.fstat(file.fileno()).st_size
     if len(content) > limit:
-        raise ValueError(f'the file has more than {limit} bytes, the most that are accepted')
+        raise ValueError(f'the file has {size} bytes, at most {limit} are accepted')
     return content
 
 

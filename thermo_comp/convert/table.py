@@ -101,8 +101,6 @@ def read_text(
         with open_regular(path) as raw:
             file = TextIOWrapper(raw, encoding='utf-8-sig', errors='replace', newline='')
             head = file.read(_SNIFF_BYTES)
-            if not head.strip():
-                raise RecordingError('the table is empty')
             if '\0' in head:
                 raise RecordingError('not a table of text: it holds zero bytes')
             file.seek(0)

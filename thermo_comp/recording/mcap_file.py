@@ -16,7 +16,6 @@ from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from itertools import pairwise
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +50,6 @@ _CUTS = {
 }
 #: Record types other than messages that are read.
 _KINDS: Any = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.METADATA: Metadata}
-#: Returns attributes of a chunk index, in the order of the fields of a `Span`.
-_SPAN_FIELDS = attrgetter(
-    *('chunk_start_offset', 'chunk_length', 'message_index_length'),
-    *('uncompressed_size', 'message_start_time', 'message_end_time'),
-)
 _new_stream: Any = ReadDataStream  # type hints differ between versions of the `mcap` library
 
 
@@ -145,7 +139,13 @@ class McapFile(BagFile):
         counts, n_messages = text.channel_message_counts, text.message_count
         channels: dict[int, Channel] = {c.id: c for c in records_of.get(Channel, [])}
         chunks = sorted(records_of.get(ChunkIndex, []), key=lambda index: index.chunk_start_offset)
-        spans = [Span(*_SPAN_FIELDS(chunk)) for chunk in chunks]
+        spans = [
+            Span(
+                *(chunk.chunk_start_offset, chunk.chunk_length, chunk.message_index_length),
+                *(chunk.uncompressed_size, chunk.message_start_time, chunk.message_end_time),
+            )
+            for chunk in chunks
+        ]
         if (
             sum(counts.values()) != n_messages
             or not counts.keys() <= channels.keys()

@@ -146,8 +146,7 @@ class CellAccumulator:
             quantum = _quantum_of(part, self._few_changes)
             self._quantum = np.where(self._quantum > 0.0, self._quantum, quantum)
             self._n_looked_at += int((part[1:] != part[:-1]).any(axis=1).sum()) + 1
-        if self._is_integer:
-            self._is_integer = bool((samples == np.rint(samples)).all())
+        self._is_integer = self._is_integer and bool((samples == np.rint(samples)).all())
         rate = None if rate is None else rate[use]
         glitches = is_glitch(samples, self._quantum)
         if glitches.any():
