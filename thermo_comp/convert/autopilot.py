@@ -130,9 +130,8 @@ def _ulog(path: Path) -> _Held:
         for topic, name in _BAROMETERS.items()
         for number, columns in by_topic[topic].items()
     }
-    metadata = {}
-    if log.file_corruption:
-        metadata['px4_corruption'] = 'parts of the file could not be read'
+    notes = {'px4_corruption': 'parts of the file could not be read'}
+    metadata = notes if log.file_corruption else {}
     accels, gyros, hint = by_topic['sensor_accel'], by_topic['sensor_gyro'], ''
     correction = None
     if not accels:
@@ -222,10 +221,9 @@ def _dataflash(path: Path) -> _Held:
     )
     imus: dict[int, ForeignLog] = {}
     baros: dict[int, Readings] = {}
-    metadata = {}
+    notes = {'ardupilot_simulated': 'the log has SIM_ parameters: a simulator wrote it'}
+    metadata = notes if any(str(key).startswith('SIM_') for key in reader.params) else {}
     changes: dict[str, list[tuple[int, float]]] = {}
-    if any(str(key).startswith('SIM_') for key in reader.params):
-        metadata['ardupilot_simulated'] = 'the log has SIM_ parameters: a simulator wrote it'
     try:
         for name in sorted(reader.name_to_id):
             if not re.fullmatch(r'IMU\d?|BARO|BAR\d|PARM', name):

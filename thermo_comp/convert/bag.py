@@ -9,7 +9,6 @@ the Imu; as case thermometer, that nearer to a barometer than to the Imu, or els
 """
 
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import numpy as np
 
@@ -17,11 +16,9 @@ from ..errors import RecordingError
 from ..recording.reader import inspect_recording, read_recording
 from ..recording.topics import Present, Topics, choice_note, of_kind
 from ..topics import IMU, TEMPERATURE
-from .log import ForeignLog
+from .log import ForeignLog, Unit
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
-
-Unit = Literal['m/s^2', 'g', 'mg']
 
 
 def bag_log(
