@@ -109,7 +109,10 @@ class McapOutput:
 
     def append(self, batches: Sequence[Messages]) -> None:
         """Add messages in log-time order; write full chunks, hold the rest for the next chunk."""
-        messages = join_messages([*self._tail, join_messages(batches).in_order()])
+        messages = join_messages([*self._tail, *batches])
+        n_old = sum(map(len, self._tail))
+        order = np.argsort(messages.log_ns[n_old:], kind='stable')
+        messages = messages.take(np.concatenate([np.arange(n_old), n_old + order]))
         ends = np.cumsum(messages.size + MESSAGE_HEAD_BYTES)
         begin = n_done = 0
         while len(ends) and ends[-1] - n_done >= self._chunk_bytes:

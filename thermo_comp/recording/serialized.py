@@ -78,7 +78,10 @@ class Messages:
 
     def places_of(self, numbers: Collection[int]) -> Ints:
         """Return the indices of the messages of some channels."""
-        return np.flatnonzero(np.isin(self.channel, list(numbers)))
+        is_own = np.zeros(len(self), np.bool_)
+        for number in numbers:  # several times as fast as `np.isin`
+            is_own |= self.channel == number
+        return np.flatnonzero(is_own)
 
     def of_channels(self, numbers: Collection[int]) -> Messages:
         """Select the messages of some channels."""

@@ -151,14 +151,20 @@ def encode_stamped(
     text = frame_id.encode() + b'\0'
     head = pack('<BBHiII', 0, 1, 0, 0, 0, len(text)) + text
     body = 4 + (len(head) + 3) // 8 * 8
-    data = np.empty((len(stamp_ns), body + 8 * n_numbers), np.uint8)
-    data[:] = np.frombuffer(head.ljust(body, b'\0') + bytes(8 * n_numbers), np.uint8)
+    row = np.frombuffer(bytearray(head.ljust(body, b'\0') + bytes(8 * n_numbers)), np.uint8)
+    # Values that are equal in all messages are in the row that is copied: this saves much time.
+    for column, values in pieces:
+        if values.ndim == 1:
+            row[body:].view('<f8')[column : column + len(values)] = values
+    data = np.empty((len(stamp_ns), len(row)), np.uint8)
+    data[:] = row
     seconds = stamp_ns // _NS
     data[:, 4:8].view('<i4')[:, 0] = seconds
     data[:, 8:12].view('<u4')[:, 0] = stamp_ns - seconds * _NS
     numbers = data[:, body:].view('<f8')
     for column, values in pieces:
-        numbers[:, column : column + values.shape[-1]] = values
+        if values.ndim > 1:
+            numbers[:, column : column + values.shape[1]] = values
     return data
 
 
