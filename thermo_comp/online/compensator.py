@@ -119,7 +119,13 @@ class Compensator:
 
     def _stuck_check(self) -> StuckCheck:
         scales = [abs(axis.scale_factor) for axis in self.calibration.axes]
-        return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales))
+        noise_sds = [
+            scale * density / math.sqrt(self.calibration.unit.cycle_time_s)
+            for scale, density in zip(
+                scales, self.calibration.noise_density_m_s2_sqrt_hz, strict=True
+            )
+        ]
+        return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales), noise_sds)
 
     def _gravity_check(self) -> GravityCheck:
         return GravityCheck(*self._gravity_settings)
