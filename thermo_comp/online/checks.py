@@ -151,19 +151,20 @@ class StuckCheck:
             is_judged[-1] = True
             spans = zip(begins[is_judged].tolist(), ends[is_judged].tolist(), strict=True)
             for begin, end in spans:
-                is_new = begin >= 0
-                if is_new:
+                if begin >= 0:
                     first = (*samples[begin].tolist(), int(stamps[begin]))
-                    run = first, 0, 0.0, 0, math.inf
+                    begun: Run = first, 0, 0.0, 0, math.inf
+                else:
+                    begun = run
                 here = slice(max(begin, 0), end)
                 equal = np.arange(here.start - begin, end - begin)
-                is_long = (equal >= STUCK_SAMPLES) & (stamps[here] - run[0][3] > self.limit_ns)
-                most, n_noisy, step = self._changes(run, columns, here, equal, axis)
+                is_long = (equal >= STUCK_SAMPLES) & (stamps[here] - begun[0][3] > self.limit_ns)
+                most, n_noisy, step = self._changes(begun, columns, here, equal, axis)
                 is_noisy = (n_noisy >= NOISY_CHANGES) & (step <= self._visible[axis])
                 are_long[axis, here] = is_long
                 is_stuck[here] |= is_long & ((most > self.motion) | is_noisy)
                 runs[axis] = (
-                    run[0], end - 1 - begin, most.item(-1), n_noisy.item(-1), step.item(-1)
+                    begun[0], end - 1 - begin, most.item(-1), n_noisy.item(-1), step.item(-1)
                 )  # fmt: skip
         self.last, self.runs = (*samples[-1].tolist(), int(stamps[-1])), tuple(runs)
         is_stuck |= are_long.all(axis=0)
