@@ -346,6 +346,9 @@ class Compensator:
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
         state = thermal.sample(stamp_ns)
         loose_k = tracker.loose_k(state[GRADIENT])
+        for name, twin in tracker.copies.items():
+            if twin.is_copy and faults[name][0] is Fault.NONE:
+                faults[name] = Fault.COPY, 0.0
         if loose_k and faults[BOARD_INPUT][0] is Fault.NONE:
             faults[BOARD_INPUT] = Fault.LOOSE, loose_k
         return CompensatorStatus(
