@@ -293,3 +293,23 @@ def test_the_batch_drops_the_samples_that_the_stream_drops(events, chunk, stuck_
         np.testing.assert_array_equal(covariance[:, UNIQUE], table[:, 3:])
     assert streamed.counters == whole.counters == cut.counters
     assert streamed.status() == whole.status() == cut.status()
+
+
+@pytest.mark.parametrize('is_mended', [False, True])
+def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mended):
+    compensator = Compensator(calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.1))
+
+    def events(bias, start_ns=0):
+        return recording(6000, 100.0, lambda _: at_rest(rng, bias), start_ns)
+
+    run(compensator, events(100.0, 100 * SECOND_NS))
+    assert compensator.is_refusing
+    n_out, n_refuted = compensator.counters.n_out, compensator.counters.n_refuted
+    run(compensator, events(0.0 if is_mended else 100.0))
+    assert compensator.counters.n_time_jumps == 1
+    if is_mended:
+        # Windows of 5 s; the first has no window to compare with, the next two restore the output.
+        assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
+    else:
+        assert compensator.counters.n_out == n_out
+        assert compensator.counters.n_refuted == n_refuted + 6000

@@ -266,7 +266,9 @@ class Compensator:
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
         self.stuck = self._stuck_check()
-        self.gravity = self._gravity_check()
+        is_refuted, self.gravity = self.gravity.is_refuted, self._gravity_check()
+        # A jump of time does not mend a wrong calibration: windows that agree restore the output.
+        self.gravity.is_refuted = is_refuted
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
 
