@@ -5,8 +5,8 @@ Owns the joining of bags that are successive parts of one recording, as split by
 recorded one after the other while the unit is turned to the next attitude.
 
 Between the parts of a recording the unit may have stayed switched on, so the parts count as one
-turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on. The
-lags do not restart, and a rest at the end of a part may continue in the next part.
+turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
+The lags do not restart, and a rest at the end of a part may continue in the next part.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from ..recording.blocks import Block
 from .reduction import Readings, ReducedBag, StillInterval
 from .sources import FitSource
 
-#: Longest gap between two parts of one recording [s]: time to turn the unit by hand and to start the
-#: recorder again. If the unit is nevertheless switched off and on in the gap, the offsets of its
-#: turn-ons count as those of mountings.
+#: Longest gap between two parts of one recording [s]: time to turn the unit by hand and to start
+#: the recorder again. If the unit is nevertheless switched off and on in the gap, the offsets of
+#: its turn-ons count as those of mountings.
 LONGEST_GAP_S = 60.0
 #: Longest overlap of the stamps of two parts of one recording [s].
 LONGEST_OVERLAP_S = 3.0
