@@ -38,7 +38,7 @@ def convert(
         'Table (.csv, .tsv, .txt, .parquet), PX4 (.ulg) or ArduPilot log (.bin), or bag.',
         metavar='FILE',
     ),
-    output: Path = option('Bag to write: a file *.mcap, or a folder.', ..., '--output', '-o'),
+    output: Path = option('Bag to write: a file *.mcap, or a folder.', ..., '-o'),
     columns: Path | None = option('Column map of a table (YAML): columns and their units.'),
     rate_hz: float | None = options.TABLE_RATE,
     imu: int | None = option('Number of the IMU in an autopilot log, counted from 0.'),
@@ -46,9 +46,7 @@ def convert(
         'Number of the barometer in an autopilot log that gives the case temperature.'
     ),
     allow_compensated: bool = option(
-        'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.',
-        False,
-        '--allow-compensated',
+        'Accept samples that the autopilot has corrected by INS_TCAL or TC_A parameters.', False
     ),
     names: dict[str, str] = options.named_topics,
     unit: Literal['m/s^2', 'g', 'mg'] = option('Unit of acceleration in the bag.', 'm/s^2'),
@@ -170,7 +168,7 @@ def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
 def export(
     path: Path = argument('Calibration of the unit.', metavar='YAML'),
     to: Tool = option('Tool for which the file is written.', ...),
-    output: Path = option('File to write.', ..., '--output', '-o'),
+    output: Path = option('File to write.', ..., '-o'),
     number: int | None = option(
         'Number of the set of parameters: TC_A0.. of PX4 (default 0), INS_TCAL1.. of ArduPilot '
         '(1), imu0.. of Kalibr (0).',

@@ -79,7 +79,7 @@ def fit(
     rate_hz: float | None = options.TABLE_RATE,
     topics: Any = options.reading_part,
     force: bool = options.FORCE,
-    verbose: bool = option('Also print the table of positions.', False, '--verbose', '-v'),
+    verbose: bool = option('Also print the table of positions.', False, '-v'),
     out: Output = options.out,
 ) -> None:
     """
@@ -158,7 +158,7 @@ def prior(
     calibrations: list[Path] = argument(
         'Calibrations of different units of one type.', metavar='YAML...'
     ),
-    output: Path = option('Prior to write (YAML).', ..., '--output', '-o'),
+    output: Path = option('Prior to write (YAML).', ..., '-o'),
     force: bool = options.FORCE,
     out: Output = options.out,
 ) -> None:

@@ -24,10 +24,7 @@ def evaluate(
         'Bags of one unit in any positions, or rest logs of the unit.', metavar='BAG...'
     ),
     calibration: list[Path] = option(
-        'Calibration (YAML); further calibrations are compared with the first.',
-        ...,
-        '--calibration',
-        '-c',
+        'Calibration (YAML); further calibrations are compared with the first.', ..., '-c'
     ),
     judging: dict[str, Any] = options.judging,
     known_force: Any = options.force,
@@ -183,10 +180,10 @@ def _sections(
 
 
 def report(
-    output: Path = option('Page to write (HTML).', ..., '--output', '-o'),
+    output: Path = option('Page to write (HTML).', ..., '-o'),
     bags: list[Path] | None = options.JUDGED_BAGS,
     calibration: list[Path] | None = option(
-        'Calibrations of the unit (YAML), whose changes are shown.', None, '--calibration', '-c'
+        'Calibrations of the unit (YAML), whose changes are shown.', None, '-c'
     ),
     figures: Path | None = option('Folder for the figures as PNG files.', metavar='DIR'),
     certificate_info: Path | None = options.CERTIFICATE_INFO,

@@ -36,22 +36,30 @@ _VALUES: dict[Any, str] = {
     **dict.fromkeys((Path, Path | None, list[Path], list[Path] | None), 'PATH'),
 }
 
-#: Options whose names differ from the names of the library's arguments, by argument.
+#: Options whose names differ from the names of the parameters and of the library's arguments.
 _FLAGS = {
+    'as_json': '--json',
+    'begin': '--from',
     'case_timeout_s': '--case-timeout',
+    'end': '--to',
     'forced': '--force-groups',
     'height_m': '--height',
+    'input_': '--input',
     'latitude_deg': '--latitude',
     'min_rest_s': '--min-rest',
     'temperature_timeout_s': '--temperature-timeout',
     'transition_time_s': '--transition-time',
+    'window_s': '--window',
 }
 
 usage = typer.BadParameter  # error in the command line, exit code 2
 
 
 def option(text: str, default: Any = None, *flags: str, **rules: Any) -> Any:
-    """Return a typer option; `flags`: its names (default: the parameter's), `rules`: for typer."""
+    """
+    Return a typer option; `rules`: for typer. `flags`: names; the name ``--parameter`` is added
+    if `flags` contain no long name.
+    """
     return typer.Option(default, *flags, help=text, **rules)
 
 
@@ -79,12 +87,19 @@ def expanded(command: Callable[..., Any]) -> Any:
         return command(**values)
 
     for parameter in options:
-        default = parameter.default
-        if isinstance(default, typer.models.OptionInfo) and default.metavar is None:
-            default.metavar = _VALUES.get(parameter.annotation)
+        made = parameter.default
+        if isinstance(made, typer.models.OptionInfo):
+            made.metavar = made.metavar or _VALUES.get(parameter.annotation)
+            flags = made.param_decls or ()
+            if not any(flag.startswith('--') for flag in flags):
+                made.param_decls = (_flag_of(parameter.name), *flags)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in options}
     return run
+
+
+def _flag_of(name: str) -> str:
+    return _FLAGS.get(name, f'--{name.replace("_", "-")}')
 
 
 @contextmanager
@@ -96,12 +111,9 @@ def usage_of(what: str = '', **flags: str) -> Iterator[None]:
     try:
         yield
     except ValueError as mistake:
-        known = _FLAGS | flags
-
-        def flag_of(name: re.Match[str]) -> str:
-            return known.get(name[1], f'--{name[1].replace("_", "-")}')
-
-        text = str(mistake) if what else re.sub(r'`(\w+)`', flag_of, str(mistake))
+        text = str(mistake)
+        if not what:
+            text = re.sub(r'`(\w+)`', lambda name: flags.get(name[1]) or _flag_of(name[1]), text)
         raise usage(f'{what}{text}') from mistake
 
 
@@ -120,9 +132,9 @@ def check_rate(rate_hz: float | None) -> float | None:
     return rate_hz
 
 
-FORCE = option('Overwrite an existing output of the same kind.', False, '--force', '-f')
-QUIET = option('Print only errors and missing parts of bags.', False, '--quiet', '-q')
-NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '--output', '-o')
+FORCE = option('Overwrite an existing output of the same kind.', False, '-f')
+QUIET = option('Print only errors and missing parts of bags.', False, '-q')
+NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '-o')
 JUDGED_BAGS = argument('Bags to judge the calibration on.', None, metavar='[BAG]...')
 CERTIFICATE_INFO = option(
     'Statements of the laboratory for the certificate: number, customer, ... (YAML).'
@@ -139,7 +151,6 @@ OFFSET = option(
 INPUT = option(
     'Samples to read from the bag: counts, imu, or auto (counts if present, else imu).',
     'auto',
-    '--input',
     metavar='KIND',
 )
 Input = Literal['auto', 'counts', 'imu']
@@ -147,8 +158,7 @@ Input = Literal['auto', 'counts', 'imu']
 
 @expanded
 def out(
-    as_json: bool = option('Print the result as one JSON object.', False, '--json'),
-    quiet: bool = QUIET,
+    as_json: bool = option('Print the result as one JSON object.', False), quiet: bool = QUIET
 ) -> Output:
     """Build the output of a command."""
     return Output(as_json, quiet)
@@ -176,12 +186,10 @@ def _reading(
     begin: float | None = option(
         'Begin of the part to read: seconds from the first sample, or a stamp (seconds since '
         '1970).',
-        None,
-        '--from',
         metavar='S',
     ),
     end: float | None = option(
-        'End of the part to read: seconds or a stamp, as for --from.', None, '--to', metavar='S'
+        'End of the part to read: seconds or a stamp, as for --from.', metavar='S'
     ),
 ) -> Any:
     from ..recording.topics import BagPart, Topics
@@ -244,7 +252,7 @@ def site(
 def judging(
     where: tuple[float | None, float] = place,
     window_s: float = option(
-        'Averaging time at rest, in s.', 60.0, '--window', metavar='S', min=1e-3, max=86400.0
+        'Averaging time at rest, in s.', 60.0, metavar='S', min=1e-3, max=86400.0
     ),
     tolerance: str | None = option('Largest accepted RMS of |f| - g, e.g. 100ug, 1e-3m/s^2.'),
     serial: str | None = SERIAL,
@@ -299,8 +307,6 @@ def fitting(
     ),
     min_rest_s: float | None = option(
         'Shortest rest used, in s; default: 3, or 1 or 2 if they determine bias and scale better.',
-        None,
-        '--min-rest',
         metavar='S',
         show_default=False,
     ),
