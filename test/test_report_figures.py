@@ -17,12 +17,10 @@ from report_helpers import certificate, evidence, fitted
 
 from thermo_comp.report import figures_bags as of_bags
 from thermo_comp.report import figures_unit as of_unit
-from thermo_comp.report.evidence import LEFT_OUT
-from thermo_comp.report.html import number
+from thermo_comp.report.certificate import curves
+from thermo_comp.report.evidence import LEFT_OUT, shown_bag
 from thermo_comp.report.page import figures_of, position_error, schuler_peak
-from thermo_comp.report.style import drawing, svg
-from thermo_comp.report.temperature_curves import curves
-from thermo_comp.report.trace import shown_bag
+from thermo_comp.report.style import drawing, number, svg
 from thermo_comp.thermal.regime import Regime
 from thermo_comp.thermal.settings import DetectorSettings
 from thermo_comp.unit.gravity import MICRO_G

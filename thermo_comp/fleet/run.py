@@ -174,8 +174,8 @@ def render_fleet(
 ) -> str:
     """Render the fleet's page; `certificate_of` returns a certificate's relative path, or ''."""
     from ..report.figures_unit import draw_distances, draw_shares
-    from ..report.html import render
     from ..report.page import ReportFigure, drawn_figures
+    from ..report.style import render
 
     fitted = [row for row in rows if is_fitted(row)]
     curves = {

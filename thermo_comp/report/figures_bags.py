@@ -15,9 +15,8 @@ from ..unit.calibration import AXES
 from ..unit.gravity import MICRO_G, ug_text
 from ..unit.metrics import statistics_by_regime
 from . import style
-from .evidence import LEFT_OUT, RAW, Evidence, Position, required
-from .html import number
-from .trace import ShownBag
+from .evidence import LEFT_OUT, RAW, Evidence, Position, ShownBag, required
+from .style import number
 
 # Length of the part at the start of a position whose mean reading counts as zero drift [s].
 _ZERO_S = 120.0

@@ -14,9 +14,9 @@ from ..unit.gravity import MICRO_G
 from ..unit.metrics import means_by
 from ..unit.rate_bias import MILLIDEGREE
 from . import style
+from .certificate import Curve, curves, slopes
 from .evidence import CHOSEN, Evidence, required
-from .html import minus, number
-from .temperature_curves import Curve, curves, slopes
+from .style import minus, number
 
 #: Two-sided 95 % of a normal distribution, in standard deviations.
 BAND_SDS = 1.96

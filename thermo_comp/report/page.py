@@ -17,24 +17,12 @@ from ..judging.evaluation import drifts_of
 from ..thermal.regime import Regime
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.terms import GROUPS
+from . import certificate
 from . import figures_bags as of_bags
 from . import figures_unit as of_unit
-from .certificate import (
-    budget,
-    combined,
-    conformity,
-    over_temperature,
-    own_heat,
-    results,
-    unclaimed_gravity_sd,
-    withheld_because,
-)
-from .evidence import LEFT_OUT, Evidence
-from .html import label_text, render, utc
+from .evidence import LEFT_OUT, Evidence, span_of
 from .statements import CertificateInfo
-from .style import drawing, png, svg
-from .temperature_curves import programs
-from .trace import span_of
+from .style import drawing, label_text, png, render, svg, utc
 
 # Mean radius of the Earth [m]: GRS 80.
 _EARTH_RADIUS = 6.371e6
@@ -82,9 +70,8 @@ def render_report(
     if figures is None:
         figures = drawn_figures(figures_of(evidence))
     info = info or CertificateInfo()
-    is_certificate = evidence.calibration is not None
-    title = 'Thermal calibration certificate' if is_certificate else 'Thermal test record'
-    contributions = budget(evidence, info)
+    title = 'Thermal calibration certificate' if evidence.calibration else 'Thermal test record'
+    contributions = certificate.budget(evidence, info)
     corrections = [*evidence.residuals, *([LEFT_OUT] if evidence.left_out else [])]
     return render(
         'certificate.html',
@@ -97,16 +84,16 @@ def render_report(
         bags=[(bag, *span_of(bag), remarks_of(bag)) for bag in evidence.bags],
         judged_bags=_judged_bags(evidence),
         tested=info.dates.test or _test_dates(evidence),
-        results=results(evidence, info, contributions),
+        results=certificate.results(evidence, info, contributions),
         budget=contributions,
-        combined=combined(contributions),
-        conformity=conformity(evidence),
-        over_temperature=over_temperature(evidence, info),
-        programs=programs(evidence.calibration) if evidence.calibration else (),
+        combined=certificate.combined(contributions),
+        conformity=certificate.conformity(evidence),
+        over_temperature=certificate.over_temperature(evidence, info),
+        programs=certificate.programs(evidence.calibration) if evidence.calibration else (),
         groups={CURVE: 'curve over temperature', SET: 'difference of the sets', **GROUPS},
-        withheld=withheld_because(evidence, info),
-        own_heat=own_heat(evidence.calibration),
-        is_gravity_known=unclaimed_gravity_sd(evidence, info) is not None,
+        withheld=certificate.withheld_because(evidence, info),
+        own_heat=certificate.own_heat(evidence.calibration),
+        is_gravity_known=certificate.unclaimed_gravity_sd(evidence, info) is not None,
         error=position_error,
         schuler=schuler_peak,
         figures=figures,
