@@ -145,8 +145,6 @@ class Evidence:
             if self.bags:
                 return 'not judged: no recording has a rest of the length of a window'
             return 'the calibration alone: no recording was judged'
-        if not self.bags:
-            return 'nothing to show yet: no file could be read'
         return 'a thermal record: no calibration was judged'
 
     @property

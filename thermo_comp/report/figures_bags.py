@@ -3,6 +3,8 @@
 """Owns the figures of bags: over time, like the paper's Fig. 3, 4, 6 and 7, and by position."""
 
 from collections.abc import Sequence
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from ..thermal.regime import Regime
 from ..typing import Bools, Floats
 from ..unit.calibration import AXES
 from ..unit.gravity import MICRO_G, ug_text
-from ..unit.metrics import statistics_by_regime
+from ..unit.metrics import means_by, statistics_by_regime
 from . import style
 from .evidence import LEFT_OUT, RAW, Evidence, Position, ShownBag, required
 from .style import number
@@ -63,8 +65,7 @@ def draw_dynamics(evidence: Evidence) -> Figure:
     style.legend_above(rates, 'b  first derivatives')
     line = style.CASE_LINE if shown.leader == 'case' else style.BOARD_LINE
     bend.plot(shown.time / unit, shown.acceleration * 3600.0, **line)
-    bend.set_ylabel('K/min²')
-    bend.set_title(f'second derivative of T {shown.leader}')
+    bend.set(ylabel='K/min²', title=f'second derivative of T {shown.leader}')
     bend.locator_params(axis='y', nbins=4)
     _draw_flag(flag, shown, unit)
     figure.align_ylabels(panels[:-1])
@@ -123,17 +124,13 @@ def _panels(
     unit, name = style.time_unit(shown.duration_s)
     figure = style.new_figure(more + sum(heights))
     panels = figure.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0]
-    spans: list[tuple[float, float]] = []
-    for stretch in shown.stretches:
-        if stretch.regime == Regime.DYNAMIC:
-            # Join successive heating and cooling, so that no bright line is between them.
-            start = spans.pop()[0] if spans and spans[-1][1] == stretch.start else stretch.start
-            spans.append((start, stretch.stop))
-    for axes in panels[:-1] if is_flagged else panels:
-        for start, stop in spans:
-            axes.axvspan(start / unit, stop / unit, color=_SHADE, lw=0, zorder=0)
-    panels[-1].set_xlabel(name)
-    panels[-1].set_xlim(0.0, shown.duration_s / unit)
+    # Join successive heating and cooling, so that no bright line is between them.
+    for regime, run in groupby(shown.stretches, key=attrgetter('regime')):
+        start, *_, stop = (edge / unit for stretch in run for edge in stretch[:2])
+        if regime == Regime.DYNAMIC:
+            for axes in panels[:-1] if is_flagged else panels:
+                axes.axvspan(start, stop, color=_SHADE, lw=0, zorder=0)
+    panels[-1].set(xlabel=name, xlim=(0.0, shown.duration_s / unit))
     return figure, list(panels), shown, unit
 
 
@@ -154,11 +151,9 @@ def _drift(evidence: Evidence) -> tuple[Floats, str]:
     windows = evidence.windows
     if windows is None or not _rows(evidence).any():
         return np.zeros((0, 3)), ''
-    drift = windows.mean.copy()
-    for p in np.unique(windows.position):
-        rows = windows.position == p
-        begin = windows.time[rows] <= windows.time[rows][0] + _ZERO_S
-        drift[rows] -= windows.mean[rows][begin].mean(axis=0)
+    _, first, place = np.unique(windows.position, return_index=True, return_inverse=True)
+    begin = windows.time <= windows.time[first][place] + _ZERO_S
+    drift = windows.mean - means_by(place[begin], windows.mean[begin])[place]
     if evidence.calibration is not None:
         K = [axis.scale_factor for axis in evidence.calibration.axes]
         return drift / K / MICRO_G, 'µg'
@@ -181,9 +176,8 @@ def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:
             look: Any = {'facecolor': _SHADE, 'edgecolor': '#777777', 'hatch': hatch, 'lw': 0}
             axes.fill_between(span, [stretch.direction or 1.0] * 2, **look)
     axes.plot(times, levels, color='black', linewidth=1.3)
-    axes.set_ylim(-1.35, 1.35)
+    axes.set(ylim=(-1.35, 1.35), title='c  regime flag S')
     axes.set_yticks([-1, 0, 1], ['S = 1, cooling', 'S = 0, static', 'S = 1, heating'])
-    axes.set_title('c  regime flag S')
     axes.grid(visible=False, axis='x')
 
 
@@ -214,16 +208,13 @@ def draw_every_position(evidence: Evidence) -> Figure:
         # The lines of the regimes differ in width, because dashes would hide noise.
         for is_drawn, color, width in ((~dynamic, style.BLACK, 1.4), (dynamic, style.RED, 0.7)):
             axes.plot(time, np.where(is_drawn, value, np.nan), color=color, linewidth=width)
-    axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.set_yticks(range(len(shown)), [str(position.number) for position in shown])
     right = axes.secondary_yaxis('right')
     right.set_yticks(
         range(len(shown)), [number(position.residual_rms[judged] / MICRO_G) for position in shown]
     )
     right.set_ylabel('RMS, µg')
-    axes.set_ylabel('position')
-    axes.set_xlabel(name)
-    axes.set_xlim(0.0, None)
+    axes.set(xlabel=name, ylabel='position', xlim=(0.0, None), ylim=(len(shown) - 0.4, -0.6))
     part = f'; the {_MOST} with the largest RMS' if len(evidence.positions) > _MOST else ''
     axes.set_title(f'{judged}: a row is ±{number(limit / MICRO_G, 2)} µg high{part}')
     return figure
@@ -283,7 +274,5 @@ def _draw_hemisphere(axes: Axes, positions: tuple[Position, ...], side: int, jud
                 size = _RING * np.sqrt(position.residual_rms.get(judged, 0.0) / largest)
                 axes.plot(*place, 'o', markersize=size, mfc='none', mec=style.RED, mew=1.1)
             _note(axes, str(position.number), place, (3.5, 2.5))
-    axes.set_xlim(-1.32, 1.32)
-    axes.set_ylim(-1.32, 1.32)
-    axes.set_aspect('equal')
+    axes.set(xlim=(-1.32, 1.32), ylim=(-1.32, 1.32), aspect='equal')
     axes.set_axis_off()

@@ -124,9 +124,7 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
     low = min((float(values[0]) for values in drawn.values()), default=1.0)
     high = max((float(values[-1]) for values in drawn.values()), default=1.0)
     style.log_axis(axes, low / 1.3, high * 1.3)
-    axes.set_ylim(0.0, 103.0)
-    axes.set_xlabel('|f| − g of a unit, RMS, µg')
-    axes.set_ylabel('units, %')
+    axes.set(ylim=(0.0, 103.0), xlabel='|f| − g of a unit, RMS, µg', ylabel='units, %')
     style.legend_above(axes)
     return figure
 
@@ -148,9 +146,7 @@ def draw_distances(
         for edge in (-limit, limit):
             if abs(edge) < 1.1 * shown:
                 axes.plot([edge, edge], [row - 0.5, row + 0.5], color=style.BLACK, linewidth=0.8)
-    axes.set_xlim(-1.1 * shown, 1.1 * shown)
-    axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.set_yticks(range(len(labels)), labels)
-    axes.grid(visible=True, axis='x')
+    axes.set(xlim=(-1.1 * shown, 1.1 * shown), ylim=(len(labels) - 0.4, -0.6))
     axes.set_xlabel('distance from the median, standard deviations')
     return figure
