@@ -139,30 +139,24 @@ def print_guess(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     Print a guessed column map and the unused columns of a table, unless `shown` contains the same
     map or list of columns from another table.
     """
-    _print_map(out, log, shown)
-    not_used = f'columns not used: {", ".join(log.not_used)}'
-    if log.not_used and shown.setdefault(not_used, log.path) == log.path:
-        out.line(f'{log.path}: {not_used}')
-
-
-def _print_map(out: Output, log: 'ForeignLog', shown: dict[str, str]) -> None:
     from ..convert.column_map import column_map_text
     from ..convert.headings import map_lines
 
-    if log.guessed is None:
-        return
-    if log.guessed.format is None:  # the map was guessed from headings
+    if log.guessed is not None and log.guessed.format is None:  # guessed from headings
         lines = map_lines(log.guessed)
         first = shown.setdefault('\n'.join(lines), log.path)
-        if first != log.path:
+        if first == log.path:
+            out.line(f'{log.path}: guessed column map; if the map is wrong, edit it for --columns')
+            for line in lines:
+                out.line(f'  {line}')
+        else:
             out.line(f'{log.path}: same column map as {first}')
-            return
-        out.line(f'{log.path}: guessed column map; if the map is wrong, edit it for --columns')
-        for line in lines:
-            out.line(f'  {line}')
-    else:
+    elif log.guessed is not None:
         text = column_map_text(log.guessed)
         out.line(f'{log.path}: guessed {text}; if this guess is wrong, give --columns')
+    not_used = f'columns not used: {", ".join(log.not_used)}'
+    if log.not_used and shown.setdefault(not_used, log.path) == log.path:
+        out.line(f'{log.path}: {not_used}')
 
 
 def export(

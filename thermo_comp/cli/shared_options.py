@@ -135,7 +135,6 @@ def check_rate(rate_hz: float | None) -> float | None:
 FORCE = option('Overwrite an existing output of the same kind.', False, '-f')
 QUIET = option('Print only errors and missing parts of bags.', False, '-q')
 NEW_CALIBRATION = option('Calibration to write (YAML).', ..., '-o')
-JUDGED_BAGS = argument('Bags to judge the calibration on.', None, metavar='[BAG]...')
 CERTIFICATE_INFO = option(
     'Statements of the laboratory for the certificate: number, customer, ... (YAML).'
 )
@@ -330,23 +329,20 @@ def fitting(
     allow: list[str] | None = option('Refusal to override, by the name in its message.'),
 ) -> dict[str, Any]:
     """Return keywords of `FitOptions`."""
-    given = locals()
+    given = locals() | where
     if fault := QUANTITIES['temperature'].fault(reference_temperature):
         raise usage(f'--reference-temperature: {fault} degC, got {reference_temperature:g}')
     for name, value, unit in (('--k2-sd', k2_sd, 'ug/g^2'), ('--k3-sd', k3_sd, 'ug/g^3')):
         if value is not None and value > 1e6 * (QUANTITIES['nonlinearity'].at_most or math.inf):
             raise usage(f'{name}: must be at most 1e6 {unit}, got {value:g}')
-    return (
-        {name: value for name, value in given.items() if name != 'where'}
-        | where
-        | {
-            'still_sd': acceleration(still_sd, '--still-sd'),
-            'mounting_sd': acceleration(mounting_sd, '--mounting-sd'),
-            'k2_sd': None if k2_sd is None else k2_sd * 1e-6,
-            'k3_sd': None if k3_sd is None else k3_sd * 1e-6,
-            'allow': tuple(allow or ()),
-        }
-    )
+    del given['where']
+    return given | {
+        'still_sd': acceleration(still_sd, '--still-sd'),
+        'mounting_sd': acceleration(mounting_sd, '--mounting-sd'),
+        'k2_sd': None if k2_sd is None else k2_sd * 1e-6,
+        'k3_sd': None if k3_sd is None else k3_sd * 1e-6,
+        'allow': tuple(allow or ()),
+    }
 
 
 def acceleration(text: str | None, name: str) -> float | None:
