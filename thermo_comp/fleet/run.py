@@ -136,11 +136,6 @@ def _require_packages() -> None:
             )
 
 
-def _in_prior(row: Row) -> bool:
-    """Whether the prior may use a unit: its data are complete and its calibration is valid."""
-    return is_valid(row) and row['is_whole'] == 1
-
-
 def lacks_data(row: Row) -> bool:
     """
     Whether a unit's data are incomplete, so that the unit is fitted again with the prior of its
@@ -151,9 +146,12 @@ def lacks_data(row: Row) -> bool:
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:
-    """Build and save the prior from the units of `_in_prior`; or return None and the reason."""
-    # Of the tests of one serial that `_in_prior` accepts, only the last test is used.
-    tests = sorted((row for row in rows if _in_prior(row)), key=lambda row: str(row['start']))
+    """
+    Build and save the prior, from the last test of each serial with complete data and a valid
+    calibration; or return None and the reason.
+    """
+    usable = (row for row in rows if is_valid(row) and row['is_whole'] == 1)
+    tests = sorted(usable, key=lambda row: str(row['start']))
     latest = {row['serial']: str(row['name']) for row in tests}
     if len(latest) < UNITS_NEEDED:
         return None, (
