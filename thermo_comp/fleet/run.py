@@ -9,7 +9,6 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -172,7 +171,7 @@ def render_fleet(
 ) -> str:
     """Render the fleet's page; `certificate_of` returns a certificate's relative path, or ''."""
     from ..report.figures_unit import draw_distances, draw_shares
-    from ..report.page import ReportFigure, drawn_figures
+    from ..report.page import drawn_figures, report_figure
     from ..report.style import render
 
     fitted = [row for row in rows if is_fitted(row)]
@@ -180,29 +179,14 @@ def render_fleet(
         section: np.array([row[f'{section}_ug'] for row in fitted], np.float64)
         for section in ('raw', 'static', 'dynamic')
     }
-    shares = ReportFigure(
-        'residuals',
-        'How large are the residuals of |f| in the fleet?',
-        'Share of the units whose residual at rest is below a value: raw (corrected with the '
-        'constants at the reference temperature alone), and corrected with each unit’s '
-        'calibration. A steep curve means similar units; inspect those at a curve’s right end.',
-        partial(draw_shares, curves),
-    )
-    distances = ReportFigure(
-        'distances',
-        'Which units stand out, and in which quantity?',
-        'Each stroke is a unit, at its distance from the fleet’s median, divided by the root of '
-        'the sum of two variances: that over the units, and that of the unit’s fit. Diamonds '
-        'beyond the lines are the outliers in the table.',
-        partial(
-            draw_distances,
-            [spread.quantity.label for spread in summary.spreads],
-            [spread.z for spread in summary.spreads],
-            [spread.limit for spread in summary.spreads],
-        ),
-    )
     # A fleet of fewer than eight units is not searched for outliers: all limits are infinite.
-    is_comparable = any(np.isfinite(spread.limit) for spread in summary.spreads)
+    limits = [spread.limit for spread in summary.spreads]
+    is_comparable = any(map(np.isfinite, limits))
+    figures = [report_figure(draw_shares, curves)] if fitted else []
+    if is_comparable:
+        labels = [spread.quantity.label for spread in summary.spreads]
+        distances = [spread.z for spread in summary.spreads]
+        figures.append(report_figure(draw_distances, labels, distances, limits))
     return render(
         'fleet.html',
         title='Fleet report',
@@ -213,7 +197,7 @@ def render_fleet(
         n_fitted=len(fitted),
         refused=[row for row in rows if not is_fitted(row)],
         is_comparable=is_comparable,
-        figures=drawn_figures([shares] * bool(fitted) + [distances] * bool(is_comparable)),
+        figures=drawn_figures(figures),
         links={row['name']: quote(certificate_of(row)) for row in fitted},
     )
 

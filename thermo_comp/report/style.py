@@ -164,6 +164,13 @@ def render(template: str, **context: Any) -> str:
     return _templates().get_template(template).render(known, policy=_POLICY)
 
 
+def caption(figure: str, *data: Any) -> tuple[str, str]:
+    """Return the question that a figure of `data` answers, and how to read the figure."""
+    macro = getattr(_templates().get_template('captions.html').module, figure)
+    question, _, reading = macro(*data).unescape().strip().partition('\n')
+    return question, ' '.join(reading.split())
+
+
 @cache
 def _templates() -> Environment:
     made = Environment(
@@ -185,6 +192,7 @@ def _templates() -> Environment:
         'of': lambda key, values: values.get(key, math.nan),
         'utc': lambda ns: f'{utc(ns):%Y-%m-%d %H:%M}',
         'css': _css_text,
+        'label': label_text,
     }
     return made
 
