@@ -189,14 +189,6 @@ def results(
     return rows
 
 
-def own_heat(calibration: Calibration | None) -> str:
-    """Return the gradient in a soak, due to self-heating, as text; '' if not known."""
-    if calibration is None or calibration.soak_gradient_k is None:
-        return ''
-    gradient, sd = (minus(f'{part:.2f}') for part in calibration.soak_gradient_k)
-    return f' (T_{calibration.sensors[0]} − T_board: {gradient} ± {sd} K)'
-
-
 def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOverTemperature]:
     """Tabulate bias and scale of each axis in a soak and in ramps at temperatures of the board."""
     calibration = evidence.calibration
@@ -243,19 +235,6 @@ def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
     if sd is None or evidence.calibration is None:
         return np.nan
     return sd / evidence.calibration.gravity_m_s2
-
-
-def withheld_because(evidence: Evidence, info: CertificateInfo) -> str:
-    """Return the reason for withheld expanded uncertainties; empty if none is withheld."""
-    calibration = evidence.calibration
-    if calibration is not None and not calibration.has_uncertainty:
-        return 'U is withheld: the calibration states no uncertainty.'
-    if unclaimed_gravity_sd(evidence, info) is None:
-        return (
-            'U of the scale factors and of |f| − g is withheld: the uncertainty of local gravity, '
-            'a part of U, is not stated.'
-        )
-    return ''
 
 
 def conformity(evidence: Evidence) -> tuple[str, str]:

@@ -7,14 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from ..files import PAGE, PICTURE, write_atomically
 from ..fitting.reduction import ReducedBag
 from ..fitting.windows import CURVE, SET
 from ..judging.evaluation import drifts_of
-from ..thermal.regime import Regime
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.terms import GROUPS
 from . import certificate
@@ -82,7 +80,6 @@ def render_report(
         info=info,
         evidence=evidence,
         bags=[(bag, *span_of(bag), remarks_of(bag)) for bag in evidence.bags],
-        judged_bags=_judged_bags(evidence),
         tested=info.dates.test or _test_dates(evidence),
         results=certificate.results(evidence, info, contributions),
         budget=contributions,
@@ -91,8 +88,6 @@ def render_report(
         over_temperature=certificate.over_temperature(evidence, info),
         programs=certificate.programs(evidence.calibration) if evidence.calibration else (),
         groups={CURVE: 'curve over temperature', SET: 'difference of the sets', **GROUPS},
-        withheld=certificate.withheld_because(evidence, info),
-        own_heat=certificate.own_heat(evidence.calibration),
         is_gravity_known=certificate.unclaimed_gravity_sd(evidence, info) is not None,
         error=position_error,
         schuler=schuler_peak,
@@ -129,21 +124,6 @@ def remarks_of(bag: ReducedBag) -> list[str]:
         )
         if is_so
     ]
-
-
-def _judged_bags(evidence: Evidence) -> list[str]:
-    """Return sentences on the judged bags and on a shown bag in which no regime was found."""
-    collected = []
-    if evidence.judgement is not None:
-        board = evidence.judgement.windows.board
-        which = 'bags of the fit' if evidence.is_seen else 'bags that the fit did not use'
-        collected.append(
-            f'{evidence.positions_text} in {which}, {np.min(board):.1f} to {np.max(board):.1f} °C.'
-        )
-    shown = evidence.shown
-    if shown is not None and all(stretch.regime == Regime.UNKNOWN for stretch in shown.stretches):
-        collected.append('The regime is not known: the shown bag is too short for the detector.')
-    return collected
 
 
 def _test_dates(evidence: Evidence) -> str:
