@@ -170,7 +170,7 @@ def render_fleet(
     rows: Sequence[Row], summary: Summary, certificate_of: Callable[[Row], str]
 ) -> str:
     """Render the fleet's page; `certificate_of` returns a certificate's relative path, or ''."""
-    from ..report.figures_unit import draw_distances, draw_shares
+    from ..report.figures import draw_distances, draw_shares
     from ..report.page import drawn_figures, report_figure
     from ..report.style import render
 

@@ -15,9 +15,7 @@ from ..fitting.windows import CURVE, SET
 from ..judging.evaluation import drifts_of
 from ..unit.gravity import STANDARD_GRAVITY
 from ..unit.terms import GROUPS
-from . import certificate
-from . import figures_bags as of_bags
-from . import figures_unit as of_unit
+from . import certificate, figures
 from .evidence import LEFT_OUT, Evidence, span_of
 from .statements import CertificateInfo
 from .style import caption, drawing, png, render, svg, utc
@@ -156,13 +154,13 @@ def figures_of(evidence: Evidence) -> list[ReportFigure]:
     if shown is not None and windows is not None and evidence.residuals:
         is_corrected = bool((windows.bag == shown.index).any())
     has_data = {
-        of_bags.draw_temperatures: shown is not None,
-        of_bags.draw_dynamics: shown is not None,
-        of_bags.draw_residuals: is_corrected,
-        of_bags.draw_gravity: is_corrected,
-        of_unit.draw_functions: calibration is not None,
-        of_unit.draw_rates: calibration is not None and calibration.gyroscope is not None,
-        of_bags.draw_every_position: evidence.residuals and len(evidence.positions) > 1,
-        of_bags.draw_positions: evidence.positions,
+        figures.draw_temperatures: shown is not None,
+        figures.draw_dynamics: shown is not None,
+        figures.draw_residuals: is_corrected,
+        figures.draw_gravity: is_corrected,
+        figures.draw_functions: calibration is not None,
+        figures.draw_rates: calibration is not None and calibration.gyroscope is not None,
+        figures.draw_every_position: evidence.residuals and len(evidence.positions) > 1,
+        figures.draw_positions: evidence.positions,
     }
     return [report_figure(draw, evidence) for draw, is_drawn in has_data.items() if is_drawn]
