@@ -206,8 +206,11 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
         value, sd = evaluate(calibration, program, at)[2:]
         off = value - np.outer(at - calibration.reference_temperature_c, slope)
         value[:, :3] += bias_0 / MICRO_G
-        # If U is withheld, its part without gravity sets the digits of value and deviation.
-        digits = np.where(known * sd > 0.0, known * sd, _four_digits(value))
+        # If U is withheld, its part without gravity sets the digits of value and deviation; if the
+        # calibration states no uncertainty, the largest values are printed with 4 digits.
+        largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
+        four_digits = 10.0 ** (np.floor(np.log10(largest)) - 2.0)
+        digits = np.where(known * sd > 0.0, known * sd, four_digits)
         sd[:, 3:] = np.hypot(sd[:, 3:], 1e6 * _gravity_part(evidence, info))
         for k, table in enumerate(tables):
             for row in range(len(at)):
@@ -221,12 +224,6 @@ def over_temperature(evidence: Evidence, info: CertificateInfo) -> list[AxisOver
                     cells += text, rounded(0.0, expanded)[1], deviation
                 table.rows.append(tuple(cells))
     return tables
-
-
-def _four_digits(value: Floats) -> Floats:
-    """Return uncertainties, (columns,), for which `rounded` gives 4 digits of largest values."""
-    largest = np.maximum(np.abs(value).max(axis=0), 1e-3)
-    return np.asarray(10.0 ** (np.floor(np.log10(largest)) - 2.0))
 
 
 def _gravity_part(evidence: Evidence, info: CertificateInfo) -> float:
