@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from ..files import PAGE, PICTURE, write_atomically
-from ..fitting.reduction import ReducedBag
 from ..fitting.windows import CURVE, SET
 from ..judging.evaluation import drifts_of
 from ..unit.gravity import STANDARD_GRAVITY
@@ -77,7 +76,7 @@ def render_report(
         is_simulated=evidence.is_simulated,
         info=info,
         evidence=evidence,
-        bags=[(bag, *span_of(bag), remarks_of(bag)) for bag in evidence.bags],
+        bags=[(bag, *span_of(bag)) for bag in evidence.bags],
         tested=info.dates.test or _test_dates(evidence),
         results=certificate.results(evidence, info, contributions),
         budget=contributions,
@@ -104,24 +103,6 @@ def position_error(bias: float, time: float) -> float:
 def schuler_peak(bias: float) -> float:
     """Return the largest position error [m] of a constant bias, 2 R b / g, after 42 minutes."""
     return 2.0 * _EARTH_RADIUS * bias / STANDARD_GRAVITY
-
-
-def remarks_of(bag: ReducedBag) -> list[str]:
-    """Return remarks on a bag, such as lost samples or a missing case temperature."""
-    n = len(bag.intervals)
-    return [
-        text
-        for text, is_so in (
-            (bag.info.truncated or '', bag.info.truncated),
-            (f'{bag.n_saturated} samples saturated, left out', bag.n_saturated),
-            (f'{bag.n_dropped} samples not finite or out of order, left out', bag.n_dropped),
-            ('no accelerometer samples', not bag.n_samples),
-            ('never at rest', bag.n_samples and not n),
-            (f'{n} still intervals', n > 1),
-            ('no case temperature', not len(bag.case.value)),
-        )
-        if is_so
-    ]
 
 
 def _test_dates(evidence: Evidence) -> str:
