@@ -114,7 +114,6 @@ def run(arguments: list[str]) -> int:
 
 def _plain(message: str, arguments: list[str]) -> str:
     """Rewrite a message of typer in plain words; quote a given value that is not a number."""
-    message = message.replace('Value error, ', '').replace('Input should be', 'must be')
     message = message.removeprefix('Invalid value: ')  # the rest of the message names the option
     option = _NO_NUMBER.search(message)
     if option is None:

@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
@@ -147,12 +148,6 @@ OFFSET = option(
     'Reading of raw samples at zero force, in counts, e.g. 32768; default: detected.',
     metavar='COUNTS',
 )
-INPUT = option(
-    'Samples to read from the bag: counts, imu, or auto (counts if present, else imu).',
-    'auto',
-    metavar='KIND',
-)
-Input = Literal['auto', 'counts', 'imu']
 
 
 @expanded
@@ -179,9 +174,25 @@ def named_topics(
     return named
 
 
-def _reading(
-    input_: Input = INPUT,
+@expanded
+def reading(
+    input_: Literal['auto', 'counts', 'imu'] = option(
+        'Samples to read from the bag: counts, imu, or auto (counts if present, else imu).',
+        'auto',
+        metavar='KIND',
+    ),
     names: dict[str, str] = named_topics,
+) -> Any:
+    """Build `Topics`, the topics of the inputs in a bag, for the whole bag."""
+    from ..recording.topics import Topics
+
+    with usage_of('--topic, --topics: '):
+        return Topics.named(names, input=input_)
+
+
+@expanded
+def reading_part(
+    topics: Any = reading,
     begin: float | None = option(
         'Begin of the part to read: seconds from the first sample, or a stamp (seconds since '
         '1970).',
@@ -191,21 +202,11 @@ def _reading(
         'End of the part to read: seconds or a stamp, as for --from.', metavar='S'
     ),
 ) -> Any:
-    from ..recording.topics import BagPart, Topics
+    """Build `Topics`, the topics of the inputs in a bag and the part of the bag to read."""
+    from ..recording.topics import BagPart
 
     with usage_of('--from, --to: '):
-        part = BagPart(begin, end)
-    with usage_of('--topic, --topics: '):
-        return Topics.named(names, part=part, input=input_)
-
-
-reading_part = expanded(_reading)
-
-
-@expanded
-def reading(input_: Input = INPUT, names: dict[str, str] = named_topics) -> Any:
-    """Build `Topics`, the topics of the inputs in a bag, for the whole bag."""
-    return _reading(input_, names, None, None)
+        return replace(topics, part=BagPart(begin, end))
 
 
 #: Sd of the difference between local gravity and normal gravity in mountains [m/s^2]: some 50 mGal

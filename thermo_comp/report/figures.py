@@ -183,13 +183,13 @@ def _draw_flag(axes: Axes, shown: ShownBag, unit: float) -> None:
         if stretch.regime == Regime.UNKNOWN:
             axes.axvspan(*span, fill=False, hatch='---', edgecolor='#999999', lw=0)
             continue
-        level = float(stretch.direction if stretch.regime == Regime.DYNAMIC else 0)
+        level = float(stretch.direction)  # 0 only in the static regime
         times += span
         levels += [level, level]
-        if stretch.regime == Regime.DYNAMIC:
-            hatch = {1: '////', -1: '\\\\\\\\', 0: 'xxxx'}[stretch.direction]
+        if level:
+            hatch = '////' if level > 0.0 else '\\\\\\\\'
             look: Any = {'facecolor': _SHADE, 'edgecolor': '#777777', 'hatch': hatch, 'lw': 0}
-            axes.fill_between(span, [stretch.direction or 1.0] * 2, **look)
+            axes.fill_between(span, [level, level], **look)
     axes.plot(times, levels, color='black', linewidth=1.3)
     axes.set(ylim=(-1.35, 1.35), title='c  regime flag S')
     axes.set_yticks([-1, 0, 1], ['S = 1, cooling', 'S = 0, static', 'S = 1, heating'])
