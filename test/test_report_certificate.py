@@ -206,9 +206,7 @@ def test_the_table_over_temperature_agrees_with_the_calibration(tmp_path):
     calibration = fitted().calibration
     for k, table in enumerate(tables):
         assert len({program for program, *_ in table.rows}) == 3
-        for program, *cells in table.rows:
-            if program != 'soak':
-                continue
+        for cells in (cells for program, *cells in table.rows if program == 'soak'):
             at, *numbers = (float(cell.replace('−', '-')) for cell in cells)
             bias, sd, scale, scale_sd = in_a_soak(calibration, at)
             # Values and temperatures are rounded; the tolerance is half of the last digit.
