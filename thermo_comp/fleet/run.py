@@ -140,8 +140,7 @@ def lacks_data(row: Row) -> bool:
     Whether a unit's data are incomplete, so that the unit is fitted again with the prior of its
     type. False for data that contradict themselves or the fit: a prior would hide the fault.
     """
-    is_contradicted = str(row['verdict']) in _CONTRADICTIONS
-    return row['is_whole'] == 0 and not is_contradicted
+    return row['is_whole'] == 0 and row['verdict'] not in _CONTRADICTIONS
 
 
 def _common(rows: Sequence[Row], results: Results) -> tuple[Calibration | None, str]:

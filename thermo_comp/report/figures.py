@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from ..thermal.regime import Regime
 from ..typing import Bools, Floats
@@ -386,7 +387,11 @@ def draw_shares(curves: Mapping[str, Floats]) -> Figure:
         axes.step(values, share, where='post', label=name, **line)
     low = min((float(values[0]) for values in drawn.values()), default=1.0)
     high = max((float(values[-1]) for values in drawn.values()), default=1.0)
-    style.log_axis(axes, low / 1.3, high * 1.3)
+    axes.set(xscale='log', xlim=(low / 1.3, high * 1.3))
+    subs = (1.0, 2.0, 5.0) if high * 1.3 < 50.0 * (low / 1.3) else (1.0,)
+    axes.xaxis.set_major_locator(LogLocator(subs=subs))
+    axes.xaxis.set_major_formatter(lambda value, _: f'{value:g}')
+    axes.xaxis.set_minor_formatter('')
     axes.set(ylim=(0.0, 103.0), xlabel='|f| − g of a unit, RMS, µg', ylabel='units, %')
     style.legend_above(axes)
     return figure

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Owns the report as an HTML page and PNG files, and the list of its figures with their texts."""
+"""Owns the report as an HTML page and PNG files, and the list of its figures."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

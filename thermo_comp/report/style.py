@@ -22,7 +22,6 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
-from matplotlib.ticker import FuncFormatter, LogLocator
 
 from .. import __version__
 from ..text import counted
@@ -145,16 +144,6 @@ def shared_legend(figure: Figure, axes: Axes, n_columns: int) -> None:
     handles, labels = axes.get_legend_handles_labels()
     place: Any = 'outside upper left'
     figure.legend(handles, labels, loc=place, borderaxespad=0.5, ncols=n_columns)
-
-
-def log_axis(axes: Axes, low: float, high: float) -> None:
-    """Make the x axis logarithmic from `low` to `high`, with plain numbers at its ticks."""
-    axes.set_xscale('log')
-    axes.set_xlim(low, high)
-    is_short = high < 50.0 * low
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
-    axes.xaxis.set_minor_formatter(FuncFormatter(lambda _value, _: ''))
 
 
 def render(template: str, **context: Any) -> str:
