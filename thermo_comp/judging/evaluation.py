@@ -26,7 +26,7 @@ from ..unit.calibration import AXES, Calibration
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.prediction import in_a_soak
 from ..unit.provenance import Source
-from .judgement import Judgement, judge
+from .judgement import SIGNIFICANT_SDS, Judgement, judge
 from .windows import WINDOW_S, corrected_windows, sum_length
 
 # Largest accepted ratio of a unit's scatter at rest to the noise that its calibration states.
@@ -34,8 +34,6 @@ _LARGEST_NOISE_RATIO = 4.0
 # Calibrated noise of a sample [sd / step of the samples] above which constant samples in a rest
 # are a fault.
 _DEAD_NOISE = 0.5
-# Smallest significant change of a constant between calibrations, in standard deviations.
-_SIGNIFICANT_SDS = 3.0
 
 
 @dataclass(frozen=True)
@@ -203,7 +201,7 @@ class Drift:
     @property
     def is_sure(self) -> bool:
         """Whether the change exceeds three standard deviations (`sd`)."""
-        return abs(self.change) > _SIGNIFICANT_SDS * self.sd
+        return abs(self.change) > SIGNIFICANT_SDS * self.sd
 
 
 def history_of(calibrations: Sequence[Calibration]) -> tuple[Epoch, ...]:
