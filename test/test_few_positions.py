@@ -15,7 +15,6 @@ from strangers_cases import HALF, Study, consumer_grade
 from strangers_units import record, rng_of
 
 import thermo_comp as tc
-from thermo_comp.convert.exchange import export_calibration
 from thermo_comp.fitting import FitOptions, fit
 from thermo_comp.simulation.campaign import positions
 from thermo_comp.unit.calibration import parameter_layout
@@ -229,16 +228,6 @@ def test_a_tilt_of_one_support_is_not_taken_for_a_scale_slope_of_a_level_axis():
     # The z axis is level in both positions, so the slope of its scale factor keeps its prior sd.
     assert sd < 100e-6
     assert abs(found - 1e-6 * unit.scale_curve[0, 2]) < 3.0 * sd
-
-
-def test_a_calibration_from_one_position_is_exported_to_px4(one_position):
-    text = export_calibration(one_position.calibration, 'px4', device_id=1).text
-    rows = [line.split() for line in text.splitlines() if line.startswith('1')]
-    value = {row[2]: float(row[3]) for row in rows}
-    d = np.array([17.0, 32.0]) - value['TC_A0_TREF']
-    for axis, slope in enumerate(SLOPE):
-        offset = sum(value[f'TC_A0_X{power}_{axis}'] * d**power for power in range(4))
-        assert np.diff(offset)[0] / 15.0 / MG == pytest.approx(slope, abs=0.2)
 
 
 def test_positions_without_a_thermometer_give_constants_and_wide_temperature_slopes():
