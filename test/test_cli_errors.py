@@ -124,11 +124,6 @@ class TestBags:
     def test_a_missing_bag_is_refused(self, cli, unit, tmp_path):
         self.replayed(cli, unit, tmp_path / 'absent', r'absent: no such file or directory')
 
-    def test_random_bytes_with_the_suffix_of_a_bag_are_refused(self, cli, unit, tmp_path):
-        for name in ('noise.mcap', 'noise.db3', 'noise.bag'):
-            (tmp_path / name).write_bytes(b'\x89MCAP0\r\n' + bytes(range(256)) * 8)
-            self.replayed(cli, unit, tmp_path / name, name)
-
     def test_a_bag_without_board_temperature_is_refused(self, cli, unit, tmp_path):
         path = bag(tmp_path / 'bag', board=False)
         self.replayed(cli, unit, path, r'temperature/board.*no such topic.*--topic board=')

@@ -7,7 +7,7 @@ import pytest
 
 from thermo_comp.convert.column_map import ColumnMap, table_log
 from thermo_comp.convert.log import NO_STAMP, write_log
-from thermo_comp.convert.table import Format, Stamp, exact_ns, layout, read_parquet, read_text
+from thermo_comp.convert.table import Format, Stamp, exact_ns, read_parquet, read_text
 from thermo_comp.errors import RecordingError
 from thermo_comp.recording.reader import read_recording
 from thermo_comp.recording.topics import Topics
@@ -92,12 +92,6 @@ def test_stamps_of_a_table_are_exact():
     assert exact_ns('1767225600123456789', 'ns') == 1767225600123456789
     bad = ['', 'soon', 'nan', 'inf', '1e40', '99999999999999999999']
     assert {exact_ns(cell, 'ns') for cell in bad} == {NO_STAMP}
-
-
-def test_the_delimiter_is_that_which_gives_equal_numbers_of_cells():
-    assert layout('a;b,c;d\n1,5;2,5;3,5\n') == (';', 3)
-    assert layout('1 2 3\n4 5 6\n') == (' ', 3)
-    assert layout('a\tb\n1\t2\n') == ('\t', 2)
 
 
 @pytest.mark.parametrize(

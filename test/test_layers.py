@@ -164,13 +164,6 @@ def loaded_after(statement, *watched):
     return ran(sys.executable, '-c', code, check=True, timeout=120).stdout.split()
 
 
-def test_the_node_imports_none_of_the_offline_libraries():
-    # Libraries for fits or plots would increase the memory and the start-up time of the node.
-    pytest.importorskip('rclpy', reason='rclpy is not installed: the extra `ros`')
-    offline = ('rosbags', 'mcap', 'matplotlib', 'scipy', 'scipy.optimize', 'typer', 'rich')
-    assert loaded_after('import thermo_comp.ros.node', *offline) == []
-
-
 def test_help_imports_none_of_the_heavy_libraries():
     heavy = ('numpy', 'scipy', 'rosbags', 'mcap', 'matplotlib', 'rclpy', 'dask')
     assert loaded_after('import thermo_comp.cli.app', *heavy) == []
@@ -179,8 +172,3 @@ def test_help_imports_none_of_the_heavy_libraries():
 def test_the_command_info_does_not_import_the_fit():
     heavy = ('scipy', 'matplotlib', 'pydantic', 'rosbags', 'rclpy', 'thermo_comp.fitting')
     assert loaded_after('import thermo_comp.recording.overview', *heavy) == []
-
-
-def test_the_compensator_imports_neither_ros_nor_libraries_for_bags():
-    statement = 'import thermo_comp.online.compensator'
-    assert loaded_after(statement, 'rclpy', 'rosbags', 'mcap', 'matplotlib', 'scipy') == []

@@ -154,7 +154,7 @@ def test_equal_curves_of_both_sets_stay_equal_in_a_population():
 
 @cache
 def helped():
-    """Fit one position with the siblings' prior; return the priors tried, last that of the start."""
+    """Fit one position with the siblings' prior; return all priors tried, the initial one last."""
     seen = []
 
     def fitted_with(*given):

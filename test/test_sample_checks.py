@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.checks import STUCK_SAMPLES, StuckCheck
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
-from thermo_comp.online.status import DROPPED, Counters
 from thermo_comp.unit.calibration import Axes, AxisReference, Unit
 
 K = 300.0
@@ -180,11 +179,6 @@ def test_the_gravity_check_uses_local_gravity_or_that_of_the_calibration(rng):
         gravity = compensator.status().gravity
         # The tolerance is that of a mean of 110 samples with a noise of 1.4 mm/s^2, and rounding.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
-
-
-def test_the_number_of_samples_is_the_sum_of_all_reasons():
-    counters = Counters(**{name: 2**k for k, name in enumerate(DROPPED)})
-    assert counters.n_in == 2 ** len(DROPPED) - 1
 
 
 @st.composite

@@ -71,19 +71,14 @@ def test_only_integers_for_floats_are_converted():
 @pytest.mark.parametrize(
     ('data', 'key', 'message'),
     [
-        ([], '', 'must be a mapping of keys, got a list'),
-        ({}, 'name', 'this key is missing'),
-        ({'nmae': 'ab'}, 'nmae', 'unknown key'),
         ({'name': 'a'}, 'name', "must have at least 2 characters, got 'a'"),
         ({'name': 'x' * 21}, 'name', 'must have at most 20 characters'),
         ({'name': 3}, 'name', 'must be a valid text, got 3'),
         ({'name': 'ab', 'layer': None}, 'layer', 'must be a valid integer or text, got None'),
         ({'name': 'ab', 'layer': True}, 'layer', 'must be a valid integer or text, got True'),
         ({'name': 'ab', 'is_hidden': 1}, 'is_hidden', 'must be a valid true or false, got 1'),
-        ({'name': 'ab', 'colour': 'pink'}, 'colour', "'red', 'green' or 'blue', got 'pink'"),
         ({'name': 'ab', 'colour': ['red']}, 'colour', "'blue', got a list"),
         ({'name': 'ab', 'colour': 'x' * 99}, 'colour', "got 'x{59}$"),
-        ({'name': 'ab', 'corner': [1.0]}, 'corner', 'must have 2 entries, got 1'),
         ({'name': 'ab', 'corner': 'ab'}, 'corner', "must be a list, got 'ab'"),
         ({'name': 'ab', 'corner': [1, 10**999]}, 'corner[1]', 'must be a valid number'),
         ({'name': 'ab', 'corner': [2, 1]}, 'corner[1]', 'must be at least corner'),
@@ -92,10 +87,7 @@ def test_only_integers_for_floats_are_converted():
         ({'name': 'ab', 'shapes': [7]}, 'shapes[0]', 'must be a mapping of keys, got 7'),
         ({'name': 'ab', 'shapes': [{'kind': 1}]}, 'shapes[0].kind', "'circle' or 'square', got 1"),
         ({'name': 'ab', 'shapes': [{'kind': 'square'}]}, 'shapes[0].side', 'missing'),
-        ({'name': 'ab', 'frame': {'radius': 0}}, 'frame.radius', 'must be greater than 0, got 0'),
         ({'name': 'ab', 'frame': {'radius': 10.0}}, 'frame.radius', 'less than 10, got 10.0'),
-        ({'name': 'ab', 'frame': {'radius': float('inf')}}, 'frame.radius', 'finite number'),
-        ({'name': 'ab', 'frame': {'radius': '1'}}, 'frame.radius', "valid number, got '1'"),
     ],
 )
 def test_the_message_about_a_wrong_value_names_its_key(data, key, message):

@@ -41,7 +41,6 @@ def test_a_good_recording_has_no_findings(tmp_path):
     result = survey(tmp_path / 'bag', up_and_down(5.0, 35.0))
     assert result.findings == []
     assert result.n == 18000
-    assert not any('gaps' in text or 'do not rise' in text for text in result.findings)
     assert result.rate_hz == pytest.approx(5.0)
     assert result.n_still == 1
     assert result.still_s == pytest.approx(3600.0, abs=15.0)
