@@ -198,31 +198,6 @@ def test_the_claimed_sd_of_nine_positions_includes_turn_on_offsets(rng):
     assert np.sqrt(np.mean(pulls(found, PLAIN) ** 2)) < 1.55
 
 
-@pytest.mark.slow
-def test_compensated_samples_are_refused_and_raw_samples_without_drift_are_fitted(rng):
-    # WHY: compensated samples, and a triad without drift, were fitted without a message.
-    program = parse_cyclogram('20 10min, 45@1.5 15min, 5@1.5 15min')
-    records = records_of(PLAIN, positions(9, 1), 4, program)
-    bias, scale, M = PLAIN.bias_at_reference, PLAIN.scale_factor, np.array(PLAIN.M)
-
-    def fit_of(correct, **options):
-        recorded = [(stamps, correct(n), *rest) for stamps, n, *rest in map(arrays_of, records)]
-        sources = [source_of(*record, name=str(k)) for k, record in enumerate(recorded)]
-        options |= {'gravity': STANDARD_GRAVITY, 'groups': ('curve',)}
-        return fit(sources, FitOptions(**options))
-
-    def force(counts):
-        # Noise of 5e-4 m/s^2 is added, so that rounding of the counts is not visible.
-        return ((counts - bias) / scale) @ M.T + 5e-4 * rng.standard_normal(counts.shape)
-
-    raw = fit_of(lambda counts: counts)
-    assert raw.residuals[-1].raw.rms / MICRO_G < 5.0
-    with pytest.raises(FitError, match=r'nothing to correct: over \d\d K .*--allow compensated'):
-        fit_of(force, input='m/s^2')
-    with pytest.raises(FitError, match='nothing to correct'):
-        fit_of(lambda counts: np.rint(4e5 * force(counts)), full_scale=8388607.0)
-
-
 def test_bags_with_and_bags_without_a_thermometer_in_one_fit_are_refused():
     records = records_of(PLAIN, FACES, 5)
     sources = sources_of(records[:3]) + sources_of(records[3:], False, 3)
