@@ -10,11 +10,11 @@ import threading
 
 import numpy as np
 import pytest
-from builders import calibration
+from builders import calibration, equal_axes
 from conftest import ran
 
 from thermo_comp.errors import CalibrationError, RecordingError
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration import Unit
 from thermo_comp.unit.calibration_file import load_calibration, save_calibration
 
 START_NS = 1_767_225_600_000_000_000
@@ -22,7 +22,7 @@ START_NS = 1_767_225_600_000_000_000
 
 def of_kind(kind, cycle_s, path):
     full_scale, K = (32767.0, 300.0) if kind == 'counts' else (160.0, 1.0)
-    axes = Axes(*[AxisReference(K, 0.0)] * 3)
+    axes = equal_axes(K)
     save_calibration(calibration(unit=Unit('T-1', kind, full_scale, cycle_s), axes=axes), path)
     return path
 

@@ -9,7 +9,7 @@ import pytest
 from builders import axis_set, calibration, drawn, regime_set, rich_calibration, term
 
 from thermo_comp.thermal.state import BOARD, RATE, WEIGHT, StateLayout
-from thermo_comp.unit.calibration import Axes, AxisReference, AxisSet, parameter_layout
+from thermo_comp.unit.calibration import AxisSet, parameter_layout
 from thermo_comp.unit.correction import VARIANCES, Correction
 from thermo_comp.unit.covariance import N_ROWS
 from thermo_comp.unit.functions import CubicSpline, Exponential, Polynomial
@@ -17,10 +17,7 @@ from thermo_comp.unit.prediction import SlowUncertainty
 
 
 def test_a_state_beyond_the_edge_of_a_column_is_limited_and_increases_the_sd():
-    unit = calibration(
-        axes=Axes(*[AxisReference(300.0, 0.0)] * 3),
-        response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),),
-    )
+    unit = calibration(response=(term('gradient', (30.0, 0.0, 0.0), range=(-1.0, 1.0)),))
     correction = Correction(unit)
     inside, outside = ((20.0, 0.0, 0.0, 0.0, 0.0, g, 0.0) for g in (1.0, 3.0))
     edge, beyond = (correction.line(s, s, np.zeros(N_ROWS), 0.0) for s in (inside, outside))

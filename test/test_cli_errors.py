@@ -6,12 +6,11 @@ import re
 
 import numpy as np
 import pytest
-from builders import axis_set, calibration, regime_set, rich_calibration
+from builders import axis_set, calibration, equal_axes, regime_set, rich_calibration
 from conftest import ROOT, parsed
 
 from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
-from thermo_comp.unit.calibration import Axes, AxisReference
 from thermo_comp.unit.calibration_file import save_calibration
 
 TOPICS = Topics()
@@ -178,7 +177,7 @@ class TestEvaluations:
         # The second calibration is right: its level of +10 mg cancels biases of -10 mg.
         right = axis_set(delta=30.0)
         sets = regime_set(right, right, right)
-        axes = Axes(*[AxisReference(300.0, -30.0)] * 3)
+        axes = equal_axes(300.0, -30.0)
         save_calibration(
             calibration(axes=axes, static=sets, dynamic=sets), tmp_path / 'right.yaml'
         )

@@ -4,19 +4,24 @@
 
 import numpy as np
 import pytest
-from builders import SECOND_NS, axis_set, calibration, regime_set, rich_calibration
-from test_compensator import warm
+from builders import (
+    SECOND_NS,
+    UNCHECKED,
+    axis_set,
+    calibration,
+    equal_axes,
+    regime_set,
+    rich_calibration,
+    warm,
+)
 
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
-from thermo_comp.unit.calibration import Axes, AxisReference
 
 
 def test_a_switch_of_sets_causes_no_step():
     # The output changes by 5 counts = 1.7 mg within 300 s, at most 0.28 ug per sample at 20 Hz.
     unit = calibration(dynamic=regime_set(axis_set(delta=5.0)))
-    compensator = Compensator(
-        unit, CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
-    )
+    compensator = Compensator(unit, UNCHECKED)
     outputs = []
     for k in range(40_000):
         stamp = k * 50_000_000
@@ -46,7 +51,7 @@ def test_a_swap_of_calibrations_takes_effect_between_two_samples():
     compensator = Compensator(calibration())
     warm(compensator, until_s=5)
     before = compensator.process(5 * SECOND_NS, 300.0, 0.0, 1.0)
-    compensator.swap(calibration(axes=Axes(*[AxisReference(150.0, 0.0)] * 3)))
+    compensator.swap(calibration(axes=equal_axes(150.0)))
     after = compensator.process(5 * SECOND_NS + 1, 300.0, 0.0, 1.0)
     assert (before[0], after[0]) == (1.0, 2.0)
 

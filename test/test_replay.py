@@ -8,7 +8,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from builders import calibration, rich_calibration
+from builders import calibration, equal_axes, rich_calibration
 from recording_helpers import OTHER, Message, regular_messages, write_rosbag1
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -20,7 +20,7 @@ from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.replay import ReplayResult, replay
 from thermo_comp.topics import IMU_OUT, REGIME
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration import Unit
 
 TOPICS = Topics()
 START_NS = 1_767_225_600_000_000_000
@@ -97,7 +97,7 @@ def test_replay_of_constants_needs_no_thermometer(tmp_path):
     stamps = START_NS + np.arange(n) * 10_000_000
     with BagWriter(bag) as writer:
         writer.write_counts(TOPICS.counts, stamps, 2940.0 + rng.standard_normal((n, 3)), 'imu')
-    constants = calibration(axes=Axes(*[AxisReference(510.0, 5.0)] * 3))
+    constants = calibration(axes=equal_axes(510.0, 5.0))
     replay(bag, constants, tmp_path / 'out')
     source = read_recording(bag, require=('accel',)).columns
     block, flags = output_of(tmp_path / 'out')

@@ -6,18 +6,24 @@ import math
 
 import numpy as np
 import pytest
-from builders import GRAVITY, SECOND_NS, calibration, columns_from_events
+from builders import (
+    GRAVITY,
+    SECOND_NS,
+    UNCHECKED,
+    assert_equal_bits,
+    calibration,
+    equal_axes,
+    stream,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermo_comp.online.batch import process_block
 from thermo_comp.online.checks import STUCK_SAMPLES, StuckCheck
 from thermo_comp.online.compensator import Compensator, CompensatorConfig
-from thermo_comp.unit.calibration import Axes, AxisReference, Unit
+from thermo_comp.unit.calibration import Unit
 
 K = 300.0
 UP = (0.36, -0.48, 0.8)
-UNIQUE = [0, 1, 2, 4, 5, 8]
 
 
 def at_rest(rng, bias=0.0):
@@ -30,19 +36,6 @@ def readings(second):
         ('board', second * SECOND_NS, 20.0 + flicker),
         ('case', second * SECOND_NS, 20.0 - flicker),
     ]
-
-
-def run(compensator, events):
-    stamps, rows = [], []
-    for kind, stamp_ns, value in events:
-        if kind == 'accel':
-            row = compensator.process(stamp_ns, *value)
-            if row is not None:
-                stamps.append(stamp_ns)
-                rows.append(row)
-        else:
-            compensator.push(kind, stamp_ns, value)
-    return stamps, rows
 
 
 def recording(n, rate_hz, sample, start_ns=0):
@@ -61,7 +54,7 @@ def recording(n, rate_hz, sample, start_ns=0):
 def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
     compensator = Compensator(calibration())
     stuck = at_rest(rng)
-    run(compensator, recording(STUCK_SAMPLES, 1.0, lambda _: stuck))
+    stream(compensator, recording(STUCK_SAMPLES, 1.0, lambda _: stuck))
     assert compensator.counters.n_stuck == 0
 
 
@@ -115,7 +108,7 @@ def test_a_constant_axis_is_stuck_if_the_other_axes_change(axis, value):
         counts[axis] = value
         return tuple(counts)
 
-    run(compensator, recording(1000, 100.0, sample))
+    stream(compensator, recording(1000, 100.0, sample))
     assert compensator.counters.n_out == 201  # two seconds
     assert compensator.counters.n_stuck == 799
 
@@ -123,7 +116,7 @@ def test_a_constant_axis_is_stuck_if_the_other_axes_change(axis, value):
 def test_a_constant_axis_at_rest_is_not_stuck(rng):
     compensator = Compensator(calibration())
     # Noise is below a rounding step: x is constant, y and z are at an edge and alternate.
-    run(
+    stream(
         compensator,
         recording(
             5000,
@@ -139,10 +132,8 @@ def test_a_constant_axis_at_rest_is_not_stuck(rng):
 
 
 def test_checks_of_samples_can_be_switched_off():
-    compensator = Compensator(
-        calibration(), CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
-    )
-    run(compensator, recording(1000, 100.0, lambda _: (0.0, 0.0, 0.0)))
+    compensator = Compensator(calibration(), UNCHECKED)
+    stream(compensator, recording(1000, 100.0, lambda _: (0.0, 0.0, 0.0)))
     assert compensator.counters.n_out == 1000
 
 
@@ -153,16 +144,14 @@ def test_samples_in_bursts_are_not_taken_for_too_fast(rng):
         events += readings(burst) if burst % 2 == 0 else []
         stamp_ns = burst * SECOND_NS // 2
         events += [('accel', stamp_ns + 1000 * k, at_rest(rng)) for k in range(1, 51)]
-    run(compensator, events)
+    stream(compensator, events)
     assert compensator.counters.n_too_fast == 0
 
 
 def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
-    unit = calibration(
-        unit=Unit('T-1', 'm/s^2', 100.0, 0.01), axes=Axes(*[AxisReference(1.0, 0.0)] * 3)
-    )
+    unit = calibration(unit=Unit('T-1', 'm/s^2', 100.0, 0.01), axes=equal_axes(1.0))
     compensator = Compensator(unit)
-    _, rows = run(
+    rows, _ = stream(
         compensator,
         recording(8000, 400.0, lambda _: tuple(GRAVITY * u + rng.normal(0.0, 1e-3) for u in UP)),
     )
@@ -175,7 +164,7 @@ def test_the_variance_of_samples_in_m_s2_is_proportional_to_their_rate(rng):
 def test_the_gravity_check_uses_local_gravity_or_that_of_the_calibration(rng):
     for local, expected in ((0.0, 0.0), (GRAVITY + 2e-3, -2e-3)):
         compensator = Compensator(calibration(), CompensatorConfig(local_gravity_m_s2=local))
-        run(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
+        stream(compensator, recording(6000, 100.0, lambda _: at_rest(rng)))
         gravity = compensator.status().gravity
         # The tolerance is that of a mean of 110 samples with a noise of 1.4 mm/s^2, and rounding.
         assert gravity.residual == pytest.approx(expected, abs=5 * 1.4e-3 / math.sqrt(110) + 2e-4)
@@ -215,20 +204,7 @@ def stretches(draw):
 @settings(max_examples=60, deadline=None)
 def test_the_batch_drops_the_samples_that_the_stream_drops(events, chunk, stuck_s):
     config = CompensatorConfig(stuck_timeout_s=stuck_s, gravity_tolerance_m_s2=0.1)
-    unit = calibration(axes=Axes(*[AxisReference(K, 60.0)] * 3))
-    streamed, whole, cut = (Compensator(unit, config) for _ in range(3))
-    stamps, rows = run(streamed, events)
-    blocks = [process_block(whole, columns_from_events(events))]
-    pieces = [
-        process_block(cut, columns_from_events(events[k : k + chunk]))
-        for k in range(0, len(events), chunk)
-    ]
-    for parts in (blocks, pieces):
-        assert np.concatenate([part.stamp_ns for part in parts]).tolist() == stamps
-        table = np.array(rows).reshape(-1, 9)
-        force = np.concatenate([part.specific_force for part in parts])
-        covariance = np.concatenate([part.covariance for part in parts])
-        np.testing.assert_array_equal(force, table[:, :3])
-        np.testing.assert_array_equal(covariance[:, UNIQUE], table[:, 3:])
-    assert streamed.counters == whole.counters == cut.counters
-    assert streamed.status() == whole.status() == cut.status()
+    unit = calibration(axes=equal_axes(K, 60.0))
+    _, _, compensators = assert_equal_bits(unit, config, events, chunk)
+    first, *others = (compensator.status() for compensator in compensators)
+    assert others == [first, first]

@@ -7,14 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders import GRAVITY, SECOND_NS, axis_set, calibration, regime_set, term
+from builders import GRAVITY, SECOND_NS, UNCHECKED, axis_set, calibration, regime_set, term, warm
 
 from thermo_comp.online.compensator import Compensator
-from thermo_comp.online.status import CompensatorConfig
 from thermo_comp.unit.calibration import LackOfFit
 from thermo_comp.unit.prediction import ramp_states, sd_of_states
-
-UNCHECKED = CompensatorConfig(stuck_timeout_s=0.0, gravity_tolerance_m_s2=0.0)
 
 
 def test_the_claimed_sd_covers_a_start_in_a_ramp():
@@ -73,8 +70,7 @@ def test_beyond_1_g_the_covariance_includes_an_unknown_k2():
     # Rests do not determine K2, the error proportional to the square of the force. Its assumed sd
     # is 100 ug/g^2, for forces above 1.01 g.
     compensator = Compensator(calibration(), UNCHECKED)
-    for name in ('board', 'case'):
-        compensator.push(name, 10**12, 20.0)
+    warm(compensator, start_s=1000, until_s=1001)
     at_1_g, at_4_g = (
         compensator.process(10**12 + k * 10**6, 0.0, 0.0, 300.0 * 9.80665 * force)
         for k, force in enumerate((1.0, 4.0))
