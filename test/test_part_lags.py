@@ -11,6 +11,7 @@ import pytest
 import second_simulator
 import strangers
 from accuracy import errors, fit_and_correct
+from simulation_helpers import slow
 from strangers_baselines import minutes
 from strangers_cases import (
     FULL_SCALE,
@@ -28,7 +29,6 @@ from strangers_cases import (
     soaks,
     third_node,
 )
-from strangers_helpers import slow
 from strangers_units import GRAVITY, UG, rng_of, spread
 
 from thermo_comp.fitting.population import population
