@@ -31,38 +31,30 @@ def of_kind(kind, cycle_s, path):
 
 
 def test_a_clock_topic_that_goes_back_or_pauses_does_not_change_samples(peer, tmp_path):
-    from diagnostic_msgs.msg import DiagnosticArray
-    from ros_helpers import drive, node_in_thread, stamp_of, standing
+    from ros_helpers import Samples, node_arguments, node_in_thread, stamp_of
     from rosgraph_msgs.msg import Clock
-    from sensor_msgs.msg import Imu
 
     path = of_kind('counts', 0.01, tmp_path / 'unit.yaml')
-    arguments = ['-p', f'calibration_file:={path}', '-p', 'diagnostics_period:=0.02']
-    with node_in_thread(*arguments) as node:
-        heard = peer.listen(Imu, 'imu/data_raw')
-        told = peer.listen(DiagnosticArray, '/diagnostics')
-        driver = drive(peer, node)
+    with node_in_thread(*node_arguments(path)) as node:
+        samples = Samples(peer, node)
         assert peer.set_parameters(use_sim_time=True)[0].successful
         clock = peer.publisher(Clock, '/clock')
         # /clock begins, falls by 1 h, is constant for five checks, jumps by a year, and ends.
         hour = 3600 * 10**9
         times = [START_NS, START_NS + hour, START_NS, *[START_NS] * 5, START_NS + 8760 * hour]
-        for n, now_ns in enumerate(times):
+        for now_ns in times:
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
             clock.publish(message)
-            for k in range(20 * n, 20 * n + 20):
-                if k % 10 == 0:
-                    driver.temperatures(START_NS + k * 10**7, 20.0, 20.0)
-                driver.counts(START_NS + k * 10**7, *standing(k))
-            peer.wait_for(lambda n=n: len(heard) >= 20 * n + 20, 'all samples')
+            samples.go_on()
             peer.wait_for(
-                lambda now_ns=now_ns: told and stamp_of(told[-1]) == now_ns, 'its time in reports'
+                lambda now_ns=now_ns: samples.reports and stamp_of(samples.reports[-1]) == now_ns,
+                'its time in reports',
             )
         assert peer.set_parameters(use_sim_time=False)[0].successful
-        peer.wait_for(lambda: stamp_of(told[-1]) not in times, 'the time of day')
-        stamps = [stamp_of(imu) for imu in heard]
-        assert stamps == [START_NS + k * 10**7 for k in range(20 * len(times))]
+        peer.wait_for(lambda: stamp_of(samples.reports[-1]) not in times, 'the time of day')
+        stamps = [stamp_of(imu) for imu in samples.heard]
+        assert stamps == [START_NS + k * 10**7 for k in range(20 + 20 * len(times))]
         assert node._loop.n_failures == 0
 
 

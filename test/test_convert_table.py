@@ -6,10 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from recording_helpers import typestore
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
+from recording_helpers import IMU, START_NS, TEMPERATURE, Message, write_rosbag1, write_rosbag2
 
 from thermo_comp.convert.bag import bag_log, find_topics
 from thermo_comp.convert.column_map import ColumnMap, table_log
@@ -215,44 +212,26 @@ def test_stamps_that_ros_cannot_hold_are_left_out(tmp_path, suffix, unit):
 
 G = 9.80665
 N = 400
-START_NS = 1_600_000_000_000_000_000
-IMU, TEMPERATURE, PRESSURE = (
-    f'sensor_msgs/msg/{name}' for name in ('Imu', 'Temperature', 'FluidPressure')
-)
-NAMES = {'/mpu/data': IMU, '/mpu/die': TEMPERATURE, '/baro/air': TEMPERATURE}
-
-
-def messages(ros, rng, scale, names):
-    """Yield (topic, type, log_ns, message) of a sensor at rest whose samples have norm `scale`."""
-    types = typestore(ros).types
-    vector = types['geometry_msgs/msg/Vector3']
-
-    def header(stamp_ns):
-        stamp = types['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 10**9))
-        return types['std_msgs/msg/Header'](*(() if ros == 2 else (7,)), stamp, 'mpu')
-
-    force = scale * (np.array([0.0, 0.1, 1.0]) + 0.003 * rng.standard_normal((N, 3)))
-    zeros = np.zeros(9)
-    for k in range(N):
-        now = START_NS + 10_000_000 * k
-        for topic, kind in names.items():
-            if kind == IMU:
-                attitude = types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
-                body = (attitude, zeros, vector(0.01, 0.0, 0.5), zeros, vector(*force[k]), zeros)
-                yield topic, kind, now, types[kind](header(now), *body)
-            elif k % 50 == 0:
-                value = 100.0 * len(topic) + k / 50 if kind == PRESSURE else len(topic) + k / 50
-                yield topic, kind, now, types[kind](header(now), value, 0.0)
+PRESSURE = 'sensor_msgs/msg/FluidPressure'
 
 
 def write_bag(path, rng, ros=2, scale=G):
-    store = typestore(ros)
-    new = {'version': 9, 'storage_plugin': StoragePlugin.SQLITE3}
-    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
-    with Writer1(path) if ros == 1 else Writer2(path, **new) as writer:
-        links = {t: writer.add_connection(t, kind, typestore=store) for t, kind in NAMES.items()}
-        for topic, kind, log_ns, message in messages(ros, rng, scale, NAMES):
-            writer.write(links[topic], log_ns, serialize(message, kind))
+    """Write a bag of a sensor at rest whose samples have norm `scale`."""
+    force = scale * (np.array([0.0, 0.1, 1.0]) + 0.003 * rng.standard_normal((N, 3)))
+    zeros, messages = [0.0] * 9, []
+    for k in range(N):
+        now_ns = START_NS + 10_000_000 * k
+        imu = (0.0, 0.0, 0.0, 1.0, *zeros, 0.01, 0.0, 0.5, *zeros, *force[k], *zeros)
+        messages.append(Message('/mpu/data', now_ns, now_ns, 'mpu', imu))
+        if k % 50 == 0:
+            messages += [
+                Message(topic, now_ns, now_ns, 'mpu', (len(topic) + k / 50, 0.0))
+                for topic in ('/mpu/die', '/baro/air')
+            ]
+    if ros == 1:
+        write_rosbag1(path, messages)
+    else:
+        write_rosbag2(path, messages, storage='sqlite3')
     return path
 
 
