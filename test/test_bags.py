@@ -3,14 +3,13 @@
 """The sample bags agree with bags/README.md: size, content, and the commands that make them."""
 
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 from thermo_comp.recording.reader import read_recording
 
-ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / 'bags' / 'README.md').read_text()
 COMMANDS = [line for line in README.splitlines() if line.startswith('thermo_comp ')]
 SHIPPED = sorted((ROOT / 'bags').rglob('*.mcap'))
