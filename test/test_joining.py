@@ -4,11 +4,11 @@
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from builders import ArrayBlock
+from conftest import ROOT
 
 import thermo_comp
 from thermo_comp.errors import FitError
@@ -22,7 +22,6 @@ from thermo_comp.recording.topics import Topics
 from thermo_comp.recording.writer import BagWriter
 from thermo_comp.unit.gravity import MICRO_G
 
-ROOT = Path(__file__).resolve().parent.parent
 START_NS = 1_700_000_000_123_456_789
 RATE_HZ = 100
 LEVEL = np.array([10.0, -3000.0, 50.0])  # counts
