@@ -31,8 +31,7 @@ from ..unit.provenance import Provenance, ResidualSummary
 from .claim import Claim
 from .data_checks import Finding
 from .equations import as_vector
-from .evidence import ResidualRow, group_evidence
-from .lack_of_fit import lack_of_fit
+from .evidence import ResidualRow, group_evidence, lack_of_fit
 from .layout import Layout
 from .reduction import ReducedBag
 from .regression import Regression

@@ -25,9 +25,9 @@ from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
 from .coverage import distinct_directions
 from .data_checks import POSITIONS_NEEDED, Finding
+from .evidence import drift_variance
 from .initial_triad import within_positions
 from .initialisation import initial_state
-from .lack_of_fit import drift_variance
 from .left_out import Folds
 from .options import FitOptions
 from .priors import constants_of, informative_priors, offset_sd_of, prior_model, with_calibration
