@@ -182,9 +182,10 @@ def _provenance(
     # the year 2000 (946684800 s after 1970) to now are taken for dates.
     is_date = 946684800.0 <= end_s <= now.timestamp()
     tested = datetime.fromtimestamp(end_s if is_date else 0.0, timezone.utc)
+    date_format = '%Y-%m-%dT%H:%M:%SZ'
     return Provenance(
-        created=_date_text(now),
-        tested=_date_text(tested) if is_date else '',
+        created=now.strftime(date_format),
+        tested=tested.strftime(date_format) if is_date else '',
         tool_version=__version__,
         model=fit.windows.model.name,
         sources=tuple(source for bag in bags for source in bag.sources),
@@ -202,10 +203,6 @@ def _provenance(
         ),
         notes=tuple(str(finding) for finding in findings if finding.level != 'good'),
     )
-
-
-def _date_text(date: datetime) -> str:
-    return date.strftime('%Y-%m-%dT%H:%M:%SZ')
 
 
 def blank_terms(columns: Iterable[Column]) -> tuple[ResponseTerm, ...]:

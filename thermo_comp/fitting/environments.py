@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -77,25 +76,16 @@ def _square_of_bags(fit: Fit) -> Floats:
     return Folds.of(folds.square, folds.windows, bag).square
 
 
-class Contradiction(NamedTuple):
-    """
-    Bags that contradict an earlier calibration of their unit.
-
-    bags: numbers of the bags whose drift the calibration does not explain with any lag states at
-        start; if these are more than half of the bags, numbers of all bags
-    may_update: whether the bags can update the calibration: ``|f| - g`` is far above the drift and
-        the claimed sd of |f|, so that bias or scale has changed, too, or the bags have the six
-        attitudes that determine bias and scale
-    """
-
-    bags: list[int]
-    may_update: bool
-
-
 def contradiction(
     windows: ThermalWindows, known: Calibration, options: FitOptions
-) -> Contradiction:
-    """Find the bags whose drift contradicts the calibration `known` of their unit."""
+) -> tuple[list[int], bool]:
+    """
+    Return the numbers of the bags whose drift the calibration `known` of their unit does not
+    explain with any lag states at start, or of all bags if these are more than half of the bags;
+    and whether the bags can update `known`: ``|f| - g`` is far above the drift and the claimed sd
+    of |f|, so that bias or scale has changed, too, or the bags have the six attitudes that
+    determine bias and scale.
+    """
     data = replace(windows.data, tilt=windows.data.tilt[:, :0])
     regression, state = _at_calibration(known, data, options.gravity)
     first = next(informative_priors(known, regression, state, windows.model, options))
@@ -130,7 +120,7 @@ def contradiction(
         # All bags are of one environment, whose effect on drifts is small in some attitudes.
         is_far[:] = True
     may_update |= len(distinct_directions(state.up)) >= POSITIONS_NEEDED
-    return Contradiction(np.flatnonzero(is_far).tolist(), may_update)
+    return np.flatnonzero(is_far).tolist(), may_update
 
 
 def _at_calibration(

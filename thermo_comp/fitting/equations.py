@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import wraps
-from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -31,26 +31,21 @@ from .series import Base, Series
 from .tangent import Tangent
 from .unknowns import Prior, State, Windows
 
-_Self = TypeVar('_Self')
-_Given = ParamSpec('_Given')
-_Result = TypeVar('_Result')
+_Method = TypeVar('_Method', bound=Callable[..., object])
 
 
-def last_result_kept(
-    method: Callable[Concatenate[_Self, _Given], _Result],
-) -> Callable[Concatenate[_Self, _Given], _Result]:
+def last_result_kept(method: _Method) -> _Method:
     """Keep the last result of a method, and return it if the arguments are the same objects."""
     name = f'_last_{method.__name__}'
 
     @wraps(method)
-    def kept(self: _Self, /, *args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
-        last: tuple[tuple[object, ...], _Result] | None = self.__dict__.get(name)
+    def kept(self: object, *args: object) -> object:
+        last = self.__dict__.get(name)
         if last is None or any(a is not b for a, b in zip(last[0], args, strict=True)):
-            last = args, method(self, *args, **kwargs)
-            self.__dict__[name] = last
+            last = self.__dict__[name] = args, method(self, *args)
         return last[1]
 
-    return kept
+    return cast(_Method, kept)
 
 
 class Effects(NamedTuple):
@@ -92,6 +87,7 @@ class Equations(Series):
 
     def initial_state(self, bias: Floats, misalignment: Floats, up: Floats) -> State:
         """Return a state with nominal scale factors and no effect of temperature."""
+        poses = [up[self.windows.pose == k].mean(axis=0) for k in range(self.windows.n_poses)]
         return State(
             kappa=np.ones(3),
             bias=bias,
@@ -105,7 +101,7 @@ class Equations(Series):
             nonlinear=np.zeros((3, self.n_coefficients)),
             radius=np.zeros(1),
             stretch=np.zeros((len(up), 1)),
-            pose=_poses(up, self.windows.pose, self.windows.n_poses),
+            pose=_unit_vector(np.reshape(poses, (-1, 3))),
             pose_of=np.zeros(0, np.int64) if self.windows.pose is None else self.windows.pose,
         )
 
@@ -134,9 +130,8 @@ class Equations(Series):
             has_lags = bool((self.windows.lag[used.any(axis=0)] >= 0).any())
             n_tilts, n_starts = self.windows.tilt.shape[1], self.start_root.shape[1] * has_lags
             self._layouts[key] = lay_out(
-                *(used, self.bag_of_position, n_tilts, n_starts, nonlinear, self.forces),
-                pose_of=self.windows.pose,
-                has_turn_ons=self.has_turn_ons,
+                *(used, nonlinear, self.bag_of_position, self.windows.pose),
+                *(n_tilts, n_starts, self.has_turn_ons, self.forces),
             )
         return self._layouts[key]
 
@@ -351,12 +346,6 @@ def with_step(state: State, step: Floats, layout: Layout) -> State:
     up = _unit_vector(state.up + np.einsum('pij,pj->pi', state.tangents, turn))
     added = {name: getattr(state, name) + padded[getattr(layout, name)] for name in _added(layout)}
     return without_inactive(replace(state, up=up, pose=pose, **added), layout)
-
-
-def _poses(up: Floats, pose_of: Ints | None, n_poses: int) -> Floats:
-    """Return the mean attitude of the positions of each pose, shape (n_poses, 3)."""
-    means = [up[pose_of == k].mean(axis=0) for k in range(n_poses)]
-    return _unit_vector(np.array(means).reshape(-1, 3))
 
 
 def _by_poses(by_rotation: Floats, layout: Layout) -> Floats:

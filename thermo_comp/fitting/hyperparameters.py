@@ -21,7 +21,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,6 +82,10 @@ def _updated(
     Move all prior sd and white noises towards their modes; return also the largest change of a
     logarithm, that of the tilts' sd divided by 3, and that of the lag states' variance by 4.
     """
+
+    def change(new: Floats | float, old: Floats | float) -> float:
+        return float(np.max(np.abs(np.log(new / old)), initial=0.0))
+
     prior, state, layout = posterior.prior, posterior.state, posterior.layout
     sd, determined = prior.column_sd, posterior.determined
     moves = (sd > 0.0) & ~candidates.fixed
@@ -92,19 +95,16 @@ def _updated(
     step = _toward(effective, np.sum(state.weights**2, axis=1), safe, slope, 1.0 / LOG_VARIANCE)
     new = np.where(moves, np.minimum(safe * np.exp(step), candidates.largest), sd)
     is_informed = moves & (effective > 0.3)
-    changes = [float(np.abs(np.log(np.where(is_informed, new / safe, 1.0))).max(initial=0.0))]
-    offset_sd, change = _offset_sd(posterior, prior.offset_sd, posterior.layout.offset)
-    changes.append(change)
-    turn_on_sd = prior.turn_on_sd
+    offset_sd, offset_change = _offset_sd(posterior, prior.offset_sd, layout.offset)
+    turn_on_sd, turn_on_change = prior.turn_on_sd, 0.0
     if prior.informative is None:
         # With a prior calibration the sd of turn-on offsets keeps its value, because the few
         # turn-ons of an update do not separate turn-on offsets from the ageing of the bias.
-        turn_on_sd, change = _offset_sd(posterior, turn_on_sd, posterior.layout.turn_on)
-        changes.append(change)
-    tilt_sd, change = _tilt_sd(posterior, float(regression.windows.kelvins[0]))
-    changes.append(change)
-    pose_sd, change = _pose_sd(posterior)
-    changes.append(change)
+        turn_on_sd, turn_on_change = _offset_sd(posterior, turn_on_sd, layout.turn_on)
+    tilt_sd, pose_sd = (
+        _tilt_sd(posterior, float(regression.windows.kelvins[0])),
+        _pose_sd(posterior),
+    )
     misalignment_sd = prior.misalignment_sd
     if prior.informative is None and not prior.unseen_misalignment_sd:
         # Three elements of M determine their sd poorly. The built-in sd therefore counts as a
@@ -124,10 +124,7 @@ def _updated(
         if gamma <= -1.0:
             raise np.linalg.LinAlgError('rounding errors exceed the information about lag states')
         start_ratio = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
-        changes.append(float(np.abs(np.log(start_ratio / prior.start_variance_ratio))) / 4.0)
-    sigma = white_noise(regression, posterior)
-    changes.append(float(np.abs(np.log(sigma / prior.sigma)).max()))
-    return replace(
+    moved = replace(
         prior,
         column_sd=new,
         offset_sd=offset_sd,
@@ -135,39 +132,44 @@ def _updated(
         tilt_sd=tilt_sd,
         pose_sd=pose_sd,
         misalignment_sd=misalignment_sd,
-        sigma=sigma,
+        sigma=white_noise(regression, posterior),
         start_variance_ratio=start_ratio,
-    ), max(changes)
+    )
+    return moved, max(
+        change(new[is_informed], sd[is_informed]),
+        *(offset_change, turn_on_change, change(pose_sd, prior.pose_sd)),
+        # An error of 15 % of the sd of tilts hardly changes the fit.
+        change(tilt_sd, prior.tilt_sd) / 3.0,
+        change(start_ratio, prior.start_variance_ratio) / 4.0,
+        change(moved.sigma, prior.sigma),
+    )
 
 
-def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> tuple[float, float]:
+def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
     """
-    Move the sd of the supports' tilts towards the mode; return also a third of the change of log
-    sd. `kelvins`: RMS of the board temperature about the reference [K]
+    Move the sd of the supports' tilts towards the mode. `kelvins`: RMS of the board temperature
+    about the reference [K]
     """
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
-        return sd, 0.0
+        return sd
     # The scale of the half-normal prior of the tilts' sd is 15 urad/K, for unevenly heated
     # aluminium of 23 ppm/K, times the RMS temperature, or times 1 K if this is larger.
     square = (sd / (1.5e-5 * max(kelvins, 1.0))) ** 2
     effective = posterior.determined[posterior.layout.tilt].sum()
     step = _toward(effective, np.sum(tilt**2), sd, square - 1.0, 2.0 * square)
-    # An error of 15 % of the sd of tilts hardly changes the fit, so a third of the change of log
-    # sd is compared with the limit of convergence, 0.05.
-    return float(sd * np.exp(step)), float(np.abs(step)) / 3.0
+    return float(sd * np.exp(step))
 
 
-def _pose_sd(posterior: PosteriorMode) -> tuple[float, float]:
-    """Move the sd of attitudes about poses towards the mode; return also the change of log sd."""
+def _pose_sd(posterior: PosteriorMode) -> float:
+    """Move the sd of attitudes about poses towards the mode."""
     sd, layout = posterior.prior.pose_sd, posterior.layout
     if not layout.pose.size:
-        return sd, 0.0
+        return sd
     effective = posterior.determined[layout.posed].sum()
     power = np.sum(posterior.state.from_pose**2)
     slope = np.log(sd / POSE_SD) / LOG_VARIANCE
-    step = _toward(effective, power, sd, slope, 1.0 / LOG_VARIANCE)
-    return float(sd * np.exp(step)), float(np.abs(step))
+    return float(sd * np.exp(_toward(effective, power, sd, slope, 1.0 / LOG_VARIANCE)))
 
 
 def _toward(
@@ -249,9 +251,9 @@ def with_slow_noise(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> PosteriorMode:
     """Estimate slow noise from the residuals, then by log evidence; refit with this noise."""
-    prior = posterior.prior
+    prior, whitener = posterior.prior, regression.whitener
     residual = regression.residual(posterior.state, posterior.layout) / prior.sigma
-    estimated = regression.whitener.estimate(residual, regression.weight)
+    estimated = whitener.estimate(residual, regression.weight)
     if estimated == prior.noise:
         return posterior
 
@@ -262,38 +264,29 @@ def with_slow_noise(
             trial = replace(trial, sigma=white_noise(regression, fitted))
         return replace(fitted, prior=trial)
 
+    def likeliest(n_times: int) -> PosteriorMode:
+        # Search the largest log evidence over the variance ratio and the correlation time, in
+        # steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
+        best, step = with_noise(estimated._replace(n_times=n_times)), 3.0
+        while step > 3.0**0.2:
+            ratio, time_s, _ = best.prior.noise
+            factors = (step, 1.0), (1.0 / step, 1.0), (1.0, step), (1.0, 1.0 / step)
+            around = (
+                with_noise(Noise(ratio * by_ratio, time_s * by_time, n_times))
+                for by_ratio, by_time in factors
+                if whitener.shows(time_s * by_time)
+            )
+            better = next((fit for fit in around if fit.log_evidence > best.log_evidence), None)
+            step, best = (step**0.5, best) if better is None else (step, better)
+        return best
+
     # The parameters absorb a part of the noise, so residuals underestimate the noise; the log
     # evidence does not. All accelerometers have flicker noise, so noise with one correlation time
     # is chosen only if its log evidence exceeds that of flicker noise by `CLEAR_GAIN`.
-    kinds = (estimated._replace(n_times=n) for n in (1, regression.whitener.n_flicker))
-    single, best = (_likeliest(with_noise, regression.whitener.shows, noise) for noise in kinds)
+    single, best = likeliest(1), likeliest(whitener.n_flicker)
     if single.log_evidence > best.log_evidence + CLEAR_GAIN:
         best = single
     return settle(regression, best.state, best.prior, candidates)
-
-
-def _likeliest(
-    with_noise: Callable[[Noise], PosteriorMode], shows: Callable[[float], bool], noise: Noise
-) -> PosteriorMode:
-    """
-    Search the variance ratio and the correlation time of the largest log evidence, beginning at
-    `noise`, in steps of a factor of 3, then of 3^(1/2) and 3^(1/4).
-    """
-    best, step = with_noise(noise), 3.0
-    while step > 3.0**0.2:
-        ratio, time_s, n_times = best.prior.noise
-        factors = (step, 1.0), (1.0 / step, 1.0), (1.0, step), (1.0, 1.0 / step)
-        around = (
-            with_noise(Noise(ratio * by_ratio, time_s * by_time, n_times))
-            for by_ratio, by_time in factors
-            if shows(time_s * by_time)
-        )
-        better = next((fit for fit in around if fit.log_evidence > best.log_evidence), None)
-        if better is None:
-            step = step**0.5
-        else:
-            best = better
-    return best
 
 
 def pruned_fit(

@@ -11,19 +11,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
 from ..recording.blocks import Block
 from .reduction import Readings, ReducedBag, StillInterval
 from .sources import FitSource
-
-#: Longest gap or overlap of two parts of one recording [s]; switching off and on takes longer.
-CONTINUED_S = 3.0
-#: Number of windows before the end of a part, and after it, whose steps are compared with the step
-#: between the two parts.
-_N_COMPARED = 20
 
 
 def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
@@ -48,9 +42,11 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     # A bag with known |f| is not joined, because times of |f| count from the start of the bag.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
-    # The overlap is at most a tenth of a part: recordings whose stamps all begin at 0 exceed this.
-    overlap_s = min(CONTINUED_S, 1e-10 * (part.end_ns - part.start_ns))
-    is_next = -overlap_s < gap_s < max(CONTINUED_S, 2.0 * bag.cycle_s)
+    # Longest gap or overlap of two parts [s]; switching off and on takes longer. The overlap is at
+    # most a tenth of a part: recordings whose stamps all begin at 0 exceed this.
+    longest_s = 3.0
+    overlap_s = min(longest_s, 1e-10 * (part.end_ns - part.start_ns))
+    is_next = -overlap_s < gap_s < max(longest_s, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)
 
 
@@ -75,9 +71,6 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
         for source in sources:
             yield from source.blocks()
 
-    def total(name: str) -> int:
-        return sum(getattr(part, name) for part in parts)
-
     source = FitSource(
         f'{sources[0].name} .. {sources[-1].name}',
         blocks,
@@ -85,6 +78,8 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
         reader=sources[-1].reader,
     )
     rates = {part.angular_rate for part in parts}
+    names = {field.name for field in fields(first) if field.name.startswith('n_')}
+    totals = {name: sum(getattr(part, name) for part in parts) for name in names - {'n_spikes'}}
     torn = [f'{part.info.path}: {part.info.truncated}' for part in parts if part.info.truncated]
     return replace(
         first,
@@ -96,13 +91,6 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
             name: _readings([part.temperatures.get(name, Readings()) for part in parts])
             for name in dict.fromkeys(name for part in parts for name in part.temperatures)
         },
-        n_samples=total('n_samples'),
-        n_dropped=total('n_dropped'),
-        n_saturated=total('n_saturated'),
-        n_cells=total('n_cells'),
-        n_still_cells=total('n_still_cells'),
-        n_glitches=total('n_glitches'),
-        n_repeated=total('n_repeated'),
         n_spikes=sum((Counter(part.n_spikes) for part in parts), Counter()),
         is_integer=all(part.is_integer for part in parts),
         middle=max(part.middle for part in parts),
@@ -110,6 +98,7 @@ def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
         max_abs=max(part.max_abs for part in parts),
         angular_rate=rates.pop() if len(rates) == 1 else 'part',
         info=replace(first.info, end_ns=last.info.end_ns, truncated='; '.join(torn) or None),
+        **totals,
     )
 
 
@@ -143,13 +132,14 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
 def _is_one_rest(before: StillInterval, after: StillInterval, window_s: float) -> bool:
     """
     Whether a rest continues in the next part: the gap is at most three windows long, and on each
-    axis the step between the parts is at most five times the RMS step from window to window, or at
-    most twice the largest step from window to window (most steps may be 0 by rounding).
+    axis the step between the parts is at most five times the RMS step between windows, or at most
+    twice the largest such step (most steps may be 0 by rounding), in the 20 windows before the end
+    of a part and after it; at least 10 steps must be known.
     """
     gap_s = 1e-9 * (after.start_ns - before.end_ns)
-    means = before.mean[: before.n_whole][-_N_COMPARED:], after.mean[:_N_COMPARED]
+    means = before.mean[: before.n_whole][-20:], after.mean[:20]
     steps = np.concatenate([np.diff(mean, axis=0) for mean in means])
-    if gap_s > 3.0 * window_s or not before.n_whole or len(steps) < _N_COMPARED // 2:
+    if gap_s > 3.0 * window_s or not before.n_whole or len(steps) < 10:
         return False
     usual = np.maximum(5.0 * np.sqrt(np.mean(steps**2, axis=0)), 2.0 * np.abs(steps).max(axis=0))
     return bool(np.all(np.abs(means[1][0] - means[0][-1]) <= usual))

@@ -126,14 +126,13 @@ class Layout:
 
 def lay_out(
     used: Bools,
+    active: Bools,
     bag_of_position: Ints,
+    pose_of: Ints | None,
     n_tilts: int,
     n_starts: int,
-    active: Bools,
-    forces: Forces | None = None,
-    *,
-    pose_of: Ints | None = None,
-    has_turn_ons: bool = False,
+    has_turn_ons: bool,
+    forces: Forces | None,
 ) -> Layout:
     """
     Assign an index to every unknown, given the active columns of bias and scale, shape (2, m), and

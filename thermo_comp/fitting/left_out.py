@@ -313,19 +313,13 @@ def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
     return point.with_step(step).state, inverse_root(factor)
 
 
-def _is_determined(by_others: float, by_all: float) -> bool:
-    """
-    Whether `by_others`, the variance of a position's norm or drift by a fit without this position,
-    is below ten times `by_all`, the sum of this variance by a fit of all positions and of the
-    variance of mounting offset or noise.
-    """
-    return by_others < 10.0 * by_all
-
-
 def _is_drift_determined(
     point: Point, posterior: PosteriorMode, root: Floats, rows: slice
 ) -> bool:
-    """Whether a fit of covariance ``root @ root.T`` determines the left-out drift in `rows`."""
+    """
+    Whether the variance of the left-out drift in `rows`, by a fit of covariance ``root @ root.T``,
+    is below ten times the sum of this variance by a fit of all positions and of the noise.
+    """
     regression, sigma = point.regression, point.prior.sigma
     if not point.layout.used[0].any():
         return True
@@ -339,13 +333,13 @@ def _is_drift_determined(
         by_others += float(np.sum((along @ root[at]) ** 2))
         by_all += float(np.sum((along @ posterior.root[at]) ** 2))
     noise = float(np.sum(sigma**2)) * len(some)
-    return _is_determined(by_others, by_all + noise)
+    return by_others < 10.0 * (by_all + noise)
 
 
 def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p: int) -> bool:
     """
-    Whether a fit without position `p`, with the covariance ``root @ root.T`` of the unit,
-    determines the norm of `p`.
+    Whether the variance of the norm of position `p`, by a fit of covariance ``root @ root.T``, is
+    below ten times the sum of this variance by a fit of all positions and of the offsets.
     """
     if not point.regression.gravity:
         return False
@@ -353,7 +347,7 @@ def _is_norm_determined(point: Point, posterior: PosteriorMode, root: Floats, p:
     by_all = float(np.sum((along @ posterior.root) ** 2)) + point.prior.offset_sd**2
     if point.regression.has_turn_ons:
         by_all += point.prior.turn_on_sd**2
-    return _is_determined(float(np.sum((along @ root) ** 2)), by_all)
+    return float(np.sum((along @ root) ** 2)) < 10.0 * by_all
 
 
 def _by_sections(

@@ -105,39 +105,27 @@ class Point:
         return self.normal.square
 
     @cached_property
-    def misfit(self) -> float:
-        """-2 times the log density of the data given the state, up to a constant."""
+    def energy(self) -> float:
+        """-2 times the log posterior density, without the normalisation of the prior."""
         n, sigma = len(self.regression.weight), self.prior.sigma
         each = self.square / sigma**2 + 2.0 * n * np.log(sigma)
-        return float((each + self.regression.noise_determinant).sum())
-
-    @cached_property
-    def prior_misfit(self) -> float:
-        """-2 times the log prior density of the state, without the prior's normalisation."""
-        size = float(self.precision @ self.deviation**2)
+        of_data = float((each + self.regression.noise_determinant).sum())
+        of_prior = float(self.precision @ self.deviation**2)
         if self.prior.informative is not None:
             # `precision` is 0 for unknowns with an informative prior, so add their term.
             root = self.prior.informative.root
-            size += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
-        if self._has_common_start:
-            size += float(np.sum(self.state.start.sum(axis=0) ** 2)) / self._common_variance
-        return size
-
-    @property
-    def energy(self) -> float:
-        """-2 times the log posterior density of the state, up to a constant."""
-        return self.misfit + self.prior_misfit
-
-    @property
-    def _has_common_start(self) -> bool:
-        return self.regression.n_bags > 1 and bool(self.layout.start.size)
+            of_prior += float(np.sum((root @ self.deviation[: self.layout.n_unit]) ** 2))
+        if self._common_variance:
+            of_prior += float(np.sum(self.state.start.sum(axis=0) ** 2)) / self._common_variance
+        return of_data + of_prior
 
     @property
     def _common_variance(self) -> float:
-        """Prior variance of the sum, over the bags, of an initial lag state."""
+        """Prior variance of the sum, over the bags, of an initial lag state; 0 if not used."""
         # The prior sd of the mean of a lag state over the bags is 0.1 times its sd in one bag: a
         # mean that differs from 0 is an effect of the unit.
-        return (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
+        is_used = self.regression.n_bags > 1 and bool(self.layout.start.size)
+        return is_used * (0.1 * self.regression.n_bags) ** 2 * self.prior.start_variance_ratio
 
     @cached_property
     def reduced(self) -> Reduced:
@@ -165,10 +153,9 @@ class Point:
     def _reduced(self, normal: Normal, deviation: Floats) -> Reduced:
         in_sigmas = normal.scaled(self.prior.sigma**-2.0)
         reduced = eliminate(in_sigmas, self.layout, self.precision, deviation)
-        if self._has_common_start:
-            total = self.state.start.sum(axis=0)
-            reduced = reduced.with_prior_of_sum(total, self._common_variance)
-        return reduced
+        if not self._common_variance:
+            return reduced
+        return reduced.with_prior_of_sum(self.state.start.sum(axis=0), self._common_variance)
 
     def without_each(self) -> Iterator[tuple[Ints, Floats]]:
         """
@@ -278,7 +265,7 @@ class Point:
         if reduced.common is not None:
             of_prior += layout.start.shape[1] * float(np.log(prior.start_variance_ratio))
         log_hessian = 2.0 * float(np.log(np.diag(factor)).sum()) + reduced.log_determinant
-        evidence = -0.5 * (end.misfit + end.prior_misfit + log_hessian - of_prior)
+        evidence = -0.5 * (end.energy + log_hessian - of_prior)
         return PosteriorMode(
             *(prior, end.state, layout, determined, unit_root, variance, end.square, evidence)
         )
