@@ -41,7 +41,13 @@ def model_of(
             detector=options.detector or prior.detector,
             reference_temperature=reference,
         )
-    detector, sensors = options.detector or learn_detector(bags), sensors_of(bags)
+    recorded = (
+        {name for name, readings in bag.temperatures.items() if len(readings.value)}
+        for bag in bags
+    )
+    # The case thermometer, recorded or not, then all others of every bag except that of the board.
+    sensors = 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})
+    detector = options.detector or learn_detector(bags)
     columns: tuple[Column, ...] = ()
     if options.model != 'golovach':
         rests = gradients_at_rest(bags, sensors)
@@ -129,12 +135,3 @@ def _may_have_sets(selected: Selected) -> bool:
         and (trial.is_chosen or (trial.is_near and (trial.posterior.prior.sigma < limit).all()))
         for trial in selected.trials
     )
-
-
-def sensors_of(bags: Sequence[ReducedBag]) -> tuple[str, ...]:
-    """Return 'case', recorded or not, then all thermometers of every bag but board and case."""
-    recorded = (
-        {name for name, readings in bag.temperatures.items() if len(readings.value)}
-        for bag in bags
-    )
-    return 'case', *sorted(set.intersection(*recorded) - {'board', 'case'})

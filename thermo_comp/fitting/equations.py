@@ -18,10 +18,8 @@ positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,22 +28,6 @@ from .layout import Layout, lay_out
 from .series import Base, Series
 from .tangent import Tangent
 from .unknowns import Prior, State, Windows
-
-_Method = TypeVar('_Method', bound=Callable[..., object])
-
-
-def last_result_kept(method: _Method) -> _Method:
-    """Keep the last result of a method, and return it if the arguments are the same objects."""
-    name = f'_last_{method.__name__}'
-
-    @wraps(method)
-    def kept(self: object, *args: object) -> object:
-        last = self.__dict__.get(name)
-        if last is None or any(a is not b for a, b in zip(last[0], args, strict=True)):
-            last = self.__dict__[name] = args, method(self, *args)
-        return last[1]
-
-    return cast(_Method, kept)
 
 
 class Effects(NamedTuple):
@@ -135,7 +117,6 @@ class Equations(Series):
             )
         return self._layouts[key]
 
-    @last_result_kept
     def effects(self, state: State) -> Effects:
         """Return the parts of the readings that `state` predicts at the reference temperature."""
         force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
@@ -266,7 +247,6 @@ class Equations(Series):
         """Return the prior sd of the weights of each axis, shape (2, 3, m)."""
         return np.asarray(prior.column_sd[:, None] * self.windows.share)
 
-    @last_result_kept
     def precision(self, prior: Prior, layout: Layout) -> Floats:
         """Return inverse prior variances, (n,); 0 for unknowns with an informative prior."""
         result = np.zeros(layout.n)

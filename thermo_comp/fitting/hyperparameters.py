@@ -146,10 +146,7 @@ def _updated(
 
 
 def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
-    """
-    Move the sd of the supports' tilts towards the mode. `kelvins`: RMS of the board temperature
-    about the reference [K]
-    """
+    """Move the sd of tilts towards the mode; `kelvins`: RMS of the board temperature [K]."""
     sd, tilt = posterior.prior.tilt_sd, posterior.state.tilt
     if not tilt.size:
         return sd
@@ -206,10 +203,7 @@ def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> tuple[float
 
 
 def log_density(posterior: PosteriorMode) -> float:
-    """
-    Return the log evidence plus the log prior density of the sd of mountings, turn-ons and poses,
-    and of the ageing since a prior calibration.
-    """
+    """Return the log evidence plus the log prior density of the offset and pose sds and ageing."""
     prior, result = posterior.prior, posterior.log_evidence
     if prior.offset_scale:
         sd = [prior.offset_sd, *[prior.turn_on_sd] * bool(posterior.layout.turn_on.size)]

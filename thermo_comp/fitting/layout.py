@@ -75,9 +75,8 @@ class Layout:
     @cached_property
     def columns(self) -> Ints:
         """
-        Indices of the columns of a position's equations in the order of `Tangent`, for each axis,
-        shape (3, k). A position's equations have columns for the unknowns of the position, of its
-        bag and of the unit, and for the residual.
+        Indices of the columns of a position's equations (for unknowns of the position, its bag and
+        the unit, and for the residual) in the order of `Tangent`, for each axis, shape (3, k).
         """
         n_own, r = self.own.shape[1], self.start.shape[1]
         starts = np.tile(n_own + np.arange(r), (3, 1))

@@ -182,12 +182,11 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     left-out norms, if that exceeds two standard errors. `by_halves`: whether an increased error of
     left-out halves of the chamber program, a sign of too many columns, excludes a gain. Increased
     errors of left-out norms exclude a gain, and so does an increased expected error of the settled
-    bias, unless noise explains the drift. A drift that noise explains need not decrease.
+    bias, unless noise explains the drift. A drift that noise explains need not decrease: left-out
+    bags of soaks contain no effects of ramps.
     """
     *drifts, norms = _beyond_thermometer(before, after)
     drift = [gain for gain in drifts if gain]
-    # The drift of left-out positions or sections need not decrease if white noise explains it:
-    # left-out bags of soaks contain no effects of ramps.
     must_gain = [
         gain
         for gain, first, second in zip(drifts, before.kinds, after.kinds, strict=False)
@@ -203,10 +202,9 @@ def gain(before: Score, after: Score, *, by_halves: bool = True) -> float:
     is_sure = bool(must_gain) and all(gain > error for gain, error in must_gain)
     if is_sure and total > _NEGLIGIBLE_LOG_RATIO * len(drift):
         return total
-    is_sure = norms is not None and norms[0] > max(2.0 * norms[1], _NEGLIGIBLE_LOG_RATIO)
-    if is_sure and norms and all(abs(gain) < _NEGLIGIBLE_LOG_RATIO for gain, _ in drift):
-        return norms[0]
-    return 0.0
+    if norms is None or not all(abs(gain) < _NEGLIGIBLE_LOG_RATIO for gain, _ in drift):
+        return 0.0
+    return norms[0] if norms[0] > max(2.0 * norms[1], _NEGLIGIBLE_LOG_RATIO) else 0.0
 
 
 def is_worse_by_norms(before: Score, after: Score) -> bool:

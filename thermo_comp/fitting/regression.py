@@ -24,7 +24,7 @@ from scipy.linalg import solve_triangular
 
 from ..typing import Bools, Floats, Ints
 from .elimination import Reduced, eliminate, factored_with_prior, inverse_root, solved
-from .equations import Equations, last_result_kept, with_step, without_inactive
+from .equations import Equations, with_step, without_inactive
 from .gains import Inactive
 from .layout import Layout
 from .tangent import Normal, Tangent
@@ -89,7 +89,7 @@ class Point:
         """The normal equations of the linearised measurement equations."""
         return self.regression.linearised(self.state, self.layout, self.grams)[1]
 
-    @property
+    @cached_property
     def precision(self) -> Floats:
         """Inverse prior variances of all unknowns, see `Equations.precision`, shape (n,)."""
         return self.regression.precision(self.prior, self.layout)
@@ -177,7 +177,7 @@ class Point:
         """
         deviation = self.deviation.copy()
         deviation[self.layout.offset[:, axis]] -= 1.0
-        step, _ = self.unit_step(self._reduced(self.normal, deviation).full_matrix)
+        step, _ = self.unit_step(self._reduced(self.normal, deviation).matrix)
         return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
@@ -207,7 +207,7 @@ class Point:
         return self._solution(self.reduced)
 
     def _solution(self, reduced: Reduced) -> tuple[Floats, Floats]:
-        unit, factor = self.unit_step(reduced.full_matrix)
+        unit, factor = self.unit_step(reduced.matrix)
         step = np.empty(self.layout.n)
         step[: self.layout.n_unit] = unit
         step[self.layout.own], step[self.layout.of_bag] = reduced.follow(unit)
@@ -274,21 +274,24 @@ class Point:
 class Regression(Equations):
     """Gauss-Newton on the measurement equations; see `Equations` for the parameters."""
 
+    #: The arguments and results of the last call of `linearised`.
+    _linearised: tuple[State, Layout, Floats, Tangent, Normal] | None = None
+
     def at(self, state: State, prior: Prior, grams: Floats | None = None) -> Point:
         """Return the equations at a state without inactive weights, by default of all windows."""
         layout = self.layout(prior.column_sd > 0.0, prior.nonlinear_sd > 0.0)
         grams = self.products(layout.used).of_positions if grams is None else grams
         return Point(self, without_inactive(state, layout), prior, layout, grams)
 
-    @last_result_kept
     def linearised(self, state: State, layout: Layout, grams: Floats) -> tuple[Tangent, Normal]:
-        """
-        Return the equations linearised about a state, and the normal equations of the windows
-        whose sums of products are `grams`, see `Point`.
-        """
-        base = self.products(layout.used).base
-        tangent = self.tangent(state, layout, base)
-        return tangent, tangent.normal(self.products_at(grams, state, base))
+        """Return the equations linearised about a state, and their normal equations (`Point`)."""
+        last = self._linearised
+        if last is None or last[0] is not state or last[1] is not layout or last[2] is not grams:
+            base = self.products(layout.used).base
+            tangent = self.tangent(state, layout, base)
+            normal = tangent.normal(self.products_at(grams, state, base))
+            last = self._linearised = state, layout, grams, tangent, normal
+        return last[3:]
 
     def solve(self, state: State, prior: Prior, n_steps: int = 6) -> PosteriorMode:
         """Return the posterior after at most `n_steps` steps from `state` to the mode."""
@@ -330,7 +333,7 @@ class Regression(Equations):
         S = -reduction.reshape(len(part), 3, len(part), 3)
         for axis in range(3):
             S[:, axis, :, axis] += sums[axis, part[:, None], part, at[:, None], at]
-        step, factor = point.unit_step(point.reduced.full_matrix)
+        step, factor = point.unit_step(point.reduced.matrix)
         S = S.reshape(reduction.shape) - cross[:n].T @ solved(factor, cross[:n])
         Q = cross[n] - cross[:n].T @ step
         if self.windows.acts_on is not None:

@@ -145,10 +145,8 @@ class Growth:
         self, before: Trial, groups: tuple[str, ...] = (), most: Floats | None = None
     ) -> Trial:
         """
-        Fit the model `before` with further groups, beginning from the fit of `before`.
-
-        `most`: largest typical prior sd of the new columns, shape (2, m), see `_typical`, or None
-        to use the typical sd of `before` for the new columns
+        Fit the model `before` with further groups, beginning from the fit of `before`. `most`:
+        largest typical prior sd of the new columns, (2, m); None for the typical sd of `before`
         """
         typical = before.typical if most is None else self._typical(before, groups, most)
         posterior = before.posterior
@@ -166,7 +164,10 @@ class Growth:
             progress(1.0 - part)
             if not better:
                 return chosen, trials
-            chosen = simplest_of_the_best(chosen, better)
+            # The smallest model that is not significantly worse than that of the largest gain.
+            best = max(better, key=lambda trial: gain(chosen.score, trial.score))
+            better.sort(key=lambda trial: len(trial.groups))
+            chosen = next(t for t in better if t is best or not is_better(t.score, best.score))
 
     def with_bends(self, before: Trial, groups: Sequence[str]) -> list[Trial]:
         """Fit `before` with further groups, then also with columns of `BEND`; return all fits."""
@@ -175,19 +176,16 @@ class Growth:
         return [smooth, *self.trials(smooth, [BEND])]
 
     def lowest_degree(self, constants: Trial) -> Trial:
-        """
-        Fit the curve with its first column, and with more columns if they increase the log density
-        by more than `CLEAR_GAIN`: curves of high degree fit the norms of few positions exactly.
-        """
-        prior = constants.posterior.prior
+        """Fit the curve with its first column, and with more if the log density clearly rises."""
+        prior, state = constants.posterior.prior, constants.posterior.state
         prior = replace(prior, offset_sd=prior.offset_scale or prior.offset_sd)
-        typical, state = self._candidates.typical, constants.posterior.state
         number = np.cumsum(self._names == CURVE)
         groups = *constants.groups, CURVE
         chosen, *larger = (
-            self.fit(groups, state, prior, np.where(number <= degree, typical, 0.0))
+            self.fit(groups, state, prior, self._candidates.typical * (number <= degree))
             for degree in range(1, int(number[-1]) + 1)
         )
+        # Curves of high degree fit the norms of few positions exactly.
         for curve in larger:
             if log_density(curve.posterior) - log_density(chosen.posterior) > CLEAR_GAIN:
                 chosen = curve
@@ -223,13 +221,9 @@ class Growth:
         return [self.extended(chosen, groups, typical) for groups in tried]
 
     def _typical(self, chosen: Trial, groups: tuple[str, ...], most: Floats) -> Floats:
-        """
-        Return the typical prior sd of the columns of the chosen model and of further groups. The
-        sd of a new column is the weight that explains the RMS residual, at most `most`.
-        """
+        """Set the typical sd of new columns to weights that explain the residual, up to `most`."""
         regression, posterior = self.regression, chosen.posterior
-        kelvins = regression.windows.kelvins
-        state = posterior.state
+        kelvins, state = regression.windows.kelvins, posterior.state
         square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
         if state.pose.size:
             # Attitudes and offsets of rests in a pose absorb errors of the model: add the mean
@@ -254,15 +248,6 @@ def better_start(fits: Sequence[Trial]) -> Trial:
     is_worse = is_better(large.score, small.score) or is_worse_by_norms(small.score, large.score)
     is_likelier = evidence_gain > CLEAR_GAIN and not is_worse
     return large if is_likelier or is_better(small.score, large.score) else small
-
-
-def simplest_of_the_best(before: Trial, better: Sequence[Trial]) -> Trial:
-    """Return the smallest model that is not significantly worse than that of the largest gain."""
-    best = max(better, key=lambda trial: gain(before.score, trial.score))
-    for trial in sorted(better, key=lambda trial: len(trial.groups)):
-        if trial is best or not is_better(trial.score, best.score):
-            return trial
-    return best
 
 
 def select(
@@ -364,12 +349,8 @@ def fit_all(
     downweigh(regression, posterior)
     posterior = settle(regression, posterior.state, posterior.prior, candidates)
     if informative:
-        fits = [
-            regression.solve(
-                posterior.state, replace(posterior.prior, informative=candidate), n_steps=3
-            )
-            for candidate in informative
-        ]
+        priors = [replace(posterior.prior, informative=candidate) for candidate in informative]
+        fits = [regression.solve(posterior.state, each, n_steps=3) for each in priors]
         best = max(fits, key=log_density)
         prior = replace(best.prior, offset_scale=scale)
         posterior = settle(regression, best.state, prior, candidates)
@@ -398,10 +379,9 @@ def finish(
     slow = with_slow_noise(regression, white.posterior, candidates)
     if slow.prior.noise != white.posterior.prior.noise:
         slow = pruned_fit(regression, slow, candidates)
-        slow_score = score_of(regression, slow)
-        is_worse = is_worse_by_norms(white.score, slow_score)
-        if not (is_worse or is_better(slow_score, white.score)):
-            return slow, slow_score
+        score = score_of(regression, slow)
+        if not (is_worse_by_norms(white.score, score) or is_better(score, white.score)):
+            return slow, score
     return white.posterior, white.score
 
 
@@ -416,13 +396,11 @@ def _with_large_offsets(
     a scale factor is proportional to the specific force along its axis, so drifts also determine
     mounting offsets, if the model explains the drifts.
     """
-    posterior = fitted.posterior
+    posterior, score = fitted.posterior, fitted.score
     prior, scale = posterior.prior, posterior.prior.offset_scale
-    score = fitted.score
     is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
     if prior.offset_sd >= scale or not is_noise:
         return []
-    large = LARGE_OFFSETS * scale
-    prior = replace(prior, offset_sd=large, turn_on_sd=large)
+    prior = replace(prior, offset_sd=LARGE_OFFSETS * scale, turn_on_sd=LARGE_OFFSETS * scale)
     posterior = settle(regression, posterior.state, prior, candidates)
     return [replace(fitted, posterior=posterior, score=score_of(regression, posterior))]
