@@ -308,8 +308,7 @@ def file_jacobian(
             (of_scale, 1.0, unknown[layout.kappa[axis]] / state.kappa[axis]),
         ):
             each = unknown[places] * (unit / regression.rms)[:, None]
-            # Add the weights of curves over the temperatures of parts to those of the columns of
-            # which these curves are sums.
+            # The curves over the temperatures of parts are sums of columns.
             each, of_parts = np.split(each, [sums.shape[1]])
             each = each + sums.T @ of_parts
             static, (delta,), dynamic, response = np.split(each, [n, n + 1, n + 1 + m])

@@ -11,8 +11,7 @@ offset sd (half-Student [1]_ without a prior calibration). An error of local gra
 the covariance, changes all scale factors by the same ratio.
 
 If the model lacks an effect, the best weights differ between sections of the chamber program, and
-the error in another program is as large as these differences, which a jackknife [2]_ over the
-sections estimates.
+the error in another program is as large as these differences: a jackknife [2]_ estimates them.
 
 References
 ----------
@@ -193,11 +192,7 @@ def _places(layout: Layout, widened: Layout) -> Ints:
 def _widened(
     regression: Regression, posterior: PosteriorMode, candidates: Floats, of_means: State | None
 ) -> tuple[Layout, Floats]:
-    """
-    Return layout and covariance, with the columns that the data do not determine.
-
-    `candidates`: prior sd of the columns, shape (2, m); `of_means`: fit to the positions' means
-    """
+    """Return layout and covariance with the columns that the data do not determine."""
     prior, state = _with_unseen(regression, posterior, candidates), posterior.state
     if of_means is None:
         with_unseen = regression.solve(state, prior, n_steps=0)
@@ -253,11 +248,9 @@ def _with_unseen(regression: Regression, posterior: PosteriorMode, typical: Floa
         square = np.mean(posterior.state.weights**2, axis=1) + sd**2
         slopes = np.sqrt(np.sum(square[:, is_curve] / kelvins[is_curve] ** 2, axis=1))
         of_curve = np.outer(slopes, kelvins)
-        typical = np.where(is_of_lags, np.minimum(typical, of_curve), typical)
+        typical = np.minimum(typical, of_curve)
         # A curve column that the data do not determine changes this slope by up to half the slope.
-        unseen = 0.5 * of_curve
-        typical = np.where(groups == CURVE, np.minimum(typical, unseen), typical)
-        sd = np.where(groups == CURVE, np.minimum(sd, unseen), sd)
+        sd = np.where(groups == CURVE, np.minimum(sd, 0.5 * of_curve), sd)
     # The variance of n lags is limited to that of one lag, so each lag gets 1 / n of the variance.
     is_lag = is_of_lags & (sd > 0.0)
     share = np.sqrt(np.maximum(is_lag.sum(axis=1, keepdims=True), 1))
@@ -308,10 +301,7 @@ def _fits(
 def _mixture(
     posterior: PosteriorMode, fits: Sequence[PosteriorMode], log_weight: Floats
 ) -> tuple[Floats, Floats]:
-    """
-    Return the covariance of the unit's unknowns by a mixture of fits, about the mode of the
-    posterior, and the weights of the fits, whose sum is 1.
-    """
+    """Return the unit's covariance by a mixture of fits, about the mode, and the weights."""
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     n = posterior.layout.n_unit

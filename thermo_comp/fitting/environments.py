@@ -23,7 +23,7 @@ from ..typing import Bools, Floats
 from ..unit.calibration import Calibration, LackOfFit, RegimeSet
 from ..unit.gravity import MICRO_G
 from .coverage import distinct_directions
-from .data_checks import POSITIONS_NEEDED, Finding
+from .data_checks import POSITIONS_NEEDED, Finding, advice
 from .evidence import drift_variance
 from .initial_triad import within_positions
 from .initialisation import initial_state
@@ -175,8 +175,7 @@ def with_excluded_error(
             f'uncertainty includes. Bags over the whole temperature range allow a fit without '
             f'{others}'
         )
-    finding = Finding('environment', 'advice', text)
-    return replace(calibration, static=static, dynamic=dynamic), finding
+    return replace(calibration, static=static, dynamic=dynamic), advice('environment', text)
 
 
 def _widened(regime: RegimeSet, square: Floats) -> RegimeSet:

@@ -19,7 +19,6 @@ positions, |f| replaces g, and the nonlinear terms ``kappa sum_j (k_j + k'_j t) 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,25 +27,6 @@ from .layout import Layout, lay_out
 from .series import Base, Series
 from .tangent import Tangent
 from .unknowns import Prior, State, Windows
-
-
-class Effects(NamedTuple):
-    """
-    The parts of the readings that a state of the unknowns predicts at the reference temperature.
-
-    force: specific force along each axis in each position, shape (n_positions, 3)
-    by_rotation: derivative of the reading w.r.t. a rotation of the attitude, (n_positions, 3, 2)
-    without_bias: reading without the bias, shape (n_positions, 3)
-    nonlinear: sums of the nonlinear terms at the reference temperature and of their changes per
-        kelvin, shape (2, n_positions, 3)
-    slopes: derivatives of `nonlinear` w.r.t. the force, shape (2, n_positions, 3)
-    """
-
-    force: Floats
-    by_rotation: Floats
-    without_bias: Floats
-    nonlinear: Floats
-    slopes: Floats
 
 
 class Equations(Series):
@@ -117,22 +97,31 @@ class Equations(Series):
             )
         return self._layouts[key]
 
-    def effects(self, state: State) -> Effects:
-        """Return the parts of the readings that `state` predicts at the reference temperature."""
-        force = np.asarray(self._norm(state) * state.up @ state.inverse.T)
+    def along(self, state: State) -> Floats:
+        """Return the specific force along each axis in each position, shape (n_positions, 3)."""
+        return np.asarray(self._norm(state) * state.up @ state.inverse.T)
+
+    def _effects(self, state: State) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """
+        Return the force `along` the axes; and, at the reference temperature: the derivative of the
+        reading by a rotation of the attitude, (n_positions, 3, 2); the reading without the bias,
+        (n_positions, 3); the sum of the nonlinear terms, and of their changes per kelvin, shape
+        (2, n_positions, 3); and the derivatives of these two sums by the force.
+        """
+        force = self.along(state)
         along_axes = np.einsum('ij,pjt->pit', state.inverse, state.tangents)
         sizes = np.reshape(self._norm(state), (-1, 1, 1))
         by_rotation = sizes * (state.kappa[:, None] * along_axes)
         if self.forces is None:
-            nonlinear = np.zeros((2, 2, *force.shape))
+            terms, slopes = np.zeros((2, 2, *force.shape))
         else:
-            terms = np.stack(self.forces.terms(force))
-            nonlinear = np.einsum('vpik,ijk->vjpi', terms, state.nonlinear.reshape(3, 2, -1))
-        return Effects(force, by_rotation, state.kappa * (force + nonlinear[0, 0]), *nonlinear)
+            each = np.stack(self.forces.terms(force))
+            terms, slopes = np.einsum('vpik,ijk->vjpi', each, state.nonlinear.reshape(3, 2, -1))
+        return force, by_rotation, state.kappa * (force + terms[0]), terms, slopes
 
     def tangent(self, state: State, layout: Layout, base: Base) -> Tangent:
         """Linearise the measurement equations about a state."""
-        force, by_rotation, without_bias, _, _ = self.effects(state)
+        force, by_rotation, without_bias, _, _ = self._effects(state)
         along = (state.kappa * force)[..., None]
         n_starts, n_stretches = layout.start.shape[1], layout.stretch.shape[1]
         scaled, by_kappa, by_force = (base.size + k for k in range(3))
@@ -171,7 +160,7 @@ class Equations(Series):
         Return the combinations of the base series that `Tangent` uses: 1 + S s; the derivatives
         w.r.t. kappa, the force along the axis and the initial lag states; and the residual.
         """
-        force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self.effects(state)
+        force, _, without_bias, (bend, bend_by_t), (slope, slope_by_t) = self._effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size, 4 + n_starts))
         result[:, :, 0, :3] = 1.0
@@ -199,7 +188,7 @@ class Equations(Series):
         if self.forces is None or not len(active):
             return active, 1.0
         k = len(self.forces.kinds)
-        value, _ = self.forces.terms(self.effects(state).force)
+        value, _ = self.forces.terms(self.along(state))
         place = np.where(active < k, scaled, base.t[0])
         return place, state.kappa[:, None] * value[..., active % k]
 
@@ -214,7 +203,7 @@ class Equations(Series):
 
     def misfit(self, state: State, base: Base) -> Floats:
         """Return the residual as combinations of the base series, (n_positions, 3, n_base)."""
-        force, by_rotation, without_bias, (_, bend_by_t), _ = self.effects(state)
+        force, by_rotation, without_bias, (_, bend_by_t), _ = self._effects(state)
         on_bias, on_scale = state.weights[:, :, base.columns]
         result = np.zeros((*force.shape, base.size))
         result[:, :, 0] = self.level - (without_bias + state.bias + state.offset)

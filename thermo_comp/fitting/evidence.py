@@ -93,8 +93,7 @@ def residual_rows(fit: Fit) -> tuple[tuple[ResidualRow, ...], Floats, Floats]:
     ]
     sizes = regression.norms(state)[regression.windows.position]
     residuals = [norm_residual(regression.force(step), sizes) for step in steps]
-    # The left-out error is the RMS of the drifts of the axes if other positions do not determine
-    # the norm.
+    # If other positions do not determine the norm, the left-out error is the drift, RMS of axes.
     norm = norm_residual(selected.score.force, sizes)
     drift = np.sqrt(np.mean(selected.score.drift**2, axis=1))
     left_out = np.where(np.isfinite(norm), norm, drift)
@@ -212,7 +211,7 @@ def drift_variance(
     """Return the variance of the drift of each window due to `covariance`, shape (n, 3)."""
     position = regression.windows.position
     columns = within_positions(regression.columns, position)
-    by_weights = layout.by_weights(columns, regression.effects(state).force[position])
+    by_weights = layout.by_weights(columns, regression.along(state)[position])
     variances = [
         np.sum((along @ covariance[np.ix_(at, at)]) * along, axis=1) for along, at in by_weights
     ]

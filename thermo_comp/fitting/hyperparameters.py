@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import median_filter
 
 from ..typing import Bools, Floats, Ints
 from .equations import as_vector
@@ -78,10 +78,7 @@ def settle(
 def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
-    """
-    Move all prior sd and white noises towards their modes; return also the largest change of a
-    logarithm, that of the tilts' sd divided by 3, and that of the lag states' variance by 4.
-    """
+    """Move prior sds and noises towards their modes; return also the largest change of a log."""
 
     def change(new: Floats | float, old: Floats | float) -> float:
         return float(np.max(np.abs(np.log(new / old)), initial=0.0))
@@ -298,10 +295,7 @@ def pruned_fit(
 
 
 def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candidates) -> Prior:
-    """
-    Drop columns with a log Bayes factor below `LEAST_GAIN`, one at a time, the smallest first;
-    after each removal the Bayes factors of the other columns are calculated again.
-    """
+    """Drop columns with a log Bayes factor below `LEAST_GAIN`, one by one, smallest first."""
     layout, prior, covariance = posterior.layout, posterior.prior, posterior.covariance.copy()
     mode = as_vector(posterior.state, layout)[: layout.n_unit]
     # A column with a fixed sd in the scale can explain the drift that the same column causes in
@@ -355,12 +349,10 @@ def downweigh(regression: Regression, posterior: PosteriorMode) -> None:
 def undisturbed(residual: Floats, weight: Floats, position: Ints) -> Floats:
     """Return factors of at most 1 for the windows' weights, from residuals of shape (n, 3)."""
     size = residual * np.sqrt(weight)[:, None]
-    side = 3  # number of windows before, and after, a window, whose median is its local level
     for part in np.split(size, np.flatnonzero(np.diff(position)) + 1):
-        if len(part) > 2 * side:
-            around = np.pad(part, ((side, side), (0, 0)), mode='reflect')
-            usual = sliding_window_view(around, 2 * side + 1, axis=0)
-            np.subtract(part, np.median(usual, axis=-1), out=part)
+        if len(part) > 6:
+            # The local level of a window is the median of the seven windows about it.
+            np.subtract(part, median_filter(part, (7, 1), mode='mirror'), out=part)
     size = np.abs(size)
     # The 80 % quantile of |x| is 1.2816 sd of a normal x. The median of |x| can be 0: the window
     # means of a charge-balancing converter often have few distinct values.

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Layout:
     """
-    Indices of the unknowns in the vector of parameters; the unknowns of the unit come first. The
-    names are those of `State`.
+    Indices of the unknowns (named as in `State`) in the vector of parameters, the unit's first.
 
     axis: scale ratio kappa, bias, active weights and nonlinear coefficients of each axis, (3, k)
     weights, nonlinear: indices of the weights, shape (2, 3, m), and of the nonlinear coefficients,

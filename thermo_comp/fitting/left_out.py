@@ -36,7 +36,6 @@ from .elimination import inverse_root
 from .initial_triad import thermometer_error_of, white_noise_of
 from .regression import Point, PosteriorMode, Regression
 from .settled_bias import settled_error
-from .unknowns import State
 
 # Smallest number of windows of a position for a score of the position's drift.
 _FEWEST_WINDOWS = 8
@@ -93,8 +92,7 @@ class Folds:
         before, after = ((folds.square * folds.windows)[known] + 1e-300 for folds in (self, other))
         of_sums = float(np.log(before.sum() / after.sum()))
         if n == 1:
-            # The standard error of a single fold is unknown, and set to the smallest log ratio
-            # that is not negligible.
+            # The standard error of a single fold is unknown: the least log ratio that matters.
             return of_sums, _NEGLIGIBLE_LOG_RATIO
         each = np.log(before / after)
         others = (np.maximum(square.sum() - square, 1e-300) for square in (before, after))
@@ -126,8 +124,7 @@ class Score:
     halves: drift of left-out halves of the test, at temperatures that occur in the other half
     noise: white noise of a window, RMS of the axes [m/s^2]
     by_thermometer: error of a window due to a coarse board thermometer, RMS of the axes [m/s^2]
-    settled: expected error of the bias at settled temperatures [m/s^2], see `settled_bias`; 0 in a
-        fit that does not limit this error
+    settled: expected error of the bias at settled temperatures [m/s^2] (`settled_bias`), or 0
     """
 
     positions: Folds
@@ -271,15 +268,16 @@ def _by_positions(
 ) -> tuple[Folds, Folds, Floats, Floats]:
     """Leave out each mounting; return folds of drift and norm, corrected force, and drift."""
     windows, share = regression.windows, regression.weight / regression.windows.weight
-    point = regression.at(posterior.state, posterior.prior)
-    edges = windows.edges
+    point, edges = regression.at(posterior.state, posterior.prior), windows.edges
     counts = np.diff(edges).astype(np.float64)
     force = np.full((len(windows.time), 3), np.nan)
     sizes = regression.norms(point.state)
     drift = np.full_like(force, np.nan)
     squares, norms = np.full((2, windows.n_positions), np.nan)
     for places, matrix in point.without_each():
-        state, root = _refitted(point, matrix)
+        step, factor = point.unit_step(matrix)
+        state = point.with_step(np.pad(step, (0, point.layout.n - len(step)))).state
+        root = inverse_root(factor)
         for p in places.tolist():
             rows = slice(edges[p], edges[p + 1])
             corrected, weight = regression.force(state, rows), share[rows]
@@ -301,16 +299,6 @@ def _mean(values: Floats, weights: Floats) -> Floats:
     return np.asarray(np.sum(values * share, axis=0) / np.sum(share, axis=0))
 
 
-def _refitted(point: Point, matrix: Floats) -> tuple[State, Floats]:
-    """
-    Return the state after a Gauss-Newton step of the unit's unknowns with the normal equations
-    `matrix` instead of those of `point`, and `PosteriorMode.root`, the root of the covariance.
-    """
-    step, factor = point.unit_step(matrix)
-    step = np.pad(step, (0, point.layout.n - point.layout.n_unit))
-    return point.with_step(step).state, inverse_root(factor)
-
-
 def _is_drift_determined(
     point: Point, posterior: PosteriorMode, root: Floats, rows: slice
 ) -> bool:
@@ -325,7 +313,7 @@ def _is_drift_determined(
     some = regression.columns[rows][:: max((rows.stop - rows.start) // 50, 1)]
     some = some - some.mean(axis=0)
     p = regression.windows.position[rows.start]
-    force = regression.effects(point.state).force[p]
+    force = regression.along(point.state)[p]
     by_others = by_all = 0.0
     for along, at in point.layout.by_weights(some, force):
         by_others += float(np.sum((along @ root[at]) ** 2))
@@ -360,8 +348,7 @@ def _by_sections(
     Score the drift of left-out sections, about the mean of those windows of the position that stay
     in the fit. Each fit without sections is `n_steps` Gauss-Newton steps from the fit of all data.
 
-    `folds`: each fold's sections, left out in all positions; `is_within`: score only windows at
-    temperatures that occur in the fit
+    `folds`: sections of each fold; `is_within`: score only temperatures that occur in the fit
     """
     windows, share = regression.windows, regression.weight / regression.windows.weight
     products = regression.products(posterior.layout.used)

@@ -181,10 +181,7 @@ class Point:
         return step - self.solution[0][: self.layout.n_unit]
 
     def unit_step(self, matrix: Floats) -> tuple[Floats, Floats]:
-        """
-        Return the step of the unit's unknowns, and the Cholesky factor of their Hessian, given
-        their normal equations, see `Reduced.matrix`.
-        """
+        """Return the unit's step and its Hessian's Cholesky factor, given `Reduced.matrix`."""
         n = self.layout.n_unit
         information, gradient, deviation = matrix[:n, :n], matrix[:n, n], self.deviation[:n]
         if not np.isfinite(information).all():
@@ -324,7 +321,7 @@ class Regression(Equations):
         columns, at = np.unique(column, return_inverse=True)
         of_columns, with_base = self.products_of(columns, base, state)
         # Derivatives of the reading w.r.t. a column's contribution to the bias, and to the scale.
-        acts = np.stack((np.ones_like(state.up), state.kappa * self.effects(state).force))
+        acts = np.stack((np.ones_like(state.up), state.kappa * self.along(state)))
         acts /= sigma
         rows = point.tangent.of(self.at_starts(with_base, state, base))[:, :, at]
         rows *= (acts[part] / sigma).transpose(1, 2, 0)[..., None]
