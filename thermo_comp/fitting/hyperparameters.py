@@ -31,7 +31,7 @@ from .equations import as_vector
 from .gains import log_bayes_factors
 from .initial_triad import white_noise_of
 from .regression import PosteriorMode, Regression
-from .unknowns import POSE_SD, Noise, Prior, State, Windows
+from .unknowns import POSE_SD, Noise, Prior, State
 from .windows import LAGS, PRODUCTS
 
 #: Degrees of freedom of the half-Student prior of the sd of mounting offsets, as in [2]_.
@@ -303,11 +303,18 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
     is_kept = candidates.fixed | candidates.forced | candidates.fixed[1]
     droppable = np.argwhere((prior.column_sd > 0.0) & ~is_kept).tolist()
     column_sd, weight_sd = prior.column_sd.copy(), regression.weight_sd(prior)
+    windows = regression.windows
+    is_lag = np.isin(windows.groups, LAGS) & (windows.lag >= 0)
+    is_product = np.isin(windows.groups, PRODUCTS)
     while droppable:
         part, column = np.array(droppable).T
         places = layout.weights[part, :, column]
         gains = log_bayes_factors(mode, covariance, places, weight_sd[part, :, column])
-        gains[_is_last_lag(regression.windows, column_sd)[part, column]] = np.inf
+        # A product t m of temperature and lag approximates the lag m at the rates of one chamber
+        # program, but not at others: a model with products keeps a lag (marginality, [3]_).
+        used = column_sd > 0.0
+        is_last = (used & is_product).any(axis=1) & ((used & is_lag).sum(axis=1) == 1)
+        gains[(used & is_lag & is_last[:, np.newaxis])[part, column]] = np.inf
         least = int(np.argmin(gains))
         if gains[least] >= LEAST_GAIN:
             break
@@ -317,21 +324,6 @@ def _pruned(regression: Regression, posterior: PosteriorMode, candidates: Candid
         mode = mode - gain.T @ mode[at]
         covariance -= covariance[:, at] @ gain
     return replace(prior, column_sd=column_sd)
-
-
-def _is_last_lag(windows: Windows, column_sd: Floats) -> Bools:
-    """
-    Return the columns that are the only lag in the bias (or scale) of a model whose bias (or
-    scale) also has products or squares of lags, shape (2, m).
-
-    A product t m of temperature and lag approximates the lag m at the rates of one chamber
-    program, but not at other rates, so a model with products keeps a lag (marginality, [3]_).
-    """
-    groups, used = np.array(windows.groups), column_sd > 0.0
-    is_lag = used & np.isin(groups, LAGS) & (windows.lag >= 0)
-    has_products = (used & np.isin(groups, PRODUCTS)).any(axis=1)
-    is_single = has_products & (is_lag.sum(axis=1) == 1)
-    return np.asarray(is_lag & is_single[:, np.newaxis])
 
 
 def downweigh(regression: Regression, posterior: PosteriorMode) -> None:

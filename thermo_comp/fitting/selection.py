@@ -123,6 +123,8 @@ class Growth:
         names = dict.fromkeys(self._names[may].tolist())
         #: Groups of columns that may be added to a model.
         self.free = [group for group in names if group not in self.forced]
+        #: Models to report, see `Selected.trials`.
+        self.tried: list[Trial] = []
 
     def fit(self, groups: tuple[str, ...], state: State, prior: Prior, typical: Floats) -> Trial:
         """Fit the model of `groups`, also with columns that the fit of a smaller model dropped."""
@@ -152,18 +154,17 @@ class Growth:
         posterior = before.posterior
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
-    def added(self, chosen: Trial, progress: Callable[[float], None]) -> tuple[Trial, list[Trial]]:
-        """Add groups while left-out errors decrease; return the final model and all trials."""
-        trials: list[Trial] = []
+    def added(self, chosen: Trial, progress: Callable[[float], None]) -> Trial:
+        """Add groups while left-out errors decrease; return the final model."""
         part = 1.0
         while True:
             larger = self.trials(chosen, self.free)
-            trials += larger
+            self.tried += larger
             better = [trial for trial in larger if is_better(chosen.score, trial.score)]
             part *= 0.6
             progress(1.0 - part)
             if not better:
-                return chosen, trials
+                return chosen
             # The smallest model that is not significantly worse than that of the largest gain.
             best = max(better, key=lambda trial: gain(chosen.score, trial.score))
             better.sort(key=lambda trial: len(trial.groups))
@@ -267,7 +268,7 @@ def select(
         priors.append(replace(prior, offset_sd=large, turn_on_sd=large))
     fits = [growth.fit(growth.forced, state, initial, candidates.typical) for initial in priors]
     constants = first = better_start(fits)
-    trials = [constants]
+    growth.tried.append(constants)
     if CURVE in growth.free:
         # The curve is added without a test: it may improve the score only with further groups.
         if regression.windows.has_drifts:
@@ -276,38 +277,37 @@ def select(
             first = growth.extended(curve)
         else:
             first = growth.lowest_degree(constants)
-        trials.append(first)
+        growth.tried.append(first)
     parts = None
     if PART in growth.free:
         # Curves over the temperatures of parts replace the curve over the board temperature.
         parts = better_start([growth.extended(fit, (PART,)) for fit in fits])
-    chosen, tried = _grown(growth, first, parts, progress)
-    trials += tried
+    chosen = _grown(growth, first, parts, progress)
     if chosen is not constants and not is_better(constants.score, chosen.score):
         more_evidence = log_density(chosen.posterior) - log_density(constants.posterior)
         if not is_undecided(constants.score, chosen.score) or more_evidence < CLEAR_GAIN:
             chosen = constants
     candidates = replace(candidates, typical=chosen.typical)
     posterior, score = finish(regression, chosen, candidates)
-    return Selected(posterior, score, _marked(trials, chosen, score))
+    return Selected(posterior, score, _marked(growth.tried, chosen, score))
 
 
 def _grown(
     growth: Growth, first: Trial, parts: Trial | None, progress: Callable[[float], None]
-) -> tuple[Trial, list[Trial]]:
-    """Add groups to `first` or, if better, to `parts`; return the best model and all trials."""
-    chosen, trials = first, []
+) -> Trial:
+    """Add groups to `first` or, if better, to `parts`; return the best model."""
+    chosen = first
     if parts is not None:
         trials = [parts, *growth.trials(parts, [BEND])]
         if 'gradient' in growth.free and not _best(chosen, trials).is_complete:
             trials.append(growth.extended(parts, ('gradient',)))
+        growth.tried += trials
         chosen = _best(chosen, trials)
     if growth.regression.windows.acts_on is not None and not chosen.is_complete:
-        tried = growth.with_bends(first, PART_SUMS)
-        trials += tried
-        chosen = _best(chosen, tried)
-    chosen, tried = growth.added(chosen, progress)
-    trials += tried
+        trials = growth.with_bends(first, PART_SUMS)
+        growth.tried += trials
+        chosen = _best(chosen, trials)
+    chosen = growth.added(chosen, progress)
     may_bend = BEND in growth.free and {*PRODUCTS} & {*chosen.groups}
     if may_bend and BEND not in chosen.groups and not chosen.is_complete:
         # A bend of the curve of a part is found only in a model with the lag of this part, not in
@@ -315,22 +315,19 @@ def _grown(
         # model with bends if its left-out error is below three times that of the chosen model.
         _, *with_bends = growth.with_bends(first, LAGS)
         if with_bends and with_bends[0].score.rms < 3.0 * chosen.score.rms:
-            last, tried = growth.added(with_bends[0], progress)
-            trials += [*with_bends, *tried]
-            if is_better(chosen.score, last.score):
-                chosen = last
-    return chosen, trials
+            growth.tried += with_bends
+            chosen = _best(chosen, [growth.added(with_bends[0], progress)])
+    return chosen
 
 
 def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
     """Mark the chosen model, and those at most one standard error worse than this model."""
-    marked = []
-    for trial in trials:
-        is_chosen = trial.groups == chosen.groups
-        near = not is_chosen and is_near(chosen.score, trial.score)
-        kept = replace(trial, score=score) if is_chosen else trial
-        marked.append(replace(kept, is_chosen=is_chosen, is_near=near))
-    return tuple(marked)
+    return tuple(
+        replace(trial, score=score, is_chosen=True)
+        if trial.groups == chosen.groups
+        else replace(trial, is_near=is_near(chosen.score, trial.score))
+        for trial in trials
+    )
 
 
 def fit_all(
