@@ -29,9 +29,7 @@ def model_of(
 ) -> Model:
     """
     Return the model of the prior or, without a prior, the model of `options` with all its columns
-    for which the bags have thermometers.
-
-    `parts`: the lag of each axis, or None for the bank of time constants
+    for which the bags have thermometers; `parts`: lag of each axis, or None for the bank of lags
     """
     prior, reference = options.prior, options.reference_temperature
     if prior is not None:
@@ -90,12 +88,7 @@ def windows_of(
     tracks: Sequence[Track] | None = None,
     undisturbed: Floats | None = None,
 ) -> ThermalWindows:
-    """
-    Return the windows of bags, with the stated |f| of the positions if not all are at 1 g.
-
-    `tracks`: thermal states of the bags, if computed before; `undisturbed`: factors of the weights
-    of the windows, or None if the fit estimates these factors
-    """
+    """Return the windows of bags; `tracks`: thermal states of the bags, if computed before."""
     windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
 

@@ -79,12 +79,7 @@ class Equations(Series):
         return np.asarray(self.forces.norms(state.radius, state.stretch)[:, None])
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
-        """
-        Assign an index to every unknown; return one `Layout` object for equal arguments.
-
-        `used`: active columns of bias and scale, shape (2, m); `nonlinear`: active nonlinear
-        coefficients, shape (2 k,); None for all
-        """
+        """Return the same object of `lay_out` for equal arguments; `nonlinear`: None for all."""
         if nonlinear is None or self.forces is None:
             nonlinear = np.ones(self.n_coefficients, dtype=bool)
         key = used.tobytes() + nonlinear.tobytes()
