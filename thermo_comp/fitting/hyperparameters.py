@@ -79,67 +79,73 @@ def _updated(
     regression: Regression, posterior: PosteriorMode, candidates: Candidates
 ) -> tuple[Prior, float]:
     """Move prior sds and noises towards their modes; return also the largest change of a log."""
-
-    def change(new: Floats | float, old: Floats | float) -> float:
-        return float(np.max(np.abs(np.log(new / old)), initial=0.0))
-
-    prior, state, layout = posterior.prior, posterior.state, posterior.layout
-    sd, determined = prior.column_sd, posterior.determined
+    prior, layout, determined = posterior.prior, posterior.layout, posterior.determined
+    sd, power = prior.column_sd, np.sum(posterior.state.weights**2, axis=1)
     moves = (sd > 0.0) & ~candidates.fixed
     safe, centre = np.where(moves, sd, 1.0), np.where(moves, candidates.typical, 1.0)
     effective = posterior.effective_parameters
     slope = np.log(safe / centre) / LOG_VARIANCE
-    step = _toward(effective, np.sum(state.weights**2, axis=1), safe, slope, 1.0 / LOG_VARIANCE)
-    new = np.where(moves, np.minimum(safe * np.exp(step), candidates.largest), sd)
-    is_informed = moves & (effective > 0.3)
-    offset_sd, offset_change = _offset_sd(posterior, prior.offset_sd, layout.offset)
-    turn_on_sd, turn_on_change = prior.turn_on_sd, 0.0
+    step = _toward(effective, power, safe, slope, 1.0 / LOG_VARIANCE)
+    column_sd = np.where(moves, np.minimum(safe * np.exp(step), candidates.largest), sd)
+    turn_on_sd = prior.turn_on_sd
     if prior.informative is None:
         # With a prior calibration the sd of turn-on offsets keeps its value, because the few
         # turn-ons of an update do not separate turn-on offsets from the ageing of the bias.
-        turn_on_sd, turn_on_change = _offset_sd(posterior, turn_on_sd, layout.turn_on)
-    tilt_sd, pose_sd = (
-        _tilt_sd(posterior, float(regression.windows.kelvins[0])),
-        _pose_sd(posterior),
-    )
-    misalignment_sd = prior.misalignment_sd
-    if prior.informative is None and not prior.unseen_misalignment_sd:
-        # Three elements of M determine their sd poorly. The built-in sd therefore counts as a
-        # fourth element, and the sd changes only if the data determine more than one element.
-        gamma = float(determined[layout.misalignment].sum())
-        share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
-        square = share * np.sum(state.misalignment**2) + prior.misalignment_scale**2
-        new_sd = float(np.sqrt(square / (share * gamma + 1.0)))
-        # The misalignment sd is limited to 0.03 rad, a value for separate sensors on a printed
-        # bracket: larger misalignments would explain the norms of six faces, to second order.
-        misalignment_sd = min(new_sd, 0.03)
-    start_ratio = prior.start_variance_ratio
-    if layout.start.size:
-        # A lag state with the variance of the node's prior (a ratio of 1) is added to the data, so
-        # that the lag states of a single bag cannot make `start_variance_ratio` very small.
-        gamma = float(determined[layout.start].sum())
-        if gamma <= -1.0:
-            raise np.linalg.LinAlgError('rounding errors exceed the information about lag states')
-        start_ratio = float(min((np.sum(state.start**2) + 1.0) / (gamma + 1.0), 1.0))
+        turn_on_sd = _offset_sd(posterior, turn_on_sd, layout.turn_on)
     moved = replace(
         prior,
-        column_sd=new,
-        offset_sd=offset_sd,
+        column_sd=column_sd,
+        offset_sd=_offset_sd(posterior, prior.offset_sd, layout.offset),
         turn_on_sd=turn_on_sd,
-        tilt_sd=tilt_sd,
-        pose_sd=pose_sd,
-        misalignment_sd=misalignment_sd,
+        tilt_sd=_tilt_sd(posterior, float(regression.windows.kelvins[0])),
+        pose_sd=_pose_sd(posterior),
+        misalignment_sd=_misalignment_sd(posterior),
+        start_variance_ratio=_start_variance_ratio(posterior),
         sigma=white_noise(regression, posterior),
-        start_variance_ratio=start_ratio,
     )
+
+    def change(name: str, at: Bools | tuple[()] = ()) -> float:
+        new, old = (np.asarray(getattr(each, name))[at] for each in (moved, prior))
+        return float(np.max(np.abs(np.log(new / old)), initial=0.0))
+
     return moved, max(
-        change(new[is_informed], sd[is_informed]),
-        *(offset_change, turn_on_change, change(pose_sd, prior.pose_sd)),
+        change('column_sd', moves & (effective > 0.3)),
+        # Offsets that the data do not determine do not count.
+        change('offset_sd') * bool(determined[layout.offset].sum() > 1.0),
+        change('turn_on_sd') * bool(determined[layout.turn_on].sum() > 1.0),
         # An error of 15 % of the sd of tilts hardly changes the fit.
-        change(tilt_sd, prior.tilt_sd) / 3.0,
-        change(start_ratio, prior.start_variance_ratio) / 4.0,
-        change(moved.sigma, prior.sigma),
+        change('tilt_sd') / 3.0,
+        change('pose_sd'),
+        change('start_variance_ratio') / 4.0,
+        change('sigma'),
     )
+
+
+def _misalignment_sd(posterior: PosteriorMode) -> float:
+    """Move the sd of the elements of M to the mode if the data determine more than one element."""
+    prior, misalignment = posterior.prior, posterior.state.misalignment
+    if prior.informative is not None or prior.unseen_misalignment_sd:
+        return prior.misalignment_sd
+    # Three elements of M determine their sd poorly: the built-in sd counts as a fourth element.
+    gamma = float(posterior.determined[posterior.layout.misalignment].sum())
+    share = 1.5 * max(1.0 - 1.0 / max(gamma, 1.0), 0.0)
+    square = share * np.sum(misalignment**2) + prior.misalignment_scale**2
+    # The misalignment sd is limited to 0.03 rad, a value for separate sensors on a printed
+    # bracket: larger misalignments would explain the norms of six faces, to second order.
+    return min(float(np.sqrt(square / (share * gamma + 1.0))), 0.03)
+
+
+def _start_variance_ratio(posterior: PosteriorMode) -> float:
+    """Move the variance ratio of the initial lag states to the mode."""
+    start, places = posterior.state.start, posterior.layout.start
+    if not places.size:
+        return posterior.prior.start_variance_ratio
+    # A lag state with the variance of the node's prior (a ratio of 1) is added to the data, so
+    # that the lag states of a single bag cannot make `start_variance_ratio` very small.
+    gamma = float(posterior.determined[places].sum())
+    if gamma <= -1.0:
+        raise np.linalg.LinAlgError('rounding errors exceed the information about lag states')
+    return float(min((np.sum(start**2) + 1.0) / (gamma + 1.0), 1.0))
 
 
 def _tilt_sd(posterior: PosteriorMode, kelvins: float) -> float:
@@ -180,14 +186,11 @@ def _toward(
     return np.asarray(np.clip(gradient / curvature, -2.0, 2.0))
 
 
-def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> tuple[float, float]:
-    """
-    Move the sd of the offsets of mountings or turn-ons, the unknowns at `places`, towards the mode
-    under a half-Student prior; return also the change of log sd, or 0 for undetermined offsets.
-    """
+def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> float:
+    """Move the sd of the offsets at `places` towards the mode under a half-Student prior."""
     scale = posterior.prior.offset_scale
     if scale <= 0.0 or not places.size:
-        return sd, 0.0
+        return sd
     effective = float(posterior.determined[places].sum())
     power = float(np.sum(as_vector(posterior.state, posterior.layout)[places] ** 2))
     square = (sd / scale) ** 2
@@ -195,8 +198,7 @@ def _offset_sd(posterior: PosteriorMode, sd: float, places: Ints) -> tuple[float
     bend = 2.0 * (STUDENT_NU + 1.0) * STUDENT_NU * square / (STUDENT_NU + square) ** 2
     step = _toward(effective, power, sd, slope, bend + 0.1)
     # Bounds of the offset sd: 1e-4 times the prior's scale, and 5 mg (0.05 m/s^2), of cheap MEMS.
-    new = float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
-    return new, float(np.abs(np.log(new / sd))) if effective > 1.0 else 0.0
+    return float(np.clip(sd * np.exp(step), 1e-4 * scale, 0.05))
 
 
 def log_density(posterior: PosteriorMode) -> float:
