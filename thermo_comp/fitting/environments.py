@@ -33,7 +33,7 @@ from .priors import constants_of, informative_priors, offset_sd_of, prior_model,
 from .reduction import ReducedBag
 from .regression import Regression
 from .selection import Fit
-from .unknowns import BIAS_SD, MISALIGNMENT_SD, SCALE_SD, Prior, State, Windows
+from .unknowns import Prior, State, Windows
 from .windows import ThermalWindows, thermal_windows
 
 
@@ -93,9 +93,6 @@ def contradiction(
     window_s = windows.typical_count * known.unit.cycle_time_s
     sigma = np.array(known.noise_density_m_s2_sqrt_hz) / np.sqrt(window_s)
     prior = Prior(
-        bias_sd=np.full(3, BIAS_SD),
-        scale_sd=SCALE_SD,
-        misalignment_sd=MISALIGNMENT_SD,
         column_sd=data.parts.astype(np.float64),
         # Only drifts are compared: bias offsets of 1 mg, by turn-ons or ageing, are allowed.
         offset_sd=1e-2,

@@ -243,12 +243,12 @@ class Prior:
         to mark the active columns by values above 0
     """
 
-    bias_sd: Floats
-    scale_sd: float
-    misalignment_sd: float
     column_sd: Floats
     offset_sd: float
     sigma: Floats
+    bias_sd: Floats = field(default_factory=lambda: np.full(3, BIAS_SD))
+    scale_sd: float = SCALE_SD
+    misalignment_sd: float = MISALIGNMENT_SD
     noise: Noise = field(default_factory=Noise)
     scale_mean: Floats = field(default_factory=lambda: np.ones(3))
     offset_scale: float = 0.0
