@@ -150,8 +150,20 @@ class Growth:
         Fit the model `before` with further groups, beginning from the fit of `before`. `most`:
         largest typical prior sd of the new columns, (2, m); None for the typical sd of `before`
         """
-        typical = before.typical if most is None else self._typical(before, groups, most)
-        posterior = before.posterior
+        regression, posterior, typical = self.regression, before.posterior, before.typical
+        if most is not None:
+            kelvins, state = regression.windows.kelvins, posterior.state
+            square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
+            if state.pose.size:
+                # Attitudes and offsets of rests in a pose absorb errors of the model: add the mean
+                # squares of both to that of the residual.
+                by_attitude = regression.gravity * state.from_pose
+                square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
+            # The typical weight of a new column explains the RMS residual.
+            slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
+            units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
+            new = np.minimum(slope * units * kelvins, most)
+            typical = np.where(np.isin(self._names, groups), new, typical)
         return self.fit((*before.groups, *groups), posterior.state, posterior.prior, typical)
 
     def added(self, chosen: Trial, progress: Callable[[float], None]) -> Trial:
@@ -220,21 +232,6 @@ class Growth:
         if chosen.groups == (CURVE,) and (SET,) in likely[3:]:
             tried.append((SET,))
         return [self.extended(chosen, groups, typical) for groups in tried]
-
-    def _typical(self, chosen: Trial, groups: tuple[str, ...], most: Floats) -> Floats:
-        """Set the typical sd of new columns to weights that explain the residual, up to `most`."""
-        regression, posterior = self.regression, chosen.posterior
-        kelvins, state = regression.windows.kelvins, posterior.state
-        square = float(np.mean(regression.residual(state, posterior.layout) ** 2))
-        if state.pose.size:
-            # Attitudes and offsets of rests in a pose absorb errors of the model: add the mean
-            # squares of both to that of the residual.
-            by_attitude = regression.gravity * state.from_pose
-            square += float(np.mean(state.offset**2) + np.mean(by_attitude**2))
-        slope = np.sqrt(square) / (float(kelvins[0]) or 1.0)
-        units = np.array([[1.0], [1.0 / (regression.gravity or 1.0)]])
-        new = np.minimum(slope * units * kelvins, most)
-        return np.where(np.isin(self._names, groups), new, chosen.typical)
 
 
 def better_start(fits: Sequence[Trial]) -> Trial:
