@@ -80,7 +80,7 @@ class Equations(Series):
 
     def layout(self, used: Bools, nonlinear: Bools | None = None) -> Layout:
         """Return the same object of `lay_out` for equal arguments; `nonlinear`: None for all."""
-        if nonlinear is None or self.forces is None:
+        if nonlinear is None:
             nonlinear = np.ones(self.n_coefficients, dtype=bool)
         key = used.tobytes() + nonlinear.tobytes()
         if key not in self._layouts:

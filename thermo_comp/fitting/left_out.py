@@ -145,8 +145,7 @@ class Score:
     @property
     def rms(self) -> float:
         """RMS of the left-out drift, the larger of the RMS over positions and over sections."""
-        known = [folds.rms for folds in (self.positions, self.sections) if np.isfinite(folds.rms)]
-        return max(known, default=float('nan'))
+        return float(np.fmax(self.positions.rms, self.sections.rms))
 
     @property
     def exceeds_noise(self) -> bool:
