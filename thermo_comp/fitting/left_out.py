@@ -282,20 +282,14 @@ def _by_positions(
             corrected, weight = regression.force(state, rows), share[rows]
             is_known = _is_drift_determined(point, posterior, root, rows)
             if counts[p] >= _FEWEST_WINDOWS and is_known:
-                drift[rows] = corrected - _mean(corrected, weight)
-                squares[p] = _mean(np.mean(drift[rows] ** 2, axis=1), weight)
+                drift[rows] = corrected - np.average(corrected, axis=0, weights=weight)
+                squares[p] = np.average(np.mean(drift[rows] ** 2, axis=1), weights=weight)
             if _is_norm_determined(point, posterior, root, p):
                 force[rows] = corrected
                 error = np.linalg.norm(corrected, axis=1) - sizes[p]
-                norms[p] = _mean(error**2, weight)
+                norms[p] = np.average(error**2, weights=weight)
     of_drift, of_norm = (Folds.of(square, counts, windows.mounting) for square in (squares, norms))
     return of_drift, of_norm, force, drift
-
-
-def _mean(values: Floats, weights: Floats) -> Floats:
-    """Average windows as `np.average` does, but without its checks, which are slow."""
-    share = weights.reshape(-1, *[1] * (values.ndim - 1))
-    return np.asarray(np.sum(values * share, axis=0) / np.sum(share, axis=0))
 
 
 def _is_drift_determined(
@@ -366,11 +360,11 @@ def _by_sections(
             rows = np.arange(*windows.edges[p : p + 2])
             out, stayed = rows[judged[rows]], rows[~left_out[rows]]
             if len(out) and len(stayed) >= _FEWEST_WINDOWS:
-                level = _mean(force[stayed], share[stayed])
+                level = np.average(force[stayed], axis=0, weights=share[stayed])
                 drift[out] = force[out] - level
         known = judged & np.isfinite(drift[:, 0])
         if known.any():
             square = np.mean(drift[known] ** 2, axis=1)
-            squares[k] = _mean(square, share[known])
+            squares[k] = np.average(square, weights=share[known])
             counts[k] = known.sum()
     return Folds(squares, counts), drift

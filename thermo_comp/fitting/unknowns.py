@@ -47,7 +47,6 @@ class Windows:
     mean: mean raw samples, in input units, shape (n, 3)
     columns: values of the columns in their physical units, with the initial lag states at their
         prior mean, shape (n, m)
-    groups: group of each column
     kelvins: temperature change that corresponds to each column's RMS [K]; 0: constant, shape (m,)
     lag: number of the lag of each column; -1 for none, shape (m,)
     start: derivative of each column w.r.t. the initial state of its lag, shape (n, m)
@@ -59,7 +58,6 @@ class Windows:
     acts_on: axes on which each column acts, shape (m, 3); None if on all axes
     pose: number of the pose of each position, -1 without a pose, shape (n_positions,), or None if
         the unit was never returned to an attitude
-    has_prior: whether the fit has a prior calibration
     board: board temperature [degC] and the variance of its estimate [K^2], (n, 2); None: unknown
     board_noise: sd of the noise of a reading of the board's thermometer [K]
     settled: columns at k constant temperatures over the range of the windows, with settled lags,
@@ -230,7 +228,6 @@ class Prior:
     turn_on_sd: sd of the bias offset of a turn-on, common to the positions of a bag [m/s^2]
     sigma: sd of the white noise of a window of weight 1 [m/s^2], shape (3,)
     least_sigma: lower bound of sigma [m/s^2]; by default it is below the noise of any sensor
-    noise: slow noise
     offset_scale: scale of the half-Student priors of offset_sd and turn_on_sd, 0: constant [m/s^2]
     misalignment_scale: value of misalignment_sd before the data are used [rad]
     unseen_misalignment_sd: sd of the elements of M [rad] in the published covariance, if positions
