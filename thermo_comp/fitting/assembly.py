@@ -280,7 +280,7 @@ def file_jacobian(
     state: State,
     model: Model,
     used: Sequence[int],
-    kinds: Sequence[Kind] = (),
+    kinds: Sequence[Kind],
 ) -> Floats:
     """
     Return the derivatives of the file's parameters w.r.t. the regression's parameters.

@@ -138,7 +138,7 @@ def _norm_errors(regression: Regression, state: State) -> Floats:
 
 
 def with_excluded_error(
-    calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool = False
+    calibration: Calibration, bags: Sequence[ReducedBag], others: str, *, is_updated: bool
 ) -> tuple[Calibration, Finding]:
     """
     Add the drift, and the error of |f|, that remain in `bags` after the correction to the lack of

@@ -238,14 +238,21 @@ def _refined(
     """Repeat a fit if its bias at settled temperatures is uncertain, or if supports may tilt."""
     if options.prior is not None or options.model == 'golovach':
         return result
+
+    def tried(bags: Sequence[ReducedBag], **given: bool) -> FitResult | None:
+        try:
+            return _fit(bags, options, progress, **given)
+        except (FitError, np.linalg.LinAlgError):
+            return None
+
     if refit_checks.extrapolates(result.fit):
-        result = _tried(bags, options, progress, is_by_settled=True) or result
+        result = tried(bags, is_by_settled=True) or result
     if not refit_checks.may_have_slow_tilts(result.fit):
         return result
     pieces = [refit_checks.in_pieces(bag) for bag in bags]
     if sum(len(bag.intervals) for bag in pieces) == sum(len(bag.intervals) for bag in bags):
         return result
-    tilted = _tried(pieces, options, progress, has_pieces=True)
+    tilted = tried(pieces, has_pieces=True)
     if tilted is None or not refit_checks.is_better_with_tilts(result.fit, tilted.fit):
         return result
     return replace(
@@ -255,16 +262,6 @@ def _refined(
         findings=(*tilted.findings, refit_checks.SLOW_TILTS),
         bags=tuple(bags),
     )
-
-
-def _tried(
-    bags: Sequence[ReducedBag], options: FitOptions, progress: Progress, **given: bool
-) -> FitResult | None:
-    """Fit the bags with the assumptions `given` of `_fit`; return None if this fit is refused."""
-    try:
-        return _fit(bags, options, progress, **given)
-    except (FitError, np.linalg.LinAlgError):
-        return None
 
 
 def _fit(
