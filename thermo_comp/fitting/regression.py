@@ -212,8 +212,16 @@ class Point:
 
     def linear_step(self) -> Floats:
         """Return the step in which damping keeps the nonlinear unknowns almost constant."""
-        reduced = self._reduced(_damped(self.normal, self.layout), self.deviation)
-        return self._solution(reduced)[0]
+        layout, local, unit = self.layout, self.normal.local.copy(), self.normal.unit.copy()
+        # A diagonal multiplied by 1e6 divides the step of these unknowns by about 1e6. With an
+        # informative prior, which correlates the unknowns, a factor far above 1e6 would cause
+        # errors of double precision.
+        at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
+        local[..., at, at] *= 1e6
+        end = unit.shape[-1] - 1
+        at = [0, *range(end - len(layout.shared), end)]
+        unit[..., at, at] *= 1e6
+        return self._solution(self._reduced(Normal(local, unit), self.deviation))[0]
 
     def with_step(self, step: Floats) -> Point:
         """Return the point at the state plus a step."""
@@ -337,18 +345,3 @@ class Regression(Equations):
             absent = ~self.windows.acts_on[column].ravel()
             S[absent], S[:, absent], Q[absent] = 0.0, 0.0, 0.0
         return Inactive(part, column, S, Q)
-
-
-def _damped(normal: Normal, layout: Layout) -> Normal:
-    """
-    Multiply the diagonal of the normal equations of the nonlinear unknowns by 1e6, which divides
-    the step of these unknowns by about 1e6. With an informative prior, which correlates the
-    unknowns, a factor far above 1e6 would cause errors of double precision.
-    """
-    local, unit = normal.local.copy(), normal.unit.copy()
-    at = [*range(2 + layout.stretch.shape[1]), *range(layout.of_axis.shape[1], layout.n_local)]
-    local[..., at, at] *= 1e6
-    end = unit.shape[-1] - 1
-    at = [0, *range(end - len(layout.shared), end)]
-    unit[..., at, at] *= 1e6
-    return Normal(local, unit)

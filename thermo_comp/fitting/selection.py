@@ -286,7 +286,13 @@ def select(
             chosen = constants
     candidates = replace(candidates, typical=chosen.typical)
     posterior, score = finish(regression, chosen, candidates)
-    return Selected(posterior, score, _marked(growth.tried, chosen, score))
+    trials = tuple(
+        replace(trial, score=score, is_chosen=True)
+        if trial.groups == chosen.groups
+        else replace(trial, is_near=is_near(chosen.score, trial.score))
+        for trial in growth.tried
+    )
+    return Selected(posterior, score, trials)
 
 
 def _grown(
@@ -315,16 +321,6 @@ def _grown(
             growth.tried += with_bends
             chosen = _best(chosen, [growth.added(with_bends[0], progress)])
     return chosen
-
-
-def _marked(trials: Sequence[Trial], chosen: Trial, score: Score) -> tuple[Trial, ...]:
-    """Mark the chosen model, and those at most one standard error worse than this model."""
-    return tuple(
-        replace(trial, score=score, is_chosen=True)
-        if trial.groups == chosen.groups
-        else replace(trial, is_near=is_near(chosen.score, trial.score))
-        for trial in trials
-    )
 
 
 def fit_all(
@@ -368,8 +364,18 @@ def finish(
     downweigh(regression, chosen.posterior)
     posterior = settle(regression, chosen.posterior.state, chosen.posterior.prior, candidates)
     posterior = pruned_fit(regression, posterior, candidates)
-    white = replace(chosen, posterior=posterior, score=score_of(regression, posterior))
-    white = better_start([white, *_with_large_offsets(regression, white, candidates)])
+    score, prior = score_of(regression, posterior), posterior.prior
+    white = replace(chosen, posterior=posterior, score=score)
+    large = LARGE_OFFSETS * prior.offset_scale
+    is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
+    if prior.offset_sd < prior.offset_scale and is_noise:
+        # Nine constants explain the norms of nine positions, whatever the mounting offsets. The
+        # drift of a scale factor is proportional to the specific force along its axis, so drifts
+        # also determine mounting offsets, if the model explains the drifts.
+        prior = replace(prior, offset_sd=large, turn_on_sd=large)
+        posterior = settle(regression, posterior.state, prior, candidates)
+        score = score_of(regression, posterior)
+        white = better_start([white, replace(chosen, posterior=posterior, score=score)])
     slow = with_slow_noise(regression, white.posterior, candidates)
     if slow.prior.noise != white.posterior.prior.noise:
         slow = pruned_fit(regression, slow, candidates)
@@ -377,24 +383,3 @@ def finish(
         if not (is_worse_by_norms(white.score, score) or is_better(score, white.score)):
             return slow, score
     return white.posterior, white.score
-
-
-def _with_large_offsets(
-    regression: Regression, fitted: Trial, candidates: Candidates
-) -> list[Trial]:
-    """
-    Repeat the fit of a model from a large sd of mounting offsets; return [] if the fitted sd is at
-    least `Prior.offset_scale`, or if the left-out drift exceeds four times the noise of a window.
-
-    Nine constants explain the norms of nine positions, whatever the mounting offsets. The drift of
-    a scale factor is proportional to the specific force along its axis, so drifts also determine
-    mounting offsets, if the model explains the drifts.
-    """
-    posterior, score = fitted.posterior, fitted.score
-    prior, scale = posterior.prior, posterior.prior.offset_scale
-    is_noise = score.rms <= 4.0 * float(np.hypot(score.noise, score.by_thermometer))
-    if prior.offset_sd >= scale or not is_noise:
-        return []
-    prior = replace(prior, offset_sd=LARGE_OFFSETS * scale, turn_on_sd=LARGE_OFFSETS * scale)
-    posterior = settle(regression, posterior.state, prior, candidates)
-    return [replace(fitted, posterior=posterior, score=score_of(regression, posterior))]
