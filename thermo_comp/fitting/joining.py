@@ -38,7 +38,7 @@ def joined(bags: Sequence[ReducedBag]) -> list[ReducedBag]:
 def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     """Whether a bag, by its stamps, sample interval and serial, continues `part`."""
     gap_s = 1e-9 * (bag.start_ns - part.end_ns)
-    is_alike = _is_alike(part.cycle_s, bag.cycle_s)
+    is_alike = abs(bag.cycle_s - part.cycle_s) < 0.01 * part.cycle_s
     # A bag with known |f| is not joined, because times of |f| count from the start of the bag.
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
@@ -55,11 +55,6 @@ def _step(part: ReducedBag, bag: ReducedBag) -> float:
     if not (part.intervals and bag.intervals):
         return 0.0
     return float(np.linalg.norm(bag.intervals[0].mean[0] - part.intervals[-1].mean[-1]))
-
-
-def _is_alike(before_s: float, after_s: float) -> bool:
-    """Whether two sample intervals, or two lengths of windows, differ by less than 1 %."""
-    return abs(after_s - before_s) < 0.01 * before_s
 
 
 def _one_recording(parts: Sequence[ReducedBag]) -> ReducedBag:
@@ -116,7 +111,7 @@ def _intervals(parts: Sequence[ReducedBag]) -> tuple[StillInterval, ...]:
     result: list[StillInterval] = []
     for part in parts:
         shift_s = 1e-9 * (part.start_ns - parts[0].start_ns)
-        is_alike = _is_alike(parts[0].window_s, part.window_s)
+        is_alike = abs(part.window_s - parts[0].window_s) < 0.01 * parts[0].window_s
         for number, rest in enumerate(part.intervals):
             # Windows of another length than in the first part, as in a short part, are not whole.
             n_whole = rest.n_whole if is_alike else 0
