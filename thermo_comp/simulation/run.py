@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..typing import Bools, Floats, Ints
 from ..unit.gravity import MICRO_G, STANDARD_GRAVITY
 from ..unit.rate_bias import MILLIDEGREE
-from .campaign import Cyclogram, Position
+from .campaign import Cyclogram, Position, Spin
 from .drift import PartHistory, drift_of
 from .network import ThermalResponse
-from .spin import Spin
 from .unit import REFERENCE_C, Stream, SwitchedLoad, UnitModel, first_charge, generator, white
 
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
