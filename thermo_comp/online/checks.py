@@ -155,10 +155,7 @@ class RateCheck:
 
     @property
     def noise_excess(self) -> float:
-        """
-        Excess of the noise variance of a sample over the calibrated variance, relative to the
-        calibrated variance, because of a sample rate above the calibrated rate.
-        """
+        """Relative excess of a sample's noise variance due to a rate above the calibrated rate."""
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
@@ -307,9 +304,7 @@ class GravityCheck:
         self.result = GravityResidual(residual, sd, n + 1, is_still)
 
     def _judge(self, residual: float, sd: float) -> bool:
-        """
-        Count consecutive windows with equal verdicts; return whether the verdict has changed.
-        """
+        """Count consecutive windows of equal verdict; return whether the verdict changed."""
         was_against = self._is_against
         is_against = residual > self._tolerance + REFUTING_SIGMAS * sd
         self._n_agreeing = self._n_agreeing + 1 if is_against == self._is_against else 1

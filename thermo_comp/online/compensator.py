@@ -193,9 +193,7 @@ class Compensator:
             self.counters.n_saturated += 1
 
     def _process_first(self, stamp_ns: int, x: float, y: float, z: float) -> Corrected | None:
-        """
-        Correct the first sample after a reading or the end of a segment, and run the checks.
-        """
+        """Correct and check the first sample after a reading or the end of a segment."""
         if stamp_ns <= self.last_ns - TIME_JUMP_NS:
             self.jump_back(stamp_ns)
             self.reading_ns = EVER_NS

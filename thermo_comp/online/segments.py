@@ -212,9 +212,7 @@ class ThermalSide:
         return EVER_NS if board_ns is None else board_ns + timeout_ns
 
     def count_unmeasured(self, n_samples: int) -> None:
-        """
-        Count samples as dropped because the board temperature is missing or too old.
-        """
+        """Count samples dropped because the board temperature is missing or too old."""
         if self.tracker.board.stamp_ns is None:
             self.counters.n_no_temperature += n_samples
         else:

@@ -125,9 +125,7 @@ class ThermalNetwork:
         return self.settled(air)[: len(self.nodes)]
 
     def air_for(self, node: str, temperature: float) -> float:
-        """
-        Return the air temperature that brings a part to a given temperature in an endless soak.
-        """
+        """Return the air temperature at which a part has a temperature after an endless soak."""
         i = self.nodes.index(node)
 
         def error(air: Floats) -> float:

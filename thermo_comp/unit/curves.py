@@ -61,10 +61,7 @@ class Curves:
         self._has_lacks = any(part.lack_of_fit for part in sets)
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """
-        Return the distances outside the ranges of each set, shapes (2, n): temperature [K], rate
-        [K/s], then temperature and rate in half ranges.
-        """
+        """Return excess of temperature [K] and rate [K/s], then of both in half ranges, (2, n)."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
         if not (over.any() or too_fast.any()):
@@ -87,17 +84,13 @@ class Curves:
 
     @cached_property
     def _tangents(self) -> Floats:
-        """
-        Slopes of the curves at the lower and upper end, in the layout of `slopes`, (2, 2, 6, 1).
-        """
+        """Slopes of the curves at the lower and upper end, each as in `slopes`, (2, 2, 6, 1)."""
         ends = zip(self._t_range, self._leads, strict=True)
         return np.array([self._functions.evaluate(t, 'slope')[leads] for t, leads in ends])
 
     @cached_property
     def _basis_slopes(self) -> list[list[list[Floats]]]:
-        """
-        Derivatives of each function's slope at both ends of its range w.r.t. free coefficients.
-        """
+        """Derivatives of functions' slopes at both ends of the range w.r.t. free coefficients."""
         rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [
             [[np.reshape(basis_slopes(curve, end), (-1, 1)) for end in ends] for curve in row]
@@ -128,16 +121,12 @@ class Curves:
         return result
 
     def slopes(self, board: Floats) -> Floats:
-        """
-        Differentiate bias and scale of both sets w.r.t. the board temperature [per K], (2, 6, n).
-        """
+        """Differentiate bias and scale of both sets w.r.t. T_board [per K], (2, 6, n)."""
         held = hold(board - self._reference, *self._t_range)
         return self._functions.evaluate(held, 'slope')
 
     def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
-        """
-        Differentiate bias and scale of each axis w.r.t. all parameters of a `posterior.Block`.
-        """
+        """Differentiate bias and scale of each axis w.r.t. all parameters of a `Block`."""
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
         is_outside = bool((held != t).any())

@@ -46,9 +46,7 @@ def hold(value: Floats, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Floats:
 
 
 def by_element(function: Callable[[float], float], x: Kelvins) -> Floats:
-    """
-    Apply a function number by number: numpy's rounding may depend on the length of the array.
-    """
+    """Apply a function to each number: numpy's rounding may depend on the array's length."""
     return np.array([function(v) for v in np.ravel(x).tolist()]).reshape(np.shape(x))
 
 
@@ -141,9 +139,7 @@ class CubicSpline(_Family):
 
     @property
     def free_coefficients(self) -> tuple[float, ...]:
-        """
-        Values of the spline at all knots except t = 0 (the reference), less the value at t = 0.
-        """
+        """Values of the spline at all knots except t = 0, less the value at t = 0."""
         at = self.knots_k.index(0.0)
         return tuple(v - self.values[at] for v in self.values[:at] + self.values[at + 1 :])
 
@@ -247,9 +243,7 @@ class Functions:
         }
 
     def evaluate(self, t: Floats, name: str = 'value') -> Floats:
-        """
-        Evaluate values or slopes, (n_rows, n_functions, n), at `t` [K], shape (n_rows, n).
-        """
+        """Evaluate values or slopes, (n_rows, n_functions, n), at `t` [K], (n_rows, n)."""
         result = _horner(self._tables[name], t[:, np.newaxis])
         for row, place, function in self._others:
             result[row, place] = getattr(function, name)(t[row])

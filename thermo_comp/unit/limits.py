@@ -117,9 +117,7 @@ def _check_bias(key: str, level: float, reached: tuple[float, float], most: floa
 
 
 def _check_scale(key: str, reached: tuple[float, float], gain: float) -> None:
-    """
-    Refuse a relative scale that exceeds its limits when the columns add up to `gain` or -`gain`.
-    """
+    """Refuse a relative scale beyond its limits with `gain` or -`gain` from the columns."""
     for word, value, is_kept, limit in (
         ('above', reached[0] - gain, operator.gt, SMALLEST_RELATIVE_SCALE),
         ('below', reached[1] + gain, operator.lt, LARGEST_RELATIVE_SCALE),

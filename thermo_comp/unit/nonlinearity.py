@@ -226,9 +226,7 @@ class ForceCorrection:
         return hold(board, *self._span) - self._reference
 
     def linearise(self, x: Floats, board: Floats) -> Floats:
-        """
-        Subtract the nonlinear terms from readings of the axes (n, 3), at board temperatures (n,).
-        """
+        """Subtract the nonlinear terms from readings (n, 3) at board temperatures (n,)."""
         k2, kq, k3 = self._of.coefficients(self.held(board))
         return np.asarray(linearised(x.T, k2, kq, k3).T)
 
