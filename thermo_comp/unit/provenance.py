@@ -43,7 +43,9 @@ class Source:
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """``|f| - g`` of all fitted data or of a regime; raw: corrected with constants alone."""
+    """
+    ``|f| - g`` of the fitted data in one regime, or of all; raw: corrected with constants alone.
+    """
 
     section: str
     n_windows: _Number
