@@ -13,7 +13,7 @@ import numpy as np
 from ..thermal.state import BOARD, RATE, WEIGHT
 from ..typing import Floats
 from .calibration import Calibration
-from .functions import TANGENT_SPANS, Functions, basis_slopes, hold
+from .functions import TANGENT_SPANS, basis_slopes, hold
 
 
 class Curves:
@@ -34,11 +34,10 @@ class Curves:
         # Edges of each set's range, shape (2, 2, 1): the lower edges, then the upper edges.
         self._t_range = (edges[:, 0].T - self._reference)[:, :, np.newaxis]
         self._rate_range = (edges[:, 1].T / 60.0)[:, :, np.newaxis]
-        rows = [
+        self._rows = [
             [axis.bias_function for axis in axes] + [axis.scale_function for axis in axes]
             for axes in (part.axes() for part in sets)
         ]
-        self._functions, self._others = Functions(rows), Functions(rows[::-1])
         # Index of the set whose tangent each set follows at the lower and at the upper end, shape
         # (2, 2).
         regimes, (lower, upper) = np.arange(2), self._t_range[:, :, 0]
@@ -73,25 +72,30 @@ class Curves:
         """Evaluate bias [input units] and relative scale at board temperatures, (2, 6, n)."""
         t = board - self._reference
         held = hold(t, *self._t_range)
-        result = self._functions.evaluate(held)
+        result = self._evaluate(held)
         result[:, :3] += self._levels
         if (held != t).any():
             here, edge = (hold(at, *self._t_range[:, ::-1]) for at in (t, held))
-            result += self._others.evaluate(here) - self._others.evaluate(edge)
+            result += (self._evaluate(here[::-1]) - self._evaluate(edge[::-1]))[::-1]
             for slopes, beyond in zip(self._tangents, self._beyond(t), strict=True):
                 result += slopes * beyond[:, np.newaxis]
         return result
+
+    def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
+        """Evaluate values or slopes of both sets at t [K from T_ref] of each set, (2, n)."""
+        pairs = zip(self._rows, t, strict=True)
+        return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
     @cached_property
     def _tangents(self) -> Floats:
         """Slopes of the curves at the lower and upper end, each as in `slopes`, (2, 2, 6, 1)."""
         ends = zip(self._t_range, self._leads, strict=True)
-        return np.array([self._functions.evaluate(t, 'slope')[leads] for t, leads in ends])
+        return np.array([self._evaluate(t, 'slope')[leads] for t, leads in ends])
 
     @cached_property
     def _basis_slopes(self) -> list[list[list[Floats]]]:
         """Derivatives of functions' slopes at both ends of the range w.r.t. free coefficients."""
-        rows = zip(self._functions.rows, self._t_range[:, :, 0].T.tolist(), strict=True)
+        rows = zip(self._rows, self._t_range[:, :, 0].T.tolist(), strict=True)
         return [
             [[np.reshape(basis_slopes(curve, end), (-1, 1)) for end in ends] for curve in row]
             for row, ends in rows
@@ -123,7 +127,7 @@ class Curves:
     def slopes(self, board: Floats) -> Floats:
         """Differentiate bias and scale of both sets w.r.t. T_board [per K], (2, 6, n)."""
         held = hold(board - self._reference, *self._t_range)
-        return self._functions.evaluate(held, 'slope')
+        return self._evaluate(held, 'slope')
 
     def regressors(self, states: Floats, phi: Floats) -> list[Floats]:
         """Differentiate bias and scale of each axis w.r.t. all parameters of a `Block`."""
@@ -135,7 +139,7 @@ class Curves:
             if place in made:
                 continue
             derivatives = []
-            for regime, row in enumerate(self._functions.rows):
+            for regime, row in enumerate(self._rows):
                 basis = row[place].basis(held[regime])
                 basis = shares[regime] * np.reshape(basis, (-1, len(t)))
                 if is_outside:
@@ -149,7 +153,7 @@ class Curves:
         """For each of the six curves, the index of the first curve with equal basis functions."""
         bases = [
             tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
-            for functions in zip(*self._functions.rows, strict=True)
+            for functions in zip(*self._rows, strict=True)
         ]
         return [bases.index(basis) for basis in bases]
 
@@ -158,7 +162,7 @@ class Curves:
         Differentiate values beyond the ranges w.r.t. a function's free coefficients, (n_free, n).
         Beyond its range a curve is a constant plus either a tangent or the other set's curve.
         """
-        function = self._functions.rows[regime][place]
+        function = self._rows[regime][place]
         own_range, other_range = (
             edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]]
         )

@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import zip_longest
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
@@ -99,11 +98,14 @@ class Polynomial(_Family):
         return replace(self, coefficients=(at_reference, *values))
 
     def _evaluate(self, t: Floats, *, is_slope: bool = False) -> Floats:
-        return _horner(self.slopes if is_slope else self.coefficients, t)
+        coefficients = self._slopes if is_slope else self.coefficients
+        result = t * 0.0 + coefficients[-1]
+        for coefficient in coefficients[-2::-1]:
+            result = result * t + coefficient
+        return np.asarray(result)
 
-    @property
-    def slopes(self) -> tuple[float, ...]:
-        """The coefficients of the polynomial's derivative."""
+    @cached_property
+    def _slopes(self) -> tuple[float, ...]:
         return tuple(k * c for k, c in enumerate(self.coefficients))[1:] or (0.0,)
 
     def basis(self, t: Kelvins) -> list[Floats]:
@@ -223,38 +225,6 @@ class Exponential(_Family):
 
 #: A function of temperature of any of the three families.
 TemperatureFunction = Polynomial | CubicSpline | Exponential
-
-
-class Functions:
-    """A table of functions of temperature; row k is evaluated at the temperatures ``t[k]``."""
-
-    def __init__(self, rows: Sequence[Sequence[TemperatureFunction]]) -> None:
-        self.rows = rows
-        places = [(i, j, function) for i, row in enumerate(rows) for j, function in enumerate(row)]
-        self._others = [place for place in places if not isinstance(place[2], Polynomial)]
-        flat = [f if isinstance(f, Polynomial) else Polynomial((0.0,)) for *_, f in places]
-        shape = -1, len(rows), len(rows[0]), 1
-        self._tables = {
-            name: np.array(list(zip_longest(*many, fillvalue=0.0))).reshape(shape)
-            for name, many in (
-                ('value', [function.coefficients for function in flat]),
-                ('slope', [function.slopes for function in flat]),
-            )
-        }
-
-    def evaluate(self, t: Floats, name: str = 'value') -> Floats:
-        """Evaluate values or slopes, (n_rows, n_functions, n), at `t` [K], (n_rows, n)."""
-        result = _horner(self._tables[name], t[:, np.newaxis])
-        for row, place, function in self._others:
-            result[row, place] = getattr(function, name)(t[row])
-        return result
-
-
-def _horner(coefficients: Floats | tuple[float, ...], t: Floats) -> Floats:
-    result = t * 0.0 + coefficients[-1]
-    for coefficient in coefficients[-2::-1]:
-        result = result * t + coefficient
-    return np.asarray(result)
 
 
 def check_reference(name: str, function: TemperatureFunction, expected: float) -> None:
