@@ -16,10 +16,10 @@ import numpy as np
 from ..recording.blocks import Block
 from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
-from ..unit.correction import Correction, is_sound
+from ..unit.correction import Correction
 from ..unit.nonlinearity import corrected_nonlinear
 from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
-from .segments import EVER_NS, SEGMENT_NS, Segment
+from .segments import EVER_NS, SEGMENT_NS, Model, Segment
 from .status import DROPPED
 
 #: Readings not queued yet, last reading first: number of samples before the reading, latest stamp
@@ -174,50 +174,41 @@ def _apply(
     angular_rate: Floats | None,
 ) -> CompensatedBlock:
     """Correct the samples of segments; return the published samples."""
-    correction, of_rate = compensator.thermal.correction, compensator.thermal.rate_correction
+    model = compensator.thermal.model
+    if model.rate_correction is None:
+        angular_rate = None
     line = rate_line = np.empty((0, 0))
     if segments:
-        slow, n_slow = _slow_rows(compensator, segments), correction.n_slow
-        line = _line(correction, segments, slow[:n_slow])
-        is_good = is_sound(line)
-        if of_rate is not None:
-            rate_line = _line(of_rate, segments, slow[n_slow:])
-            is_good &= is_sound(rate_line)
+        line, rate_line, is_good = _lines(model, segments)
         if not is_good.all():
             counts = [count for _, count in segments]
             compensator.counters.n_unsound += int(np.sum(counts, where=~is_good))
             index = index[np.repeat(is_good, counts)]
             segments = [segment for segment, good in zip(segments, is_good, strict=True) if good]
-            line, rate_line = line[:, is_good], rate_line[:, is_good[: rate_line.shape[1]]]
+            line, rate_line = line[:, is_good], rate_line[:, is_good]
     if len(index) < len(stamps):
         stamps, samples = stamps[index], samples[index]
         angular_rate = None if angular_rate is None else angular_rate[index]
     force = rate = np.empty((12, 0))
-    has_rate = angular_rate is not None and of_rate is not None
     if segments:
-        force = _corrected(line, segments, stamps, samples, correction)
+        force = _corrected(line, segments, stamps, samples, model.correction)
         is_kept = _judge(compensator, segments, stamps, samples, force)
-        if angular_rate is not None and of_rate is not None:
+        if angular_rate is not None:
             rate = _corrected(rate_line, segments, stamps, angular_rate)[:, is_kept]
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
-    rates = (rate[:3].T, rate[3:6].T) if has_rate else ()
+    rates = () if angular_rate is None else (rate[:3].T, rate[3:6].T)
     return CompensatedBlock(index, stamps, force[:3].T, force[3:].T, *rates)
 
 
-def _slow_rows(compensator: Compensator, segments: Segments) -> Floats:
-    """Evaluate the slowly varying variance of segments, once for each `SlowState`."""
-    held = {id(segment.slow): segment.slow for segment, _ in segments}
-    rows = compensator.thermal.model.slow_rows([*held.values()])
+def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
+    """Evaluate `Model.lines`, with the slowly varying variance once for each `SlowState`."""
+    each = [segment for segment, _ in segments]
+    held = {id(segment.slow): segment.slow for segment in each}
     places = {key: place for place, key in enumerate(held)}
-    return rows[:, [places[id(segment.slow)] for segment, _ in segments]]
-
-
-def _line(correction: Correction, segments: Segments, slow: Floats) -> Floats:
-    """Evaluate `Correction.line` for segments, with their slowly varying variance."""
-    start, end = (np.array([segment[at] for segment, _ in segments]).T for at in (4, 5))
-    excess = np.array([segment.noise_excess for segment, _ in segments])
-    return correction.line(start, end, slow, excess)
+    slow = model.slow_rows([*held.values()])[:, [places[id(segment.slow)] for segment in each]]
+    start, end = (np.array([segment[at] for segment in each]).T for at in (4, 5))
+    return model.lines(start, end, slow, np.array([segment.noise_excess for segment in each]))
 
 
 def _corrected(

@@ -24,7 +24,7 @@ from ..thermal.regime import Regime
 from ..thermal.state import GRADIENT
 from ..typing import Floats
 from ..unit.calibration import Calibration
-from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess, is_sound
+from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess
 from ..unit.covariance import covariance_at
 from ..unit.functions import TANGENT_SPANS
 from ..unit.nonlinearity import corrected_nonlinear
@@ -113,16 +113,13 @@ class Compensator:
         self.calibration = calibration
         self._full_scale = self._limit = calibration.unit.full_scale
         self._edge = self.thermal.correction.beyond.edge
-        self.gravity = self._gravity_check()
+        self.gravity = GravityCheck(*self._gravity_settings)
         self._corrected = corrected_nonlinear if calibration.nonlinearity else corrected
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
 
     def _stuck_check(self) -> StuckCheck:
         scales = [abs(axis.scale_factor) for axis in self.calibration.axes]
         return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales))
-
-    def _gravity_check(self) -> GravityCheck:
-        return GravityCheck(*self._gravity_settings)
 
     @property
     def _gravity_settings(self) -> tuple[float, float]:
@@ -211,26 +208,22 @@ class Compensator:
             return None
         counters = self.counters
         segment = thermal.segment(stamp_ns, counters.n_in - counters.n_out_of_order)
-        start_ns, is_new, is_too_fast, excess, start, end, _ = segment
+        start_ns, is_new, is_too_fast, excess, start, end, state = segment
         self.event_ns = min(thermal.queue.next_ns, start_ns + SEGMENT_NS, fresh_ns + 1)
-        correction = thermal.correction
-        slow, n_slow = thermal.slow_rows(segment.slow), correction.n_slow
-        line = correction.line(start, end, slow[:n_slow], excess)
-        is_good = is_sound(line)
-        if thermal.rate_correction is not None:
-            rate_line = thermal.rate_correction.line(start, end, slow[n_slow:], excess)
-            is_good &= is_sound(rate_line)
-            self.rate_line = rate_line.tolist()
+        correction, slow = thermal.correction, thermal.slow_rows(state)
+        line, rate_line, is_good = thermal.model.lines(start, end, slow, excess)
+        self.rate_line = rate_line.tolist()
         if not is_good:
             # While the correction is not finite, each sample takes this path and is dropped.
             counters.n_unsound += 1
             self.event_ns, self.last_ns = EVER_NS, stamp_ns
             return None
         self._segment = (start_ns, line.tolist(), correction.misalignment)
-        if not is_new:
-            return self.process(stamp_ns, x, y, z)
-        self.is_refusing = is_too_fast
+        if is_new:
+            self.is_refusing = is_too_fast
         row = self.process(stamp_ns, x, y, z)
+        if not is_new:
+            return row
         if self.gravity.is_refuted and not is_too_fast:
             # The check of |f| also uses samples that it drops: later ones may agree with gravity.
             self.is_refusing = True
@@ -258,7 +251,7 @@ class Compensator:
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
         self.stuck = self._stuck_check()
-        self.gravity = self._gravity_check()
+        self.gravity = GravityCheck(*self._gravity_settings)
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
 
@@ -299,8 +292,7 @@ class Compensator:
 
     def take_over(self, model: Model, config: CompensatorConfig) -> None:
         """Use `model` and `config` from now on; an object that `self` copies does not change."""
-        gravity, before = copy(self.gravity), self._gravity_settings
-        stuck = self.stuck
+        gravity, before, stuck = copy(self.gravity), self._gravity_settings, self.stuck
         self.config, self.thermal = config, copy(self.thermal)
         self.thermal.take_over(model, config, self.now_ns)
         is_same = self.calibration == model.calibration
