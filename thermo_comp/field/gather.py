@@ -55,22 +55,20 @@ class RestFinder:
     """Finds the rests in a stream of samples of one unit."""
 
     def __init__(
-        self,
-        scale: Floats,
-        noise: Floats,
-        full_scale: float,
-        state_now: StateNow,
-        cycle_s: float = 0.0,
+        self, scale: Floats, noise: Floats, full_scale: float, state_now: StateNow, cycle_s: float
     ) -> None:
         # `scale`: scale factors [input units per m/s^2]; `noise`: variance of one sample
         # [m^2/s^4] of each axis, at one sample per `cycle_s`, larger at a higher rate.
         self._scale, self._noise, self._full_scale = scale, float(noise.sum()), full_scale
         self._state_now, self._cycle_s = state_now, cycle_s
         self._cell: _Cell | None = None
+        self._forget()
+
+    def _forget(self) -> None:
         self._run: list[_Cell] = []
         self._states: list[tuple[Sequence[float], Sequence[float]]] = []
+        self._last: list[_Cell] = []  # the last cell of the previous window
         self._n_windows = 0
-        self._last: list[_Cell] = []  # sums of the last cell of the previous window
 
     def add(self, stamps: Stamps, samples: Floats) -> list[Rest]:
         """Add samples of rising stamps, (n, 3) or, with angular rates, (n, 6); return rests."""
@@ -112,9 +110,6 @@ class RestFinder:
         if not is_followed:
             self._forget()
         return rests
-
-    def _forget(self) -> None:
-        self._run, self._states, self._n_windows, self._last = [], [], 0, []
 
     def _is_still(self, cell: _Cell) -> bool:
         n = cell.n

@@ -152,36 +152,36 @@ def update(
     # The estimated shift of parameters that are not updated is an error of their old values.
     covariance = solution.posterior + solution.future + np.outer(kept, kept)
     turn_on = float(np.hypot(ageing.turn_on, ageing.rest))
-    axis_determined = [change.is_determined for change in by_axis]
     new = _shifted(calibration, shift, covariance)
-    before = calibration.provenance
     new = replace(
         new,
-        static=_with_residual(new.static, turn_on, axis_determined),
-        dynamic=_with_residual(new.dynamic, turn_on, axis_determined),
-        provenance=replace(
-            _with_update(before, series, judged),
-            created=created or before.created,
-            tested=last_rest(source) if source else '',
-            sources=(*before.sources, *([source] if source else [])),
-        ),
+        static=_with_residual(new.static, turn_on, by_axis),
+        dynamic=_with_residual(new.dynamic, turn_on, by_axis),
+        provenance=_with_update(new.provenance, series, judged, source, created),
     )
     n_outliers = len(series) - len(used)
     return Update(new, by_axis, ageing, model.changes, judged, used, n_outliers, model, solution)
 
 
-def _with_update(provenance: Provenance, series: RestSeries, judged: Judged) -> Provenance:
-    """Add the residuals on left-out rests, and a note on the update, to a provenance."""
+def _with_update(
+    before: Provenance, series: RestSeries, judged: Judged, source: Source | None, created: str
+) -> Provenance:
+    """Add the source, the residuals on left-out rests and a note on the update."""
     largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time.max()), 'D')
     residuals = ResidualSummary(
         f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
     )
     note = (
         f'updated by {int(series.n_windows.sum())} windows at rest up to {day}; before: '
-        f'{provenance.created or "no date"}. {judged}'
+        f'{before.created or "no date"}. {judged}'
     )
     return replace(
-        provenance, residuals=(*provenance.residuals, residuals), notes=(*provenance.notes, note)
+        before,
+        created=created or before.created,
+        tested=last_rest(source) if source else '',
+        sources=(*before.sources, *([source] if source else [])),
+        residuals=(*before.residuals, residuals),
+        notes=(*before.notes, note),
     )
 
 
@@ -245,10 +245,9 @@ def _axis_changes(
         present = float(np.hypot(np.sqrt(error), max(residual, scatter)))
         change = rows @ solution.shift * is_determined
         sd = np.sqrt(np.maximum(np.diag(posterior if is_determined else prior), 0.0))
-        of_scale = change[1] / gravity, sd[1] / gravity
-        values = [change[0], sd[0], *of_scale, change[2], sd[2], change[3], sd[3]]
-        values += [claimed, present]
-        shifts.append(AxisChange(name, is_determined, *map(float, values)))
+        change[1], sd[1] = change[1] / gravity, sd[1] / gravity
+        values = [*np.stack((change, sd), axis=1).ravel().tolist(), claimed, present]
+        shifts.append(AxisChange(name, is_determined, *values))
     determined[layout.misalignment :] = all(shift.is_determined for shift in shifts)
     return determined, tuple(shifts)
 
@@ -271,15 +270,9 @@ def _judged(series: RestSeries, model: Model, solution: Solution, determined: Bo
     before, after = np.array(squares).T
     gain = before - after
     gain_sd = float(gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else np.inf
-    return Judged(
-        over,
-        len(gain),
-        float(np.sqrt(before.mean())),
-        float(np.sqrt(after.mean())),
-        float(gain.mean()),
-        gain_sd,
-        int((gain < -gain_sd).sum()),
-    )
+    old, new = (float(np.sqrt(square.mean())) for square in (before, after))
+    n_worse = int((gain < -gain_sd).sum())
+    return Judged(over, len(gain), old, new, float(gain.mean()), gain_sd, n_worse)
 
 
 def _gravity_part(series: RestSeries, solution: Solution) -> Floats:
@@ -322,15 +315,12 @@ def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Cal
     )
 
 
-def _with_residual(part: RegimeSet, turn_on: float, determined: Sequence[bool]) -> RegimeSet:
+def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange]) -> RegimeSet:
     """Set the residual sd to `turn_on` on determined axes, and at least to `turn_on` on others."""
-    axes: dict[str, Any] = {
-        name: replace(
-            axis,
-            residual_sd_m_s2=turn_on if is_determined else max(turn_on, axis.residual_sd_m_s2),
-        )
-        for name, axis, is_determined in zip(AXES, part.axes(), determined, strict=True)
-    }
+    axes: dict[str, Any] = {}
+    for axis, change in zip(part.axes(), changes, strict=True):
+        sd = turn_on if change.is_determined else max(turn_on, axis.residual_sd_m_s2)
+        axes[change.axis] = replace(axis, residual_sd_m_s2=sd)
     return replace(part, **axes)
 
 
