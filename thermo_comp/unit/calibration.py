@@ -301,41 +301,41 @@ class Calibration:
     @property
     def needs_temperature(self) -> bool:
         """Whether any parameter of the correction depends on the temperature or on the regime."""
-        weights: list[float] = []
-        for axis in (axis for part in self.regime_sets() for axis in part.axes()):
-            weights += (axis.delta, *axis.bias_function.free_coefficients)
-            weights += axis.scale_function.free_coefficients
         gyroscope = self.gyroscope
-        for rate in (*gyroscope.static.axes(), *gyroscope.dynamic.axes()) if gyroscope else ():
-            weights += (rate.delta, *rate.bias_function.free_coefficients)
+        sets = (*self.regime_sets(), *((gyroscope.static, gyroscope.dynamic) if gyroscope else ()))
+        weights: list[float] = []
+        for axis in (axis for part in sets for axis in part.axes()):
+            weights += (axis.delta, *axis.bias_function.free_coefficients)
+            if isinstance(axis, AxisSet):
+                weights += axis.scale_function.free_coefficients
         for term in self.nonlinearity.terms if self.nonlinearity else ():
             weights += term.per_kelvin
-        return any(weights) or bool(self.response or (gyroscope and gyroscope.response))
+        return any(weights) or bool(self.columns)
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The columns of the specific force, then those of the angular rate."""
+        return (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
 
     @property
     def needs_case(self) -> bool:
         """Whether `detector.case` is not the default, or a column depends on one of `sensors`."""
-        columns = (*self.response, *(self.gyroscope.response if self.gyroscope else ()))
-        return self.detector.case != ThermometerSettings() or any(
-            column.is_of_sensor for column in columns
-        )
+        is_default = self.detector.case == ThermometerSettings()
+        return not is_default or any(column.is_of_sensor for column in self.columns)
 
     @property
     def has_uncertainty(self) -> bool:
         """Whether a posterior, misalignment sd, residual sd or lack of fit is given."""
-        return (
-            self.posterior is not None
-            or any(self.misalignment_sd)
-            or any(axis.residual_sd_m_s2 for part in self.regime_sets() for axis in part.axes())
-            or any(part.lack_of_fit for part in self.regime_sets())
-        )
+        sets = self.regime_sets()
+        sds = (axis.residual_sd_m_s2 for part in sets for axis in part.axes())
+        has_lacks = any(part.lack_of_fit for part in sets)
+        return self.posterior is not None or has_lacks or any((*self.misalignment_sd, *sds))
 
 
 def parameter_layout(calibration: Calibration) -> ParameterLayout:
     """Return the indices in the posterior of all parameters of a calibration."""
-    axes = zip(calibration.static.axes(), calibration.dynamic.axes(), strict=True)
     pairs: list[tuple[TemperatureFunction, TemperatureFunction]] = []
-    for static, dynamic in axes:
+    for static, dynamic in zip(*(part.axes() for part in calibration.regime_sets()), strict=True):
         pairs.append((static.bias_function, dynamic.bias_function))
         pairs.append((static.scale_function, dynamic.scale_function))
     blocks = lay_out(pairs, len(calibration.response))
@@ -392,9 +392,7 @@ def gyroscope_of(triad: Calibration) -> Gyroscope:
         for regime_set in triad.regime_sets()
     )
     sx, sy, sz = (axis.residual_sd_m_s2 for axis in triad.static.axes())
-    terms = [vars(term).copy() for term in triad.response]
-    for keys in terms:
-        del keys['scale']
+    terms = [{k: v for k, v in vars(term).items() if k != 'scale'} for term in triad.response]
     posterior = triad.posterior
     if posterior is not None:
         rows = _bias_rows(triad)

@@ -60,6 +60,8 @@ if TYPE_CHECKING:
 else:
     _Group, _Kind = Literal[tuple(GROUPS)], Literal[tuple(TERMS)]
 _Value = Annotated[float, QUANTITIES['value of a column']]
+_Lag = Annotated[float, QUANTITIES['lag']]
+_Kelvin = Annotated[float, QUANTITIES['gradient']]
 
 
 class Part(NamedTuple):
@@ -94,14 +96,10 @@ class Column:
     ]
     sensor: Annotated[str, 'Thermometer s of the gradient g_s = T_s - T_board.'] = 'case'
     tau_s: Annotated[
-        float,
-        QUANTITIES['lag'],
-        'Time constant of the lag; 0 = no lag (not in kinds board, gradient_lag and cube).',
+        _Lag, 'Time constant of the lag; 0 = no lag (not in kinds board, gradient_lag and cube).'
     ] = 0.0
     second_tau_s: Annotated[
-        float,
-        QUANTITIES['lag'],
-        'Time constant of a second stage of the lag, in series with the first; 0 = none.',
+        _Lag, 'Time constant of a second stage of the lag, in series with the first; 0 = none.'
     ] = 0.0
     sensor_share: Annotated[
         float,
@@ -109,8 +107,7 @@ class Column:
         'The part lags T_board + sensor_share * g_s (kinds board, square, cube, play, bend).',
     ] = 0.0
     lead_s: Annotated[
-        float,
-        QUANTITIES['lag'],
+        _Lag,
         'Lag of the board thermometer behind the temperature that drives the part, if '
         '`sensor_share` is 0; 0 = none.',
     ] = 0.0
@@ -118,14 +115,11 @@ class Column:
         float, QUANTITIES['width'], 'Width of kind gradient_even, half-width of a play.'
     ] = 0.0
     rest_k: Annotated[
-        float,
-        QUANTITIES['gradient'],
+        _Kelvin,
         'Gradient g_s in a soak, for the kinds gradient_even, size, and square without lag.',
     ] = 0.0
     knee_k: Annotated[
-        float,
-        QUANTITIES['gradient'],
-        'Temperature of the part less T_ref at which the slope of a bend changes.',
+        _Kelvin, 'Temperature of the part less T_ref at which the slope of a bend changes.'
     ] = 0.0
     power: Annotated[int, QUANTITIES['power'], 'Exponent of the factor T_board - T_ref.'] = 0
     during: Annotated[
@@ -310,17 +304,10 @@ class ColumnTable:
         ]
         #: Whether any column applies in only one regime.
         self.differs = bool(self._during.any())
-        # The value u of columns that differ only in power, range or regime is evaluated once.
-        of = [
-            (layout.places[c.source], c.term, c.term.centre(c), c.term.width(c)) for c in columns
-        ]
-        sources = list(dict.fromkeys(of))
-        self._source = np.array([sources.index(source) for source in of], np.int64)
-        self._places = np.array([source[0] for source in sources], np.int64)
-        self._centres, self._widths = (
-            np.array([source[k] for source in sources])[:, np.newaxis] for k in (2, 3)
-        )
-        terms = np.array([source[1] for source in sources], object)
+        self._places = np.array([layout.places[c.source] for c in columns], np.int64)
+        self._centres = np.array([c.term.centre(c) for c in columns])[:, np.newaxis]
+        self._widths = np.array([c.term.width(c) for c in columns])[:, np.newaxis]
+        terms = np.array([c.term for c in columns], object)
         self._terms = [
             (np.flatnonzero(terms == term), term)
             for term in dict.fromkeys(terms.tolist())
@@ -335,7 +322,7 @@ class ColumnTable:
         u = self._scaled(states)
         for rows, term in self._terms:
             u[rows] = term.form.value(u[rows])
-        return np.asarray(u[self._source])
+        return u
 
     def _scaled(self, states: Floats) -> Floats:
         numbers = states[self._places]
@@ -383,8 +370,8 @@ class ColumnTable:
             slopes[rows] = term.form.slope(scaled[rows])
         slopes /= self._widths
         if not len(self._parts):
-            return np.asarray(slopes[self._source]), None
+            return slopes, None
         by_board = np.zeros_like(slopes)
         by_board[self._parts] = slopes[self._parts]
         slopes[self._parts] *= np.where(self._is_lagging, -1.0, 1.0)
-        return np.asarray(slopes[self._source]), np.asarray(by_board[self._source])
+        return slopes, by_board

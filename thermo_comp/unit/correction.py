@@ -149,12 +149,10 @@ class Correction:
     def gentle_transition(self, given_s: float) -> float:
         """Lengthen a transition [s], at most 10 times, to let the force change at GENTLE_RATE."""
         board = np.linspace(*self._span, _GAP_TEMPERATURES)
-        static, dynamic = self.curves.values(board)
-        gap = dynamic - static
+        gap = np.diff(self.curves.values(board), axis=0)[0]
         scale = np.abs(gap[3:]).max(axis=0)
-        largest = float(
-            (np.sqrt(((gap[:3] / self.K) ** 2).sum(axis=0)) + self._gravity * scale).max()
-        )
+        bias = np.sqrt(((gap[:3] / self.K) ** 2).sum(axis=0))
+        largest = float((bias + self._gravity * scale).max())
         return min(max(given_s, largest / GENTLE_RATE), LONGEST_TRANSITION * given_s)
 
     def excess(self, state: Sequence[float], *, is_dynamic: bool) -> Excess:
@@ -282,9 +280,8 @@ class Correction:
         parts = np.concatenate((board[np.newaxis], board - states[self._lagged]))
         parts_out = np.abs(parts - hold(parts, *self._span)).max(axis=0)
         if is_beyond or outside.any() or parts_out.any():
-            columns_out = np.where(self._is_present, self.table.excess(raw), 0.0).max(
-                axis=1, initial=0.0
-            )
+            columns_out = np.where(self._is_present, self.table.excess(raw), 0.0)
+            columns_out = columns_out.max(axis=1, initial=0.0)
             # Outside the calibrated range the curves are extrapolated. Add two errors: the slope
             # at the edge of the range times the board's distance from the edge, and the sd of the
             # slopes within the range times the larger distance: the board's or that of a part.
@@ -323,9 +320,7 @@ class Correction:
 
 def memory_of_unit(calibration: Calibration) -> MemorySpec:
     """Return the lags, plays and rates that the columns of force and angular rate need."""
-    gyroscope = calibration.gyroscope
-    columns = (*calibration.response, *(gyroscope.response if gyroscope else ()))
-    return memory_of(columns, calibration.sensors)
+    return memory_of(calibration.columns, calibration.sensors)
 
 
 def is_sound(line: Floats) -> npt.NDArray[np.bool_]:

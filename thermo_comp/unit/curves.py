@@ -134,10 +134,8 @@ class Curves:
         t, weight = states[BOARD] - self._reference, states[WEIGHT]
         held, shares = hold(t, *self._t_range), np.array([1.0 - weight, weight])
         is_outside = bool((held != t).any())
-        made: dict[int, Floats] = {}
-        for place in self._families:
-            if place in made:
-                continue
+        result = []
+        for place in range(6):
             derivatives = []
             for regime, row in enumerate(self._rows):
                 basis = row[place].basis(held[regime])
@@ -145,17 +143,8 @@ class Curves:
                 if is_outside:
                     basis += self._followed(regime, place, t, shares)
                 derivatives += [shares[regime], *basis]
-            made[place] = np.array([*derivatives, *phi])
-        return [made[place] for place in self._families]
-
-    @cached_property
-    def _families(self) -> list[int]:
-        """For each of the six curves, the index of the first curve with equal basis functions."""
-        bases = [
-            tuple(function.with_free((0.0,) * function.n_free, 0.0) for function in functions)
-            for functions in zip(*self._rows, strict=True)
-        ]
-        return [bases.index(basis) for basis in bases]
+            result.append(np.array([*derivatives, *phi]))
+        return result
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
         """
