@@ -6,8 +6,6 @@ Owns the curves of static and dynamic set over board temperature, within and bey
 n thermal states are the columns of an array; results have the rows bias x, y, z, scale x, y, z.
 """
 
-from functools import cached_property
-
 import numpy as np
 
 from ..thermal.state import BOARD, RATE, WEIGHT
@@ -57,7 +55,6 @@ class Curves:
             )
             for part in sets
         ]
-        self._has_lacks = any(part.lack_of_fit for part in sets)
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Return excess of temperature [K] and rate [K/s], then of both in half ranges, (2, n)."""
@@ -77,8 +74,9 @@ class Curves:
         if (held != t).any():
             here, edge = (hold(at, *self._t_range[:, ::-1]) for at in (t, held))
             result += (self._evaluate(here[::-1]) - self._evaluate(edge[::-1]))[::-1]
-            for slopes, beyond in zip(self._tangents, self._beyond(t), strict=True):
-                result += slopes * beyond[:, np.newaxis]
+            ends = zip(self._t_range, self._leads, self._beyond(t), strict=True)
+            for end, leads, beyond in ends:
+                result += self._evaluate(end, 'slope')[leads] * beyond[:, np.newaxis]
         return result
 
     def _evaluate(self, t: Floats, what: str = 'value') -> Floats:
@@ -86,29 +84,14 @@ class Curves:
         pairs = zip(self._rows, t, strict=True)
         return np.array([[getattr(function, what)(at) for function in row] for row, at in pairs])
 
-    @cached_property
-    def _tangents(self) -> Floats:
-        """Slopes of the curves at the lower and upper end, each as in `slopes`, (2, 2, 6, 1)."""
-        ends = zip(self._t_range, self._leads, strict=True)
-        return np.array([self._evaluate(t, 'slope')[leads] for t, leads in ends])
-
-    @cached_property
-    def _basis_slopes(self) -> list[list[list[Floats]]]:
-        """Derivatives of functions' slopes at both ends of the range w.r.t. free coefficients."""
-        rows = zip(self._rows, self._t_range[:, :, 0].T.tolist(), strict=True)
-        return [
-            [[np.reshape(basis_slopes(curve, end), (-1, 1)) for end in ends] for curve in row]
-            for row, ends in rows
-        ]
-
     def _beyond(self, t: Floats) -> tuple[Floats, Floats]:
         """Return how far each set follows its lower and its upper tangent [K], (2, n)."""
         (lower, upper), (below, above) = self._ends, self._reaches
         return hold(t - lower, -below, 0.0), hold(t - upper, 0.0, above)
 
     def unexplained(self, board: Floats) -> Floats:
-        """Evaluate ``residual_sd_m_s2 ** 2`` plus lack of fit, shape (2, 3, n) or (2, 3, 1)."""
-        return self._residuals + self.lack_of_fit(board) if self._has_lacks else self._residuals
+        """Evaluate ``residual_sd_m_s2 ** 2`` plus lack of fit, shape (2, 3, n)."""
+        return self._residuals + self.lack_of_fit(board)
 
     def lack_of_fit(self, board: Floats) -> Floats:
         """Evaluate the variance of the lack of fit by set and axis [m^2/s^4], shape (2, 3, n)."""
@@ -152,15 +135,14 @@ class Curves:
         Beyond its range a curve is a constant plus either a tangent or the other set's curve.
         """
         function = self._rows[regime][place]
-        own_range, other_range = (
-            edges for edges in np.moveaxis(self._t_range, 1, 0)[[regime, 1 - regime]]
-        )
+        own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]
         here, edge = (
             np.reshape(function.basis(hold(at, *own_range)), (-1, len(t)))
             for at in (t, hold(t, *other_range))
         )
         result = shares[1 - regime] * (here - edge)
-        ends = zip(self._basis_slopes[regime][place], self._leads, self._beyond(t), strict=True)
-        for slopes, leads, beyond in ends:
+        ends = zip(own_range[:, 0].tolist(), self._leads, self._beyond(t), strict=True)
+        for end, leads, beyond in ends:
+            slopes = np.reshape(basis_slopes(function, end), (-1, 1))
             result += slopes * (shares * beyond)[leads == regime].sum(axis=0)
         return np.asarray(result)

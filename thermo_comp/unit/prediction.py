@@ -96,12 +96,8 @@ class SlowUncertainty:
 
     def _at(self, states: Floats, start_shares: Floats, rates: Floats) -> Floats:
         of_start = self.of_start(states, start_shares, rates)
-        table = self._correction.table
-        regressors = (
-            self._correction.curves.regressors(states, table.values(states))
-            if self._blocks
-            else []
-        )
+        curves, phi = self._correction.curves, self._correction.table.values(states)
+        regressors = curves.regressors(states, phi) if self._blocks else []
         of_misalignment, var_misalignment = self._misalignment
         n_start, (n, rank) = len(of_start), (states.shape[1], of_misalignment.shape[1])
         errors = np.zeros((9, n_start + rank, n))
@@ -123,9 +119,8 @@ class SlowUncertainty:
                 added[axis, 2] = in_order(var_scale[:, np.newaxis] * by_scale**2, 0)
                 if nonlinear is not None:
                     both = on_bias[n_start:], on_scale[n_start:]
-                    beyond.append(
-                        nonlinear.variance(nonlinear.held(states[BOARD]), *of_force, *both)
-                    )
+                    t = nonlinear.held(states[BOARD])
+                    beyond.append(nonlinear.variance(t, *of_force, *both))
             elif nonlinear is not None:
                 beyond.append(np.zeros((5, n)))
             products = on_bias * on_bias, 2.0 * (on_bias * on_scale), on_scale * on_scale
@@ -217,15 +212,10 @@ def sd_of_states(calibration: Calibration, states: Floats) -> tuple[Floats, Floa
     slow = SlowUncertainty(calibration, correction)
     forgotten = np.zeros((len(correction.memory.lags), len(states)))
     variance = slow.at(states.T, forgotten)[:9].T.reshape(-1, 3, 3)
-    board, n = states[:, BOARD], len(states)
-    regime, each = np.rint(states[:, WEIGHT]).astype(np.int64), np.arange(n)
-    unexplained, lack = (
-        np.broadcast_to(variances, (2, 3, n))[regime, :, each]
-        for variances in (
-            correction.curves.unexplained(board),
-            correction.curves.lack_of_fit(board),
-        )
-    )
+    board, each = states[:, BOARD], np.arange(len(states))
+    regime = np.rint(states[:, WEIGHT]).astype(np.int64)
+    unexplained = correction.curves.unexplained(board)[regime, :, each]
+    lack = correction.curves.lack_of_fit(board)[regime, :, each]
     warmer = states.copy()
     _add_gradient(warmer, calibration, (calibration.soak_gradient_k or (0.0, 0.0))[1])
     by_gradient = correction.bias_scale(warmer.T) - correction.bias_scale(states.T)
@@ -269,8 +259,6 @@ def _add_gradient(states: Floats, calibration: Calibration, change_k: float) -> 
         if isinstance(quantity, Gradient) and quantity.input == calibration.sensors[0]:
             states[:, place] += change_k
         elif isinstance(quantity, Lag):
-            states[:, place] += change_k * sum(
-                share
-                for (name, _), share in quantity.first_order_weights.items()
-                if name == calibration.sensors[0]
-            )
+            weights = quantity.first_order_weights.items()
+            of_first = (share for (name, _), share in weights if name == calibration.sensors[0])
+            states[:, place] += change_k * sum(of_first)
