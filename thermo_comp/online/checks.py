@@ -168,14 +168,10 @@ class RateCheck:
             return
         n, dt = n_seen - last[0], (stamp_ns - last[1]) * 1e-9
         level = self._level + n - LARGEST_RATE * dt / self._cycle_s
-        if level <= 0.0:
-            self._level = 0.0
-            self.is_too_fast = False
-        else:
-            # Excess samples are counted up to twice the allowance, so that the alarm ends soon
-            # after a long excess.
-            self._level = min(level, 2.0 * self._allowance)
-            self.is_too_fast = self._counts_cycles and self._level > self._allowance
+        # Excess samples are counted up to twice the allowance, so that the alarm ends soon after a
+        # long excess.
+        self._level = min(max(level, 0.0), 2.0 * self._allowance)
+        self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
         if dt >= _WINDOW_S:
             self.ratio = n * self._cycle_s / dt
@@ -220,10 +216,8 @@ class GravityCheck:
     ) -> None:
         """Take a force [m/s^2], its covariance (xx to zz), and the trace of its noise part."""
         self._watch_step(stamp_ns, force, covariance, noise)
-        if (
-            not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
-            or not 0 <= stamp_ns - self._last_ns < 3 * WINDOW_NS
-        ):
+        since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns
+        if not (0 <= since_ns < LONGEST_WINDOW_NS and 0 <= step_ns < 3 * WINDOW_NS):
             self._forces = []
         if not self._forces:
             self._begin_ns = stamp_ns
@@ -247,10 +241,7 @@ class GravityCheck:
             return
         # Largest difference of two samples at rest, including four sd of the noise difference.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
-        was_resting, reference = (
-            self._is_resting,
-            self._off[0] if self._off else self._last_mean or (),
-        )
+        was_resting, reference = self._is_resting, (self._off or [self._last_mean or ()])[0]
         is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
         variance = max(variance_along(force, covariance), noise / 3.0)
         residual = math.hypot(*force) - self.gravity

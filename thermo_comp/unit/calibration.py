@@ -253,7 +253,10 @@ class Calibration:
             check_ranges(self, rest_gradient_range_k=QUANTITIES['temperature span'])
         check_limits(self, parameter_layout(self))
         if self.gyroscope is not None:
-            self._check_gyroscope()
+            try:
+                rate_triad(self)  # the rules for the three accelerometers apply
+            except ValueError as error:
+                raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 
     def _check_misalignment(self) -> None:
         for (row, column), value in np.ndenumerate(np.array(self.misalignment)):
@@ -278,13 +281,6 @@ class Calibration:
                     f'`response[{k}].sensor` must be one of sensors {list(names)}, '
                     f'got {term.sensor!r}'
                 )
-
-    def _check_gyroscope(self) -> None:
-        """Check the gyroscope by the rules for the three accelerometers."""
-        try:
-            rate_triad(self)
-        except ValueError as error:
-            raise ValueError(str(error).replace('`', '`gyroscope.', 1)) from error
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any

@@ -237,12 +237,9 @@ def _family(
     widths: Sequence[float] = (0.0,),
 ) -> list[Column]:
     """Return the columns of a group: one for each combination of the listed values."""
+    ranges = {kind: TERMS[kind].bounds or UNBOUNDED for kind in kinds}
     return [
-        Column(
-            *(group, kind, sensor, *part, width),
-            power=power,
-            range=TERMS[kind].bounds or UNBOUNDED,
-        )
+        Column(group, kind, sensor, *part, width, power=power, range=ranges[kind])
         for sensor, kind, power, part, width in product(sensors, kinds, powers, lags, widths)
     ]
 
@@ -269,10 +266,6 @@ def memory_of(columns: Iterable[Column], sensors: Sequence[str] = ('case',)) -> 
 _DURING: Final = ('always', 'static', 'dynamic')
 
 
-def _root(order: int, x: float) -> float:
-    return float(x ** (1.0 / order))
-
-
 class ColumnTable:
     """
     Evaluates columns at thermal states (width, n), with results (n_columns, n). The result of a
@@ -291,17 +284,11 @@ class ColumnTable:
         self._reference = reference_temperature
         lower, upper = temperature_range_c
         self._t_range = lower - reference_temperature, upper - reference_temperature
-        self._range = (
-            np.array([column.range for column in columns]).reshape(-1, 2).T[:, :, np.newaxis]
-        )
+        ranges = np.array([column.range for column in columns])
+        self._range = ranges.reshape(-1, 2).T[:, :, np.newaxis]
         self._power = np.array([column.power for column in columns], np.int64)
-        self._lowered = np.maximum(self._power - 1, 0)
         self._during = np.array([_DURING.index(column.during) for column in columns], np.int64)
-        orders = np.array([column.term.order for column in columns], np.int64)
-        self._roots = [
-            (np.flatnonzero(orders == order), partial(_root, order))
-            for order in set(orders.tolist()) - {1}
-        ]
+        self._orders = np.array([column.term.order for column in columns], np.int64)
         #: Whether any column applies in only one regime.
         self.differs = bool(self._during.any())
         self._places = np.array([layout.places[c.source] for c in columns], np.int64)
@@ -342,7 +329,8 @@ class ColumnTable:
         """
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
-        for rows, root in self._roots:
+        for order in {*self._orders.tolist()} - {1}:
+            rows, root = self._orders == order, partial(pow, exp=1.0 / order)
             excess[rows] = by_element(root, 1.0 + excess[rows]) - 1.0
         return excess
 
@@ -352,7 +340,7 @@ class ColumnTable:
         n_powers = int(self._power.max(initial=0))
         powers = np.multiply.accumulate([np.ones_like(t), *[t] * n_powers])
         shares = np.array([np.ones_like(weight), 1.0 - weight, weight])[self._during]
-        lowered = self._power[:, np.newaxis] * powers[self._lowered] if n_powers else 0.0
+        lowered = self._power[:, np.newaxis] * powers[np.maximum(self._power - 1, 0)]
         return powers[self._power] * shares, lowered * shares
 
     def values(self, states: Floats) -> Floats:
