@@ -16,16 +16,15 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Final, TypeVar
+from typing import Final
 
 from ..thermal.lags import BOARD_INPUT
 from ..thermal.plausibility import Fault
 from ..thermal.regime import Regime
 from ..thermal.state import GRADIENT
-from ..typing import Floats
 from ..unit.calibration import Calibration
 from ..unit.correction import SCALE_VARIANCES, VARIANCES, Excess
-from ..unit.covariance import covariance_at
+from ..unit.covariance import Real, covariance_at
 from ..unit.functions import TANGENT_SPANS
 from ..unit.nonlinearity import corrected_nonlinear
 from .checks import MOTION, GravityCheck, StuckCheck
@@ -54,8 +53,6 @@ CONTINUED: Final = (
 
 #: Specific force x, y, z [m/s^2] and the covariance xx, xy, xz, yy, yz, zz [m^2/s^4].
 Corrected = tuple[float, float, float, float, float, float, float, float, float]
-# Type of a quantity: the value of one sample, or an array of many samples.
-Real = TypeVar('Real', float, Floats)
 
 
 @dataclass(frozen=True, slots=True)

@@ -249,13 +249,13 @@ def _spinning(radius: float, rates: tuple[float, ...], seed: int) -> tuple[Posit
     program = parse_cyclogram('three-soaks')
     begins = tuple(end - _LEAD_S for end in _SOAK_ENDS_S)
     time, rate = steps(begins, rates, _DWELL_S, _RAMP_S)
-    across = np.roll(positions(12, seed), 1, axis=1)
-    result = []
-    for inward, other in zip(positions(12, seed), across, strict=True):
-        up = np.cross(inward, other)
-        spin = Spin(time, rate, radius, inward)
-        result.append(Position(program, up / np.linalg.norm(up), spin))
-    return tuple(result)
+    inward = positions(12, seed)
+    ups = np.cross(inward, np.roll(inward, 1, axis=1))
+    spins = [Spin(time, rate, radius, direction) for direction in inward]
+    return tuple(
+        Position(program, up / np.linalg.norm(up), spin)
+        for up, spin in zip(ups, spins, strict=True)
+    )
 
 
 def _positions(program: Cyclogram, ups: Floats) -> tuple[Position, ...]:

@@ -149,8 +149,7 @@ class ThermalResponse:
         self.network, self._time = network, time
         heat = network.thermostat
         if heat is not None:
-            n = len(network.nodes)
-            watts = [network.settled(float(a))[n] for a in (air.max(), air.min())]
+            watts = [network.settled(float(a))[-1] for a in (air.max(), air.min())]
             if watts[0] < 0.0 or watts[1] > heat.max_power:
                 raise ValueError(
                     f'air of {air.min():g}..{air.max():g} degC needs {watts[0]:.2f}..'

@@ -94,18 +94,11 @@ def arrays(
     unit: UnitModel, stations: Sequence[Position], seed: int = 0, *, rate_hz: float = 4.0
 ) -> list[SimulatedRun]:
     """Simulate all positions of a test in memory, each with another seed, stamps from 0."""
-    return [
-        simulate(
-            unit,
-            station.program,
-            station.up,
-            rate_hz=rate_hz,
-            seed=1000 * seed + k,
-            start_ns=0,
-            spin=station.spin,
-        )
-        for k, station in enumerate(stations)
-    ]
+    runs = []
+    for number, station in enumerate(stations, 1000 * seed):
+        options: dict[str, Any] = {'seed': number, 'spin': station.spin, 'start_ns': 0}
+        runs.append(simulate(unit, station.program, station.up, rate_hz=rate_hz, **options))
+    return runs
 
 
 def simulate_blocks(

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 
 from ..quantities import QUANTITIES
 from ..typing import Floats
-from .covariance import N_COEFFICIENTS, covariance_at
+from .covariance import N_COEFFICIENTS, Real, covariance_at
 from .functions import hold, in_order
 from .gravity import STANDARD_GRAVITY
 from .schema import Vector, check_ranges
@@ -43,9 +43,6 @@ LARGEST_SLOPE = 0.2
 
 #: Index of the first coefficient of the nonlinearity in a result of `Correction.line`.
 _NONLINEAR: Final = 12 + N_COEFFICIENTS
-
-# Type of a quantity: the value of one sample, or an array of many samples.
-Real = TypeVar('Real', float, Floats)
 
 
 @dataclass(frozen=True)
@@ -259,17 +256,13 @@ class ForceCorrection:
         scale, (rank, n). The covariances of Kq with other parameters are omitted: most are
         negative, so in most cases the result is too large.
         """
-        kinds = [term.kind for term in self._of.terms]
-        k = len(kinds)
-        units = np.array([unit_of(kind) for kind in kinds]).reshape(-1, 1)
-        along = (rows[:k, :, np.newaxis] + t * rows[k:, :, np.newaxis]) / units[:, np.newaxis]
-        alone = (rest[:k, np.newaxis] + t * t * rest[k:, np.newaxis]) / (units * units)
-        none = np.zeros_like(on_bias), np.zeros_like(t)
-        terms = [
-            (along[kinds.index(kind)], alone[kinds.index(kind)]) if kind in kinds else none
-            for kind in POWERS
-        ]
-        (n2, v2), (nq, vq), (n3, v3) = terms
+        k = len(self._of.terms)
+        kinds = [list(POWERS).index(term.kind) for term in self._of.terms]
+        units = np.array([unit_of(term.kind) for term in self._of.terms]).reshape(-1, 1)
+        along, alone = np.zeros((3, *on_bias.shape)), np.zeros((3, len(t)))
+        along[kinds] = (rows[:k, :, np.newaxis] + t * rows[k:, :, np.newaxis]) / units[:, :, None]
+        alone[kinds] = (rest[:k, np.newaxis] + t * t * rest[k:, np.newaxis]) / (units * units)
+        (n2, nq, n3), (v2, vq, v3) = along, alone
         # Products and sums are explicit, because results of BLAS depend on the arrays' alignment.
         products = (
             2.0 * on_bias * n2,
