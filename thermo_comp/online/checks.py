@@ -231,10 +231,7 @@ class GravityCheck:
     def _watch_step(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """
-        Refute the calibration if |f| steps from its value at rest to a value out of the tolerance
-        and keeps the new value for `STEP_NS`; a step refutes sooner than means of windows do.
-        """
+        """Refute the calibration if |f| steps, at rest, beyond the tolerance for `STEP_NS`."""
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False

@@ -84,10 +84,7 @@ class Model:
         self.inputs = (BOARD_INPUT, *calibration.sensors)
 
     def slow_rows(self, held: Sequence[SlowState]) -> Floats:
-        """
-        Evaluate the slowly varying variance of the force, `Correction.n_slow` rows, then that of
-        the angular rate, shape (rows, len(held)).
-        """
+        """Evaluate the slow variance of force (`n_slow` rows), then of angular rate, (rows, n)."""
         states, shares, rates = (np.array(part).T for part in zip(*held, strict=True))
         return np.concatenate([part.at(states, shares, rates) for part in self.uncertainty])
 

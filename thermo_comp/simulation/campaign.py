@@ -188,10 +188,7 @@ class Spin:
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """
-    A position of a test: the chamber's program, the direction of the specific force at rest, and a
-    rotation whose centripetal acceleration adds to the specific force.
-    """
+    """A position of a test: chamber program, direction of the force at rest, and a rotation."""
 
     program: Cyclogram
     up: Floats

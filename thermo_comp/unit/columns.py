@@ -9,13 +9,9 @@ dynamic regime. u is limited to the column's range, and t to the calibrated temp
 the calibrated temperatures the curves of the sets first continue along tangents, but t^power is
 constant, because no recording determines the weights of columns at these temperatures.
 
-The function `bank` makes the columns in groups. A group has the columns of the kind with the
-group's name, except for the following groups. Group *product* has the kind board, and group
-*gradient_x_temperature* the kinds gradient and gradient_lag, times a power of temperature, for
-coefficients that change with temperature. Group *square* also has the kind cube, and group
-*gradient_even* also the kinds size and square. Group *gradient_even_about_rest* has the kinds of
-*gradient_even*, for the gradient less its rest value. The fit makes group *part* of board, square
-and cube: their sum with a curve over the board temperature is a curve over a part's temperature.
+The function `bank` makes the columns in groups, which have one kind or more. The fit makes group
+*part* of board, square and cube: their sum with a curve over the board temperature is a curve over
+a part's temperature.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -267,10 +263,7 @@ _DURING: Final = ('always', 'static', 'dynamic')
 
 
 class ColumnTable:
-    """
-    Evaluates columns at thermal states (width, n), with results (n_columns, n). The result of a
-    state does not depend on the other states.
-    """
+    """Evaluates columns at thermal states (width, n), each state by itself: (n_columns, n)."""
 
     def __init__(
         self,
@@ -323,10 +316,7 @@ class ColumnTable:
         return hold(raw, *self._range)
 
     def excess(self, raw: Floats) -> Floats:
-        """
-        Return how far the value of each column is outside the column's range, in half ranges; for
-        a power of a quantity, how far the quantity is outside its range.
-        """
+        """Return the excess over the range [half ranges]; for a power, that of its base."""
         lower, upper = self._range
         excess = np.asarray(np.abs(raw - self.held(raw)) / ((upper - lower) / 2.0))
         for order in {*self._orders.tolist()} - {1}:

@@ -130,10 +130,8 @@ class Curves:
         return result
 
     def _followed(self, regime: int, place: int, t: Floats, shares: Floats) -> Floats:
-        """
-        Differentiate values beyond the ranges w.r.t. a function's free coefficients, (n_free, n).
-        Beyond its range a curve is a constant plus either a tangent or the other set's curve.
-        """
+        """Differentiate values beyond the ranges w.r.t. free coefficients, (n_free, n)."""
+        # Beyond its range a curve is a constant plus either a tangent or the other set's curve.
         function = self._rows[regime][place]
         own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]
         here, edge = (

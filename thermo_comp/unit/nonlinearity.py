@@ -98,10 +98,7 @@ class Nonlinearity:
             raise ValueError(f'`terms` must be of {list(POWERS)}, at most one each, in this order')
 
     def check_slope(self, force: float, temperatures: Sequence[float]) -> None:
-        """
-        Raise ValueError if the slope of the terms reaches `LARGEST_SLOPE` at a |f| up to `force`
-        [m/s^2], at one of the temperatures [K from T_ref].
-        """
+        """Raise ValueError if the slope is too large up to |f| = `force` [m/s^2], at any t [K]."""
         for t in temperatures:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
             slope = float(np.max(2.0 * (k2 + kq) * force + 3.0 * k3 * force * force))
@@ -199,10 +196,7 @@ class BeyondForce(NamedTuple):
 
 
 def beyond_force(calibration: Calibration) -> BeyondForce:
-    """
-    Return the variance of an unknown square term beyond the largest |f| in the fit, or, if the
-    calibration has no nonlinearity, beyond a force of 1 % above gravity.
-    """
+    """Return the variance of an unknown square term beyond the |f| of the fit, or at rest."""
     known = calibration.nonlinearity
     edge = known.force_range_m_s2[1] if known else AT_REST * calibration.gravity_m_s2
     sd = (known.beyond_sd_g_g2 if known else K2_SD) / STANDARD_GRAVITY

@@ -231,10 +231,7 @@ def ramp_states(
     rate: float = 0.0,
     lasted_s: Floats | float = 0.0,
 ) -> Floats:
-    """
-    Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted for `lasted_s` [s];
-    the gradient due to self-heating is `soak_gradient_k`.
-    """
+    """Build thermal states (n, width) of a ramp at `rate` [K/s] that has lasted `lasted_s` [s]."""
     layout = StateLayout(memory_of_unit(calibration))
     states = np.zeros((len(temperature), layout.width))
     states[:, BOARD], states[:, WEIGHT] = temperature, float(rate != 0.0)
