@@ -7,6 +7,7 @@ The compensator uses the temperature readings one by one. The segments between t
 collected, evaluated together and applied to all samples with the arithmetic of single samples.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from operator import itemgetter
 from typing import Final, TypeAlias
@@ -16,9 +17,7 @@ import numpy as np
 from ..recording.blocks import Block
 from ..thermal.reading_queue import DISORDER_NS, NEVER_NS, PENDING_LIMIT
 from ..typing import Bools, Floats, Ints, Stamps
-from ..unit.correction import Correction
-from ..unit.nonlinearity import corrected_nonlinear
-from .compensator import TIME_JUMP_NS, Compensator, corrected, corrected_rate
+from .compensator import TIME_JUMP_NS, Compensator, corrected_rate
 from .segments import EVER_NS, SEGMENT_NS, Model, Segment
 from .status import DROPPED
 
@@ -27,6 +26,8 @@ from .status import DROPPED
 _Arrivals: TypeAlias = list[tuple[int, int, str, int, float]]
 #: Segments of the correction, each with its number of samples.
 Segments: TypeAlias = list[tuple[Segment, int]]
+#: Arithmetic of samples: function of a line, time since the segment's start [s], and x, y, z.
+_Arithmetic: TypeAlias = Callable[..., Sequence[Floats]]
 #: Code of the reason for which a sample is dropped; the code 0 marks a published sample.
 _REASONS = {name: number for number, name in enumerate(DROPPED, 1)}
 _TOO_FAST, _REFUTED = _REASONS['n_too_fast'], _REASONS['n_refuted']
@@ -189,12 +190,21 @@ def _apply(
     if len(index) < len(stamps):
         stamps, samples = stamps[index], samples[index]
         angular_rate = None if angular_rate is None else angular_rate[index]
+    correction = model.correction
+
+    def force_of(line: list[Floats], dt: Floats, x: Floats, y: Floats, z: Floats) -> list[Floats]:
+        row = compensator.evaluate(line, correction.misalignment, dt, x, y, z)
+        row = correction.beyond.widened(*row)
+        return [row[place] for place in _COLUMNS]
+
     force = rate = np.empty((12, 0))
     if segments:
-        force = _corrected(line, segments, stamps, samples, model.correction)
+        force = _corrected(force_of, line, segments, stamps, samples)
         is_kept = _judge(compensator, segments, stamps, samples, force)
         if angular_rate is not None:
-            rate = _corrected(rate_line, segments, stamps, angular_rate)[:, is_kept]
+            rate = _corrected(corrected_rate, rate_line, segments, stamps, angular_rate)[
+                :, is_kept
+            ]
         if not is_kept.all():
             index, stamps, force = index[is_kept], stamps[is_kept], force[:, is_kept]
     rates = () if angular_rate is None else (rate[:3].T, rate[3:6].T)
@@ -212,24 +222,12 @@ def _lines(model: Model, segments: Segments) -> tuple[Floats, Floats, Bools]:
 
 
 def _corrected(
-    table: Floats,
-    segments: Segments,
-    stamps: Stamps,
-    samples: Floats,
-    correction: Correction | None = None,
+    evaluate: _Arithmetic, table: Floats, segments: Segments, stamps: Stamps, samples: Floats
 ) -> Floats:
-    """
-    Return force and row-major covariance of segments, (12, n), or, without the correction of the
-    force, angular rates and their variances, (6, n).
-    """
-    each = [segment for segment, _ in segments]
-    start_ns = np.array([segment.start_ns for segment in each], dtype=np.int64)
+    """Apply the arithmetic of samples to segments, whose lines are the columns of `table`."""
+    start_ns = np.array([segment.start_ns for segment, _ in segments], dtype=np.int64)
     ends = np.cumsum([count for _, count in segments])
-    order = range(6) if correction is None else _COLUMNS
-    is_nonlinear = correction is not None and correction.of_force is not None
-    corrected_force = corrected_nonlinear if is_nonlinear else corrected
-    n = len(stamps)
-    result = np.empty((len(order), n))
+    n, parts = len(stamps), []
     # Samples that are not finite are corrected like all others; the caller drops them.
     with np.errstate(invalid='ignore', over='ignore'):
         for begin in range(0, n, PIECE):
@@ -239,16 +237,8 @@ def _corrected(
             counts = np.diff(np.minimum(ends[low:high], stop), prepend=begin)
             dt = (stamps[begin:stop] - np.repeat(start_ns[low:high], counts)) * 1e-9
             line = list(np.repeat(table[:, low:high], counts, axis=1))
-            x, y, z = samples[begin:stop].T
-            values: tuple[Floats, ...]
-            if correction is None:
-                values = corrected_rate(line, dt, x, y, z)
-            else:
-                values = corrected_force(line, correction.misalignment, dt, x, y, z)
-                values = correction.beyond.widened(*values)
-            for column, place in zip(result, order, strict=True):
-                column[begin:stop] = values[place]
-    return result
+            parts.append(np.array(evaluate(line, dt, *samples[begin:stop].T)))
+    return np.concatenate(parts, axis=1)
 
 
 def _judge(

@@ -111,7 +111,7 @@ class Compensator:
         self._full_scale = self._limit = calibration.unit.full_scale
         self._edge = self.thermal.correction.beyond.edge
         self.gravity = GravityCheck(*self._gravity_settings)
-        self._corrected = corrected_nonlinear if calibration.nonlinearity else corrected
+        self.evaluate = corrected_nonlinear if calibration.nonlinearity else corrected
         self.leap_ns = max(LEAP_NS, round(LEAP_CYCLES * 1e9 * calibration.unit.cycle_time_s))
 
     def _stuck_check(self) -> StuckCheck:
@@ -157,7 +157,7 @@ class Compensator:
             return None
         self.counters.n_out += 1
         start_ns, line, misalignment = self._segment
-        row = self._corrected(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
+        row = self.evaluate(line, misalignment, (stamp_ns - start_ns) * 1e-9, x, y, z)
         edge = self._edge
         if -edge < row[0] < edge and -edge < row[1] < edge and -edge < row[2] < edge:
             return row
