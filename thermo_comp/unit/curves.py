@@ -48,13 +48,8 @@ class Curves:
         self._residuals = np.array(
             [[[axis.residual_sd_m_s2**2] for axis in part.axes()] for part in sets]
         )
-        self._lacks = [
-            (
-                np.array([point.temperature_c for point in part.lack_of_fit]),
-                np.array([point.sd_m_s2 for point in part.lack_of_fit]).T ** 2,
-            )
-            for part in sets
-        ]
+        lacks = ([(p.temperature_c, *p.sd_m_s2) for p in part.lack_of_fit] for part in sets)
+        self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
 
     def excess(self, states: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Return excess of temperature [K] and rate [K/s], then of both in half ranges, (2, n)."""
@@ -96,7 +91,8 @@ class Curves:
     def lack_of_fit(self, board: Floats) -> Floats:
         """Evaluate the variance of the lack of fit by set and axis [m^2/s^4], shape (2, 3, n)."""
         result = np.zeros((2, 3, len(board)))
-        for regime, (at, variance) in enumerate(self._lacks):
+        for regime, points in enumerate(self._lacks):
+            at, variance = points[0], points[1:] ** 2
             if len(at) == 1:
                 result[regime] += variance
             elif len(at):
