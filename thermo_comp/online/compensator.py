@@ -273,7 +273,7 @@ class Compensator:
 
     def swap(self, calibration: Calibration) -> None:
         """Use `calibration` instead of the present calibration from the next sample on."""
-        vars(self).update(vars(self.successor(Model(calibration), self.config)))
+        self.take_over(Model(calibration), self.config)
 
     def successor(self, model: Model, config: CompensatorConfig) -> Compensator:
         """
