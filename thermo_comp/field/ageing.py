@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -54,6 +54,8 @@ _SLOPE_WALK = _BENDS[0] / np.sqrt(365.25)
 #: with the cube of this number.
 _ROWS, _SEARCH_ROWS, _MOST_ROWS = 6, 3, 600
 
+_Kind: TypeAlias = Literal['levels', 'gravity', 'curve']
+
 
 @dataclass(frozen=True)
 class Ageing:
@@ -84,7 +86,7 @@ class Change:
     may_be_gravity: whether a jump of gravity explains the rests about as well as a jump of levels
     """
 
-    kind: Literal['levels', 'gravity', 'curve']
+    kind: _Kind
     time: float | None
     sd: float
     log_bayes_factor: float
@@ -336,18 +338,14 @@ def _candidates(model: Model, inverse: Floats) -> Iterator[Change]:
     after = np.cumsum(np.cumsum(precision[::-1, ::-1], axis=0), axis=1)[::-1, ::-1]
     gradient = np.cumsum(gradient[::-1], axis=0)[::-1]
     known = {(change.kind, change.time) for change in model.changes}
-    places: tuple[tuple[Literal['levels', 'gravity'], slice], ...]
-    places = ('levels', slice(6)), ('gravity', slice(6, width))
-    for k in range(n):
-        time = float(rows.time[first[k]])
-        for kind, at in places:
+    parts: list[tuple[_Kind, slice]] = [('levels', slice(6)), ('gravity', slice(6, width))]
+    for k, time in enumerate(rows.time[first].tolist()):
+        for kind, at in parts:
             for sd in _JUMPS if (kind, time) not in known else ():
                 gain = _log_bayes_factor(after[k, k][at, at], gradient[k, at], sd)
                 yield Change(kind, time, sd, gain - float(np.log(n * len(_JUMPS))))
-    if ('curve', None) in known:
-        return
     by_slope = rows.by_slope
-    for sd in _BENDS:
+    for sd in _BENDS if ('curve', None) not in known else ():
         gain = _log_bayes_factor(by_slope.T @ inverse @ by_slope, by_slope.T @ alpha, sd)
         yield Change('curve', None, sd, gain - float(np.log(len(_BENDS))))
 

@@ -143,10 +143,9 @@ def read_rests(
     if others:
         notes.append(f'rests of {", ".join(sorted(others))} are not of unit {wanted}: left out')
     if not rests:
-        found = ': the files contain no rests'
-        if others:
-            found = f': the rests are of {", ".join(sorted(others))}'
-        raise RecordingError(f'no rest of unit {wanted}{found}', ', '.join(map(str, paths)))
+        of_others = f'the rests are of {", ".join(sorted(others))}'
+        found = of_others if others else 'the files contain no rests'
+        raise RecordingError(f'no rest of unit {wanted}: {found}', ', '.join(map(str, paths)))
     begin, _, is_update = valid_since(calibration)
     # The name of an update's source has the time of the last rest rounded down to a second.
     first_ns = begin * _DAY_NS + 1e9 * is_update
@@ -298,12 +297,9 @@ def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:
     group = np.zeros(len(start), dtype=np.int64)
     first = 0
     for k in range(1, len(start)):
-        is_same = (
-            start[k] == start[first]
-            and abs(temperature[k] - temperature[first]) < 1.0
-            and np.abs(direction[k] - direction[first]).max() < 1e-3
-            and k - first < 60
-        )
+        is_near = np.abs(direction[k] - direction[first]).max() < 1e-3
+        is_near &= abs(temperature[k] - temperature[first]) < 1.0
+        is_same = is_near and start[k] == start[first] and k - first < 60
         first = first if is_same else k
         group[k] = group[k - 1] + (not is_same)
     return group
@@ -346,11 +342,10 @@ def _variance_along(correction: Correction, slow: SlowUncertainty, at: _Geometry
     """Return the variance of the error along u without the noise of a sample, (n,)."""
     columns, x = at.states.T, at.x.T
     line = list(correction.line(columns, columns, slow.at(columns, at.shares.T), 0.0))
-    covariance = (
-        covariance_at(line[12:], *x)
-        if correction.of_force is None
-        else nonlinear_covariance(line, correction.misalignment, *x)
-    )
+    if correction.of_force is None:
+        covariance = covariance_at(line[12:], *x)
+    else:
+        covariance = nonlinear_covariance(line, correction.misalignment, *x)
     i, j = np.triu_indices(3)
     products = at.u[:, i] * at.u[:, j] * np.where(i == j, 1.0, 2.0)
     of_one_sample = (at.v**2 * np.array(correction.noise)).sum(axis=1)

@@ -33,8 +33,6 @@ OVERRIDES = ('gravity', 'unit')
 #: shock), and in claimed sd (30, some milli-g for a poor sensor). An RMS above both limits is
 #: taken for that of another unit.
 _LARGEST_PART, _LARGEST_SIGMAS = 1e-3, 30.0
-#: Default time of use after the last rest, for which the covariance includes ageing [days].
-AHEAD_DAYS = 1.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ def update(
     calibration: Calibration,
     source: Source | None = None,
     created: str = '',
-    ahead: float = AHEAD_DAYS,
+    ahead: float = 1.0,
     *,
     is_gravity_certain: bool = False,
 ) -> Update:
@@ -306,13 +304,12 @@ def refuse_another_unit(result: Update) -> None:
 def _shifted(calibration: Calibration, shift: Floats, covariance: Floats) -> Calibration:
     """Add a shift to a calibration's parameters; multiply K by 1 + the shift of the scale."""
     layout = parameter_layout(calibration)
-    of_scale = np.array([shift[block.static] for block in layout.scale])
     K = np.array([axis.scale_factor for axis in calibration.axes])
-    if not shift.any():
-        return with_parameters(calibration, K, parameters_of(calibration), covariance)
-    return with_parameters(
-        calibration, K * (1.0 + of_scale), parameters_of(calibration) + shift, covariance
-    )
+    K *= 1.0 + shift[[block.static for block in layout.scale]]
+    parameters = parameters_of(calibration)
+    if shift.any():
+        parameters += shift
+    return with_parameters(calibration, K, parameters, covariance)
 
 
 def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange]) -> RegimeSet:
