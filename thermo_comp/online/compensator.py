@@ -149,11 +149,9 @@ class Compensator:
             stuck.last = (x, y, z, stamp_ns)
             stuck.runs = ()
         limit = self._limit
+        is_stuck = is_stuck or (stuck.is_on and not (x or y or z))
         if is_stuck or not (-limit < x < limit and -limit < y < limit and -limit < z < limit):
             self._count_bad(x, y, z)
-            return None
-        if not (x or y or z) and stuck.is_on:
-            self.counters.n_stuck += 1
             return None
         self.counters.n_out += 1
         start_ns, line, misalignment = self._segment
