@@ -248,10 +248,8 @@ class Model:
     def log_covariance(self, ageing: Ageing) -> Floats:
         """Return the covariance of the log sds of `Ageing`, by Fisher information and prior."""
         inverse = self.inverse(ageing)
-        parts = [
-            2.0 * sd**2 * inverse @ part
-            for sd, part in zip(vars(ageing).values(), self.parts, strict=True)
-        ]
+        pairs = zip(vars(ageing).values(), self.parts, strict=True)
+        parts = [2.0 * sd**2 * inverse @ part for sd, part in pairs]
         information = [[0.5 * float((a * b.T).sum()) for a in parts] for b in parts]
         return np.asarray(np.linalg.inv(information + np.eye(len(parts)) / _LOG_SD**2))
 

@@ -190,9 +190,8 @@ def valid_since(calibration: Calibration) -> tuple[float, float, bool]:
     The first time is that of the last rest of an update, else the date of the test or of the file,
     or -inf without a date.
     """
-    names = [
-        source.name for source in calibration.provenance.sources if source.name.startswith(_UNTIL)
-    ]
+    every = (source.name for source in calibration.provenance.sources)
+    names = [name for name in every if name.startswith(_UNTIL)]
     text = names[-1].removeprefix(_UNTIL) if names else calibration.provenance.date
     date, _, aged = text.partition(_AGED)
     try:

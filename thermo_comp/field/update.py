@@ -166,9 +166,8 @@ def _with_update(
 ) -> Provenance:
     """Add the source, the residuals on left-out rests and a note on the update."""
     largest, day = float(np.abs(series.residual).max()), np.datetime64(int(series.time.max()), 'D')
-    residuals = ResidualSummary(
-        f'left-out {judged.over}', judged.n, judged.before, judged.after, largest
-    )
+    section = f'left-out {judged.over}'
+    residuals = ResidualSummary(section, judged.n, judged.before, judged.after, largest)
     note = (
         f'updated by {int(series.n_windows.sum())} windows at rest up to {day}; before: '
         f'{before.created or "no date"}. {judged}'

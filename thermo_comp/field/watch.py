@@ -176,13 +176,11 @@ def _smoothed(day: Ints, ratio: Floats) -> tuple[Ints, Floats]:
     RMS of a week, perhaps of a disturbed day, is replaced by the second largest.
     """
     n = np.arange(len(day))
-    first = np.minimum(
-        np.searchsorted(day, day - _WINDOW_DAYS, side='right'), np.maximum(n - 1, 0)
-    )
+    first = np.searchsorted(day, day - _WINDOW_DAYS, side='right')
+    first = np.minimum(first, np.maximum(n - 1, 0))
     squares = [np.sort(ratio[i : k + 1] ** 2) for i, k in zip(first, n, strict=True)]
-    return first, np.sqrt(
-        [(values.sum() - np.diff(values[-2:]).sum()) / len(values) for values in squares]
-    )
+    means = [(values.sum() - np.diff(values[-2:]).sum()) / len(values) for values in squares]
+    return first, np.sqrt(means)
 
 
 def _forecasts(

@@ -134,9 +134,8 @@ class ThermalSide:
         self._last_end: tuple[int, int, tuple[float, ...]] | None = None
 
     def _new_tracker(self) -> ThermalTracker:
-        return ThermalTracker(
-            self.calibration.detector, self.correction.memory, *self._tracker_config()
-        )
+        settings = self.calibration.detector
+        return ThermalTracker(settings, self.correction.memory, *self._tracker_config())
 
     def _tracker_config(self) -> tuple[ThermalConfig, float, tuple[float, float]]:
         gentle_s = self.correction.gentle_transition(self.config.transition_time_s)

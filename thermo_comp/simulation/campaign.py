@@ -248,11 +248,8 @@ def _spinning(radius: float, rates: tuple[float, ...], seed: int) -> tuple[Posit
     time, rate = steps(begins, rates, _DWELL_S, _RAMP_S)
     inward = positions(12, seed)
     ups = np.cross(inward, np.roll(inward, 1, axis=1))
-    spins = [Spin(time, rate, radius, direction) for direction in inward]
-    return tuple(
-        Position(program, up / np.linalg.norm(up), spin)
-        for up, spin in zip(ups, spins, strict=True)
-    )
+    pairs = zip(ups, (Spin(time, rate, radius, direction) for direction in inward), strict=True)
+    return tuple(Position(program, up / np.linalg.norm(up), spin) for up, spin in pairs)
 
 
 def _positions(program: Cyclogram, ups: Floats) -> tuple[Position, ...]:

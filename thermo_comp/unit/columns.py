@@ -207,20 +207,15 @@ def bank(
     # The load of a heat pump is an even function of the gradient; an effect that is equal in
     # heating and cooling is an even function of the gradient less its value at rest.
     rest = at_rest or {}
-    columns += even + [
-        replace(column, group='gradient_even_about_rest', rest_k=rest[column.sensor])
-        for column in even
-        if rest.get(column.sensor)
-    ]
+    about_rest = partial(replace, group='gradient_even_about_rest')
+    columns += even
+    columns += [about_rest(c, rest_k=rest[c.sensor]) for c in even if rest.get(c.sensor)]
     columns += _family('play', ['play'], lags=of_plays, widths=PLAY_WIDTHS)
     least_k = LEAST_KNEE_K * MOST_KNEES / most_knees
     n_knees = min(int((span_k[1] - span_k[0]) / least_k), most_knees)
     knees = np.linspace(*span_k, n_knees + 2)[1:-1].round(3).tolist()
-    columns += [
-        replace(column, knee_k=knee)
-        for column in _family('bend', ['bend'], lags=of_bends)
-        for knee in knees
-    ]
+    bends = _family('bend', ['bend'], lags=of_bends)
+    columns += [replace(column, knee_k=knee) for column in bends for knee in knees]
     return tuple(columns)
 
 

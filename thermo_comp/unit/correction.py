@@ -82,11 +82,9 @@ class Correction:
         self.K = np.array(K)[:, np.newaxis]
         self._full_scale = calibration.unit.full_scale
         self._gravity = calibration.gravity_m_s2
-        response = calibration.response
+        response, reference = calibration.response, calibration.reference_temperature_c
         self.memory = memory or memory_of_unit(calibration)
-        self.table = ColumnTable(
-            response, self.memory, calibration.reference_temperature_c, self._span
-        )
+        self.table = ColumnTable(response, self.memory, reference, self._span)
         weights = np.array([(*term.bias, *term.scale) for term in response])
         self._W = weights.reshape(-1, 6).T[:, :, np.newaxis]
         self._is_present = (self._W[:3] != 0.0) | (self._W[3:] != 0.0)
@@ -167,9 +165,8 @@ class Correction:
         columns = zip(beyond, self.table.columns, strict=True)
         gradients = [0.0, *(excess for excess, column in columns if column.is_gradient)]
         of_columns = float(self.table.excess(raw).max(initial=0.0))
-        return Excess(
-            over[is_dynamic], too_fast[is_dynamic], max(gradients, key=abs), curves + of_columns
-        )
+        gradient = max(gradients, key=abs)
+        return Excess(over[is_dynamic], too_fast[is_dynamic], gradient, curves + of_columns)
 
     def by_pairs(self, slopes: Floats) -> Floats:
         """
@@ -297,9 +294,8 @@ class Correction:
         if not (is_beyond or of_gap.any()):
             return v, growth
         if self.table.differs:
-            of_static, of_dynamic = (
-                self.table.factors(board, np.full_like(weight, w))[0] for w in (0.0, 1.0)
-            )
+            both = (np.full_like(weight, w) for w in (0.0, 1.0))
+            of_static, of_dynamic = (self.table.factors(board, w)[0] for w in both)
             gap = self._weigh(held * (of_dynamic - of_static), gap)
         held_back = self._weigh(beyond_range * factors[0], np.zeros_like(gap))
         of_gaps = np.array([of_gap, np.ones_like(of_gap)])

@@ -45,9 +45,8 @@ class Curves:
         biases = [axis.bias for axis in calibration.axes]
         deltas = [[axis.delta for axis in part.axes()] for part in sets]
         self._levels = np.add(biases, deltas)[:, :, np.newaxis]
-        self._residuals = np.array(
-            [[[axis.residual_sd_m_s2**2] for axis in part.axes()] for part in sets]
-        )
+        residuals = [[axis.residual_sd_m_s2**2 for axis in part.axes()] for part in sets]
+        self._residuals = np.array(residuals)[:, :, np.newaxis]
         lacks = ([(p.temperature_c, *p.sd_m_s2) for p in part.lack_of_fit] for part in sets)
         self._lacks = [np.array(points).reshape(-1, 4).T for points in lacks]
 

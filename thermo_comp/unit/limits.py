@@ -48,10 +48,8 @@ def check_limits(calibration: Calibration, layout: ParameterLayout) -> None:
         calibration.nonlinearity.check_slope(force, outermost)
     response = calibration.response
     farthest_k = max(map(abs, outermost))
-    sizes = [
-        min(max(map(abs, term.range)), term.term.largest(term)) * farthest_k**term.power
-        for term in response
-    ]
+    largest = (min(max(map(abs, term.range)), term.term.largest(term)) for term in response)
+    sizes = [u * farthest_k**term.power for u, term in zip(largest, response, strict=True)]
     for k, (term, size) in enumerate(zip(response, sizes, strict=True)):
         effect = size * max(map(abs, term.bias))
         if not effect <= WORST * most:

@@ -84,7 +84,7 @@ def _build(hint: Any, data: Any, key: str) -> Any:
         return value
     if origin is Literal:
         if not isinstance(data, str) or data not in arguments:
-            _refuse(key, f'must be {_choice([repr(option) for option in arguments])}', data)
+            _refuse(key, f'must be {_choice([*map(repr, arguments)])}', data)
         return data
     if origin is tuple:
         return _sequence(arguments, data, key)
@@ -96,10 +96,8 @@ def fields_of(cls: type) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the type hints of a dataclass by key, and the keys that must be given."""
     hints = typing.get_type_hints(cls, include_extras=True)
     fields = dataclasses.fields(cls)
-    required = tuple(
-        f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING
-    )
-    return {f.name: hints[f.name] for f in fields}, required
+    required = (f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING)
+    return {f.name: hints[f.name] for f in fields}, tuple(required)
 
 
 def _scalar(hint: type, data: Any, key: str) -> Any:
@@ -126,11 +124,8 @@ def _object(cls: type, data: Any, key: str) -> Any:
     for name in required:
         if name not in data:
             raise SchemaError(_joined(key, name), 'this key is missing')
-    values = {
-        name: _build(hint, data[name], _joined(key, name))
-        for name, hint in hints.items()
-        if name in data
-    }
+    given = {name: hint for name, hint in hints.items() if name in data}
+    values = {name: _build(hint, data[name], _joined(key, name)) for name, hint in given.items()}
     try:
         return cls(**values)
     except ValueError as error:
@@ -168,9 +163,7 @@ def _either(arguments: tuple[Any, ...], data: Any, key: str) -> Any:
         raise SchemaError(_joined(key, 'kind'), 'this key is missing')
     kind = data['kind']
     if not isinstance(kind, str) or kind not in kinds:
-        _refuse(
-            _joined(key, 'kind'), f'must be {_choice([repr(option) for option in kinds])}', kind
-        )
+        _refuse(_joined(key, 'kind'), f'must be {_choice([*map(repr, kinds)])}', kind)
     return _object(kinds[kind], data, key)
 
 
