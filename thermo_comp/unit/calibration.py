@@ -32,7 +32,7 @@ from .nonlinearity import Nonlinearity
 from .posterior import ParameterLayout, Posterior, lay_out
 from .provenance import GroupEvidence, Provenance
 from .rate_bias import LARGEST_RATE, NIL, Gyroscope, RateCurve, RateSet, RateTerm
-from .schema import Vector, check_ranges
+from .schema import Vector, broken, check_ranges
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -83,10 +83,8 @@ class AxisReference:
     def __post_init__(self) -> None:
         bounds = QUANTITIES['scale factor']
         if bounds.fault(abs(self.scale_factor)):
-            raise ValueError(
-                f'`scale_factor` must be {bounds.at_least:g} to {bounds.at_most:g} in magnitude, '
-                f'got {self.scale_factor:g}'
-            )
+            rule = f'be {bounds.at_least:g} to {bounds.at_most:g} in magnitude'
+            raise broken('scale_factor', rule, self.scale_factor)
 
 
 @dataclass(frozen=True)
@@ -158,10 +156,8 @@ class RegimeSet:
         at = [point.temperature_c for point in self.lack_of_fit]
         for k, (before, after) in enumerate(pairwise(at)):
             if not before < after:
-                raise ValueError(
-                    f'`lack_of_fit[{k + 1}].temperature_c` must be above the previous entry '
-                    f'({before:g}), got {after:g}'
-                )
+                rule = f'be above the previous entry ({before:g})'
+                raise broken(f'lack_of_fit[{k + 1}].temperature_c', rule, after)
 
     def axes(self) -> tuple[AxisSet, AxisSet, AxisSet]:
         """Return the curves of the axes x, y, z."""
@@ -246,7 +242,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         if (version := self.format_version) != FORMAT_VERSION:
-            raise ValueError(f'`format_version` must be {FORMAT_VERSION}, got {version}')
+            raise broken('format_version', f'be {FORMAT_VERSION}', version)
         self._check_misalignment()
         self._check_sensors()
         if self.rest_gradient_range_k is not None:
@@ -266,21 +262,17 @@ class Calibration:
             elif column < row:
                 is_good, rule = abs(value) < 0.5, 'below 0.5 in magnitude'
             if not is_good:
-                raise ValueError(f'`misalignment[{row}][{column}]` must be {rule}, got {value:g}')
+                raise broken(f'misalignment[{row}][{column}]', f'be {rule}', value)
 
     def _check_sensors(self) -> None:
         names = self.sensors
         if not names or len(set(names)) != len(names) or not all(names) or 'board' in names:
-            raise ValueError(
-                '`sensors` must be one or more different names, none of them board, '
-                f'got {list(names)}'
-            )
+            rule = 'be one or more different names, none of them board'
+            raise broken('sensors', rule, list(names))
         for k, term in enumerate(self.response):
             if term.is_of_sensor and term.sensor not in names:
-                raise ValueError(
-                    f'`response[{k}].sensor` must be one of sensors {list(names)}, '
-                    f'got {term.sensor!r}'
-                )
+                rule = f'be one of sensors {list(names)}'
+                raise broken(f'response[{k}].sensor', rule, repr(term.sensor))
 
     def correct(
         self, time_s: ArrayLike, counts: ArrayLike, *, board: Temperature = ([], []), **others: Any

@@ -28,7 +28,7 @@ from ..thermal.quantity import Quantity
 from ..thermal.state import BOARD, WEIGHT, Gradient, Rate, StateLayout
 from ..typing import Floats
 from .functions import by_element, hold
-from .schema import check_ranges
+from .schema import broken, check_ranges
 from .terms import GROUPS, LINE, TERMS, Term
 
 UNBOUNDED: Final = (-1e9, 1e9)
@@ -130,21 +130,15 @@ class Column:
     def __post_init__(self) -> None:
         check_ranges(self, range=QUANTITIES['span of a column'])
         if self.kind not in TERMS:
-            raise ValueError(f'`kind` must be one of {tuple(TERMS)}, got {self.kind}')
+            raise broken('kind', f'be one of {tuple(TERMS)}', self.kind)
         for key in self.term.positive:
             if not getattr(self, key) > 0.0:
-                raise ValueError(
-                    f'`{key}` must be greater than 0 for {self.kind}, got {getattr(self, key):g}'
-                )
+                raise broken(key, f'be greater than 0 for {self.kind}', float(getattr(self, key)))
         if self.second_tau_s > 0.9 * self.tau_s:
-            raise ValueError(
-                f'`second_tau_s` must be at most 0.9 of `tau_s`, got {self.second_tau_s:g}'
-            )
+            raise broken('second_tau_s', 'be at most 0.9 of `tau_s`', float(self.second_tau_s))
         if self.lead_s and (self.sensor_share or not self.tau_s):
-            raise ValueError(
-                '`lead_s` must be 0 in a column without `tau_s` or with '
-                f'`sensor_share`, got {self.lead_s:g}'
-            )
+            rule = 'be 0 in a column without `tau_s` or with `sensor_share`'
+            raise broken('lead_s', rule, float(self.lead_s))
 
     @property
     def term(self) -> Term:

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from ..quantities import QUANTITIES
 from ..typing import Floats
+from .schema import broken
 
 #: One temperature difference [K], or an array of temperature differences.
 Kelvins: TypeAlias = float | Floats
@@ -126,12 +127,10 @@ class CubicSpline(_Family):
 
     def __post_init__(self) -> None:
         if len(self.knots_k) < 3:
-            raise ValueError(f'`knots_k` must hold at least 3 knots, got {len(self.knots_k)}')
+            raise broken('knots_k', 'hold at least 3 knots', len(self.knots_k))
         if len(self.values) != len(self.knots_k):
-            raise ValueError(
-                f'`values` must have one number per knot ({len(self.knots_k)}), '
-                f'got {len(self.values)}'
-            )
+            rule = f'have one number per knot ({len(self.knots_k)})'
+            raise broken('values', rule, len(self.values))
         if any(b - a < _KNOT_STEP for a, b in zip(self.knots_k, self.knots_k[1:], strict=False)):
             raise ValueError(f'`knots_k` must rise strictly, by {_KNOT_STEP} K or more')
         if max(map(abs, self.knots_k)) > _FARTHEST_KNOT:
@@ -194,10 +193,8 @@ class Exponential(_Family):
         if not self.amplitudes:
             raise ValueError('`amplitudes` must hold at least one number')
         if len(self.amplitudes) != len(self.e_fold_k):
-            raise ValueError(
-                f'`e_fold_k` must have one number per amplitude ({len(self.amplitudes)}), '
-                f'got {len(self.e_fold_k)}'
-            )
+            rule = f'have one number per amplitude ({len(self.amplitudes)})'
+            raise broken('e_fold_k', rule, len(self.e_fold_k))
         if any(abs(e_fold) < 1.0 for e_fold in self.e_fold_k):
             # With a shorter e-fold exp(t / e_fold) may overflow within a useful range of t.
             raise ValueError('`e_fold_k` must be at least 1 K in magnitude')
@@ -232,7 +229,7 @@ def check_reference(name: str, function: TemperatureFunction, expected: float) -
     with np.errstate(all='ignore'):
         value = function.value(0.0)
     if not abs(value - expected) <= NORMALISATION_TOLERANCE:
-        raise ValueError(f'`{name}` must be {expected:g} at t = 0 (T_ref), got {value:g}')
+        raise broken(name, f'be {expected:g} at t = 0 (T_ref)', float(value))
 
 
 def basis_slopes(function: TemperatureFunction, t: float) -> list[float]:

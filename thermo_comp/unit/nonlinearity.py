@@ -23,7 +23,7 @@ from ..typing import Floats
 from .covariance import N_COEFFICIENTS, Real, covariance_at
 from .functions import hold, in_order
 from .gravity import STANDARD_GRAVITY
-from .schema import Vector, check_ranges
+from .schema import Vector, broken, check_ranges
 
 if TYPE_CHECKING:
     from .calibration import Calibration
@@ -103,10 +103,9 @@ class Nonlinearity:
             k2, kq, k3 = np.abs(self.coefficients(np.array([t])))[..., 0]
             slope = float(np.max(2.0 * (k2 + kq) * force + 3.0 * k3 * force * force))
             if not slope < LARGEST_SLOPE:
-                raise ValueError(
-                    f'`nonlinearity.terms` must have a slope below {LARGEST_SLOPE:g} up to full '
-                    f'scale, got {slope:.3g} at {t:+.3g} K from T_ref'
-                )
+                rule = f'have a slope below {LARGEST_SLOPE:g} up to full scale'
+                got = f'{slope:.3g} at {t:+.3g} K from T_ref'
+                raise broken('nonlinearity.terms', rule, got)
 
     def coefficients(self, t: Floats) -> Floats:
         """Return K2, Kq [s^2/m], K3 [s^4/m^2] by axis at t [K] from T_ref, shape (3, 3, n)."""

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from ..quantities import QUANTITIES
 from ..typing import Floats
 from .functions import TemperatureFunction
+from .schema import broken
 
 #: Largest fraction of each variance that a `diagonal` may have.
 _TOLERANCE = 1e-5
@@ -42,9 +43,8 @@ class Posterior:
     def __post_init__(self) -> None:
         n, size = self.n_parameters, len(_decoded('factor', self.factor))
         if size != n * self.rank:
-            raise ValueError(
-                f'`factor` must hold {n} x {self.rank} numbers (`diagonal` x `rank`), got {size}'
-            )
+            rule = f'hold {n} x {self.rank} numbers (`diagonal` x `rank`)'
+            raise broken('factor', rule, size)
         if (self.variances < 0.0).any():
             raise ValueError('`diagonal` must not have a negative variance')
 
@@ -76,10 +76,8 @@ class Posterior:
     def check_size(self, expected: int) -> None:
         """Raise ValueError, with the key's name, if there are not `expected` parameters."""
         if self.n_parameters != expected:
-            raise ValueError(
-                f'`posterior.diagonal` must have one number per parameter ({expected}), '
-                f'got {self.n_parameters}'
-            )
+            rule = f'have one number per parameter ({expected})'
+            raise broken('posterior.diagonal', rule, self.n_parameters)
 
 
 class Block(NamedTuple):

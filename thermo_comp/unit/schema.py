@@ -46,18 +46,21 @@ def build(hint: type[Value], data: Any, key: str = '') -> Value:
     return result
 
 
+def broken(key: str, rule: str, got: object) -> ValueError:
+    """Return the error of a key whose value breaks a rule: '`key` must rule, got value'."""
+    shown = f'{got:g}' if isinstance(got, float) else got
+    return ValueError(f'`{key}` must {rule}, got {shown}')
+
+
 def check_ranges(value: object, **spans: Bounds) -> None:
     """Raise ValueError, with the key's name, if a range is reversed or narrower than its bound."""
     for key, span in spans.items():
         lower, upper = getattr(value, key)
+        shown = f'[{lower}, {upper}]'
         if not lower < upper:
-            raise ValueError(
-                f'`{key}` must be [lower, upper] with lower < upper, got [{lower}, {upper}]'
-            )
+            raise broken(key, 'be [lower, upper] with lower < upper', shown)
         if span.at_least is not None and not upper - lower >= span.at_least:
-            raise ValueError(
-                f'`{key}` must span at least {span.at_least:g} {span.unit}, got [{lower}, {upper}]'
-            )
+            raise broken(key, f'span at least {span.at_least:g} {span.unit}', shown)
 
 
 def plain(value: Any) -> Any:
