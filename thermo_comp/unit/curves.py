@@ -54,8 +54,6 @@ class Curves:
         """Return excess of temperature [K] and rate [K/s], then of both in half ranges, (2, n)."""
         t, rate = states[BOARD] - self._reference, states[RATE]
         over, too_fast = t - hold(t, *self._t_range), rate - hold(rate, *self._rate_range)
-        if not (over.any() or too_fast.any()):
-            return over, too_fast, np.zeros_like(over), np.zeros_like(over)
         span, rate_span = (edges[1] - edges[0] for edges in (self._t_range, self._rate_range))
         return over, too_fast, np.abs(over) / (span / 2.0), np.abs(too_fast) / (rate_span / 2.0)
 
