@@ -265,38 +265,30 @@ class GravityCheck:
         mean = [math.fsum(values) / n for values in axes]
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
-        last, self._last_mean = self._last_mean, mean
+        last, self._last_mean = self._last_mean or [math.inf] * 3, mean
         # Largest difference of two means at rest, including four sd of the noise difference.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
-        is_still = (
-            scatter <= SCATTER_FACTOR**2 * noise_variance
-            and last is not None
-            and max(abs(a - b) for a, b in zip(mean, last, strict=True)) <= change
-        )
-        if not is_still:
+        largest = max(abs(a - b) for a, b in zip(mean, last, strict=True))
+        if not (scatter <= SCATTER_FACTOR**2 * noise_variance and largest <= change):
             self.result = self.result and self.result._replace(is_still=False)
             return
         size = math.hypot(*mean)
         # The mean of a window reduces the noise of the samples, but not the calibration's error.
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
-        if self._judge(abs(size - self.gravity), math.sqrt(variance)):
+        limit = self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
+        is_against = abs(size - self.gravity) > limit
+        if is_against == self._is_against:
+            self._n_agreeing += 1
+        else:
             # The windows before a change of the verdict do not describe the present error.
-            self._weight = 0.0
+            self._is_against, self._n_agreeing, self._weight = is_against, 1, 0.0
+        if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
+            self.is_refuted = is_against
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0
         gain = 1.0 / self._weight
         residual, sd, n, _ = self.result or (0.0, 0.0, 0, False)
         residual += gain * (size - self.gravity - residual)
         sd = math.sqrt(sd**2 + gain * (variance - sd**2))
-        self.result = GravityResidual(residual, sd, n + 1, is_still)
-
-    def _judge(self, residual: float, sd: float) -> bool:
-        """Count consecutive windows of equal verdict; return whether the verdict changed."""
-        was_against = self._is_against
-        is_against = residual > self._tolerance + REFUTING_SIGMAS * sd
-        self._n_agreeing = self._n_agreeing + 1 if is_against == self._is_against else 1
-        self._is_against = is_against
-        if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
-            self.is_refuted = is_against
-        return is_against != was_against
+        self.result = GravityResidual(residual, sd, n + 1, is_still=True)
