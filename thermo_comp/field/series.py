@@ -226,7 +226,9 @@ def series_of(
     group = _grouped(beginnings, states[:, BOARD], mean / K)
     sizes = np.bincount(group)
     averaged = partial(means_by, group)
-    first = np.searchsorted(group, np.arange(len(sizes)))
+    of_rests = beginnings[np.searchsorted(group, np.arange(len(sizes)))]
+    _, first, start = np.unique(of_rests, return_index=True, return_inverse=True)
+    start = np.argsort(np.argsort(first))[start]  # numbers from 0 in the order of the rests
     states, mean, shares, local = map(averaged, (states, mean, shares, local))
     bias, scale = (part.T for part in correction.bias_scale(states.T))
     x = (mean - bias) / scale
@@ -246,7 +248,7 @@ def series_of(
     of_start = of_start[:, :, :3] / K + of_start[:, :, 3:] * x[:, np.newaxis]
     return RestSeries(
         time=averaged(stamps / _DAY_NS),
-        start=_numbered(beginnings[first]),
+        start=start,
         temperature=states[:, BOARD],
         state=states,
         direction=v,
@@ -275,12 +277,6 @@ def _places(memory: MemorySpec, wanted: MemorySpec) -> tuple[Ints, Ints]:
             'the rests were logged with another calibration, and their thermal state does not '
             'contain the lags of this calibration: log rests while the node uses this calibration'
         ) from error
-
-
-def _numbered(start: Ints) -> Ints:
-    """Return the number of each rest's start of the node, from 0 in order of appearance."""
-    _, first, start = np.unique(start, return_index=True, return_inverse=True)
-    return np.asarray(np.argsort(np.argsort(first))[start], dtype=np.int64)
 
 
 def _grouped(start: Ints, temperature: Floats, force: Floats) -> Ints:

@@ -8,7 +8,7 @@ An axis is updated only if the rests reduce the sd of a combination of its bias 
 most 0.6 times the sd before the update, with ageing. Other axes keep their values; their sd grows.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -320,19 +320,6 @@ def _with_residual(part: RegimeSet, turn_on: float, changes: Sequence[AxisChange
     return replace(part, **axes)
 
 
-def _gravity_texts(result: Update) -> Iterator[str]:
-    for change, size, sd in result.solution.gravity:
-        time = change.time or 0.0
-        stated = result.series.gravity[np.argmin(np.abs(result.series.time - time))]
-        yield (
-            f'from {np.datetime64(int(time * 86400.0), "s")} on |f| is '
-            f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} '
-            f'than before in all attitudes, as if gravity were not the stated {stated:.5f} m/s^2: '
-            'no scale was changed for this; state the gravity of the place (--gravity; parameter '
-            'local_gravity of the node) or, if the stated gravity is right, use --allow gravity'
-        )
-
-
 def change_texts(result: Update) -> list[str]:
     """Return messages on the ageing, the jumps, and axes that the rests do not determine."""
     ageing = result.ageing
@@ -357,7 +344,16 @@ def change_texts(result: Update) -> list[str]:
                     'parameter local_gravity of the node)'
                 )
             lines.append(text)
-    lines += _gravity_texts(result)
+    for change, size, sd in result.solution.gravity:
+        time = change.time or 0.0
+        stated = result.series.gravity[np.argmin(np.abs(result.series.time - time))]
+        lines.append(
+            f'from {np.datetime64(int(time * 86400.0), "s")} on |f| is '
+            f'{"larger" if size > 0.0 else "smaller"} by {ug_text(abs(size))} +- {ug_text(sd)} '
+            f'than before in all attitudes, as if gravity were not the stated {stated:.5f} m/s^2: '
+            'no scale was changed for this; state the gravity of the place (--gravity; parameter '
+            'local_gravity of the node) or, if the stated gravity is right, use --allow gravity'
+        )
     undetermined = [change.axis for change in result.axis_changes if not change.is_determined]
     if undetermined:
         lines.append(
