@@ -216,10 +216,8 @@ class Model:
             alpha = inverse @ self.rows.y
             shift = (logs - middle) / _LOG_SD
             value = np.log(np.diag(factor)).sum() + 0.5 * (self.rows.y @ alpha + shift @ shift)
-            slope = [
-                v**2 * float((inverse * part).sum() - alpha @ part @ alpha)
-                for v, part in zip(sd, self.parts, strict=True)
-            ]
+            pairs = zip(sd, self.parts, strict=True)
+            slope = [v**2 * float((inverse * P).sum() - alpha @ P @ alpha) for v, P in pairs]
             return float(value), np.array(slope) + shift / _LOG_SD
 
         # The gradient of the evidence is almost 0 where a variance is small, so the search begins

@@ -84,11 +84,8 @@ class RestSeries:
 
     def at(self, chosen: Bools | slice) -> RestSeries:
         """Return the selected rests; the remaining starts are numbered from 0."""
-        parts: dict[str, Any] = {
-            name: value[chosen]
-            for name, value in vars(self).items()
-            if isinstance(value, np.ndarray)
-        }
+        arrays = (item for item in vars(self).items() if isinstance(item[1], np.ndarray))
+        parts: dict[str, Any] = {name: value[chosen] for name, value in arrays}
         parts['start'] = np.unique(parts['start'], return_inverse=True)[1]
         return replace(self, **parts)
 

@@ -144,10 +144,8 @@ def simulate_blocks(
     read = unit
     if temperature_rate_hz is not None:
         read = unit.with_thermometers(rate_hz=temperature_rate_hz)
-    readings = (
-        read.board.read(truth.response, duration, seed, Stream.BOARD_NOISE),
-        read.case.read(truth.response, duration, seed, Stream.CASE_NOISE),
-    )
+    sensors = (read.board, Stream.BOARD_NOISE), (read.case, Stream.CASE_NOISE)
+    readings = [each.read(truth.response, duration, seed, noise) for each, noise in sensors]
     return _blocks(truth, readings, spin, (n_cycles, block_size, rate_hz), seed, start_ns)
 
 

@@ -339,10 +339,9 @@ def rate_triad(calibration: Calibration) -> Calibration:
         raise ValueError('`calibration` must have a gyroscope')
 
     def regime(shared: RegimeSet, curves: RateSet) -> RegimeSet:
-        x, y, z = (
-            AxisSet(curve.bias_function, Polynomial((1.0,)), curve.delta, sd)
-            for curve, sd in zip(curves.axes(), gyroscope.residual_sd_rad_s, strict=True)
-        )
+        one = Polynomial((1.0,))
+        pairs = zip(curves.axes(), gyroscope.residual_sd_rad_s, strict=True)
+        x, y, z = (AxisSet(curve.bias_function, one, curve.delta, sd) for curve, sd in pairs)
         # The lack of fit of the unit is an error of the specific force, not of the angular rate.
         return replace(shared, x=x, y=y, z=z, lack_of_fit=())
 

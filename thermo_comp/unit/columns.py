@@ -277,11 +277,8 @@ class ColumnTable:
         self._centres = np.array([c.term.centre(c) for c in columns])[:, np.newaxis]
         self._widths = np.array([c.term.width(c) for c in columns])[:, np.newaxis]
         terms = np.array([c.term for c in columns], object)
-        self._terms = [
-            (np.flatnonzero(terms == term), term)
-            for term in dict.fromkeys(terms.tolist())
-            if term.form is not LINE
-        ]
+        bent = [term for term in dict.fromkeys(terms.tolist()) if term.form is not LINE]
+        self._terms = [(np.flatnonzero(terms == term), term) for term in bent]
         # The temperature of a part is the board temperature less the lag of the part.
         self._parts = np.flatnonzero([term.is_temperature for term in terms])
         self._is_lagging = self._places[self._parts][:, np.newaxis] != BOARD

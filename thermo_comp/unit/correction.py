@@ -94,10 +94,9 @@ class Correction:
         bends = slopes.std(axis=2, keepdims=True)
         self._bends = np.concatenate((bends * of_bias, bends * ~of_bias))
         rounding = ROUNDING_VARIANCE if calibration.unit.input == 'counts' else 0.0
-        self.noise = tuple(
-            density * density / calibration.unit.cycle_time_s + rounding / (k * k)
-            for density, k in zip(calibration.noise_density_m_s2_sqrt_hz, K, strict=True)
-        )
+        cycle_s, densities = calibration.unit.cycle_time_s, calibration.noise_density_m_s2_sqrt_hz
+        pairs = zip(densities, K, strict=True)
+        self.noise = tuple(d * d / cycle_s + rounding / (k * k) for d, k in pairs)
         self.noise_trace = sum(self.noise, 0.0)
         self._noise = np.array(self.noise)[:, np.newaxis]
         M = calibration.misalignment

@@ -127,10 +127,8 @@ class Curves:
         # Beyond its range a curve is a constant plus either a tangent or the other set's curve.
         function = self._rows[regime][place]
         own_range, other_range = self._t_range[:, regime], self._t_range[:, 1 - regime]
-        here, edge = (
-            np.reshape(function.basis(hold(at, *own_range)), (-1, len(t)))
-            for at in (t, hold(t, *other_range))
-        )
+        bases = (function.basis(hold(at, *own_range)) for at in (t, hold(t, *other_range)))
+        here, edge = (np.reshape(basis, (-1, len(t))) for basis in bases)
         result = shares[1 - regime] * (here - edge)
         ends = zip(own_range[:, 0].tolist(), self._leads, self._beyond(t), strict=True)
         for end, leads, beyond in ends:
