@@ -142,8 +142,7 @@ def update(
     # time is unknown or after the first rest (the last, for an updated file), at the first rest.
     since = aged if -np.inf < aged < (last if is_update else first) else first
     ageing, model, used = learn(series, calibration, since, is_gravity_certain=is_gravity_certain)
-    to_file, bend = _levels(calibration), _slopes(calibration)
-    solution = solve(model, ageing, to_file, bend, ahead)
+    solution = solve(model, ageing, *_derivatives(calibration), ahead)
     determined, by_axis = _axis_changes(used, calibration, model, solution, ageing)
     judged = _judged(used, model, solution, determined)
     shift, kept = solution.shift * determined, solution.shift * ~determined
@@ -182,32 +181,25 @@ def _with_update(
     )
 
 
-def _levels(calibration: Calibration) -> Floats:
-    """Return the parameters' derivatives by bias and by scale times g of each axis, (n, 6)."""
-    layout = parameter_layout(calibration)
-    result = np.zeros((layout.n_parameters, 6))
+def _derivatives(calibration: Calibration) -> tuple[Floats, Floats]:
+    """
+    Return the parameters' derivatives by bias and by scale times g of each axis, (n, 6), and by a
+    slope of each axis' bias [m/s^2 per K], (n, 3).
+    """
+    layout, reference_c = parameter_layout(calibration), calibration.reference_temperature_c
+    levels, slopes = np.zeros((layout.n_parameters, 6)), np.zeros((layout.n_parameters, 3))
     for axis, reference in enumerate(calibration.axes):
         bias, scale = layout.bias[axis], layout.scale[axis]
-        result[[bias.static, bias.dynamic], axis] = reference.scale_factor
-        result[[scale.static, scale.dynamic], axis + 3] = 1.0 / calibration.gravity_m_s2
-    return result
-
-
-def _slopes(calibration: Calibration) -> Floats:
-    """Return the parameters' derivatives by a slope of each axis' bias [m/s^2 per K], (n, 3)."""
-    layout = parameter_layout(calibration)
-    result = np.zeros((layout.n_parameters, 3))
-    for axis, reference in enumerate(calibration.axes):
-        block = layout.bias[axis]
-        for part, level in zip(calibration.regime_sets(), block[:2], strict=True):
+        levels[[bias.static, bias.dynamic], axis] = reference.scale_factor
+        levels[[scale.static, scale.dynamic], axis + 3] = 1.0 / calibration.gravity_m_s2
+        for part, level in zip(calibration.regime_sets(), bias[:2], strict=True):
             function = part.axes()[axis].bias_function
-            t = np.linspace(*part.temperature_range_c, 50) - calibration.reference_temperature_c
+            t = np.linspace(*part.temperature_range_c, 50) - reference_c
             if function.n_free:
-                basis = np.array(function.basis(t)).T
-                free = np.linalg.lstsq(basis, t, rcond=None)[0]
+                free = np.linalg.lstsq(np.array(function.basis(t)).T, t, rcond=None)[0]
                 places = slice(level + 1, level + 1 + function.n_free)
-                result[places, axis] = reference.scale_factor * free
-    return result
+                slopes[places, axis] = reference.scale_factor * free
+    return levels, slopes
 
 
 def _axis_changes(
