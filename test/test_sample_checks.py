@@ -3,12 +3,14 @@
 """Invalid samples (stuck, zero, too fast) are rejected, one by one and in blocks alike."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from builders import GRAVITY, SECOND_NS, calibration, columns_from_events
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from thermo_comp.online.batch import process_block
 from thermo_comp.online.checks import STUCK_SAMPLES, StuckCheck
@@ -80,10 +82,11 @@ def test_few_equal_samples_are_accepted_at_any_sample_rate(rng):
 def test_constant_samples_are_found_in_batches_of_any_size(parts, cuts, period):
     # In each part of a recording an axis is constant or changes with each sample; some are NaN.
     stands = np.repeat([which >> np.arange(3) & 1 for _, which in parts], [n for n, _ in parts], 0)
-    samples = 1.0 + np.cumsum(1.0 - stands.reshape(-1, 3), axis=0)
+    sizes = 1.0 + np.arange(len(stands)) % 4
+    samples = 1.0 + np.cumsum((1.0 - stands.reshape(-1, 3)) * sizes[:, np.newaxis], axis=0)
     samples[7::97, 1] = np.nan
     stamps = np.arange(len(samples), dtype=np.int64) * 20_000_000
-    single, batched = (StuckCheck(period / 50.0, 30.0) for _ in range(2))
+    single, batched = (StuckCheck(period / 50.0, 60.0, (2.0, 1.5, 2.5)) for _ in range(2))
     expected = []
     for stamp_ns, (x, y, z) in zip(stamps.tolist(), samples.tolist(), strict=True):
         last = single.last
@@ -137,6 +140,58 @@ def test_a_constant_axis_at_rest_is_not_stuck(rng):
         ),
     )
     assert compensator.counters.n_out == 5000
+
+
+def noisy_unit(noise_counts, n_in_counts=K):
+    """Make a calibration whose samples have a noise of that many counts [sd] at 100 Hz."""
+    density = noise_counts / n_in_counts / 10.0
+    return calibration(
+        axes=Axes(*[AxisReference(n_in_counts, 0.0)] * 3),
+        unit=replace(calibration().unit, cycle_time_s=0.01),
+        noise_density_m_s2_sqrt_hz=(density,) * 3,
+    )
+
+
+@pytest.mark.parametrize('dead', [(0,), (1,), (2,), (0, 1), (1, 2)])
+def test_a_constant_axis_at_rest_is_stuck_if_its_noise_would_show(dead, rng):
+    compensator = Compensator(noisy_unit(3.0))
+
+    def sample(_):
+        counts = [float(round(K * GRAVITY * u + rng.normal(0.0, 3.0))) for u in UP]
+        for axis in dead:
+            counts[axis] = float(round(K * GRAVITY * UP[axis]))
+        return tuple(counts)
+
+    run(compensator, recording(1000, 100.0, sample))
+    # The time-out of two seconds, or somewhat later, as the other axes must have shown noise.
+    assert 201 <= compensator.counters.n_out <= 260
+    assert compensator.counters.n_stuck == 1000 - compensator.counters.n_out
+
+
+@pytest.mark.parametrize('correlation', [0.0, 0.9, 0.999])
+def test_no_sample_of_a_working_sensor_is_stuck_whatever_its_bandwidth(correlation, rng):
+    compensator = Compensator(noisy_unit(3.0))
+    n = 30_000
+    noise = lfilter(
+        [3.0 * math.sqrt(1.0 - correlation**2)],
+        [1.0, -correlation],
+        rng.normal(size=(n, 3)),
+        axis=0,
+    )
+    table = np.round(K * GRAVITY * np.array(UP) + noise)
+    run(compensator, recording(n, 100.0, lambda k: tuple(table[k].tolist())))
+    assert compensator.counters.n_stuck == 0
+
+
+@pytest.mark.parametrize('step', [1.0, 2.0, 5.0])
+def test_a_sensor_that_is_quieter_than_its_calibration_is_not_stuck(step, rng):
+    # Calibrated on a vibrating chamber; used at rest, with a noise far below the converter's step.
+    compensator = Compensator(noisy_unit(3.0))
+    edge = np.array([0.5, 0.0, 0.5])
+    centre = step * (np.round(K * GRAVITY * np.array(UP) / step) + edge)
+    table = step * np.round((centre + rng.normal(0.0, 0.1 * step, (5000, 3))) / step)
+    run(compensator, recording(5000, 100.0, lambda k: tuple(table[k].tolist())))
+    assert compensator.counters.n_stuck == 0
 
 
 def test_checks_of_samples_can_be_switched_off():
@@ -238,3 +293,23 @@ def test_the_batch_drops_the_samples_that_the_stream_drops(events, chunk, stuck_
         np.testing.assert_array_equal(covariance[:, UNIQUE], table[:, 3:])
     assert streamed.counters == whole.counters == cut.counters
     assert streamed.status() == whole.status() == cut.status()
+
+
+@pytest.mark.parametrize('is_mended', [False, True])
+def test_a_jump_back_in_time_does_not_restore_a_refuted_calibration(rng, is_mended):
+    compensator = Compensator(calibration(), CompensatorConfig(gravity_tolerance_m_s2=0.1))
+
+    def events(bias, start_ns=0):
+        return recording(6000, 100.0, lambda _: at_rest(rng, bias), start_ns)
+
+    run(compensator, events(100.0, 100 * SECOND_NS))
+    assert compensator.is_refusing
+    n_out, n_refuted = compensator.counters.n_out, compensator.counters.n_refuted
+    run(compensator, events(0.0 if is_mended else 100.0))
+    assert compensator.counters.n_time_jumps == 1
+    if is_mended:
+        # Windows of 5 s; the first has no window to compare with, the next two restore the output.
+        assert compensator.counters.n_out - n_out == pytest.approx(4500, abs=200)
+    else:
+        assert compensator.counters.n_out == n_out
+        assert compensator.counters.n_refuted == n_refuted + 6000

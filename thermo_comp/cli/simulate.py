@@ -26,9 +26,7 @@ _RATE_TOPIC, _RATE_STEP_S, _RADIUS_SD_M = 'table/angular_velocity', 0.5, 1e-3
 
 
 def simulate(
-    output: Path = option(
-        'Bag to write; with several positions, folder of the bags.', ..., '--output', '-o'
-    ),
+    output: Path = option('Bag to write; with several positions, folder of the bags.', ..., '-o'),
     unit: str = option(
         'Kind of unit: thermostatted, bare-quartz, mems, or demo (the unit of the sample bags).',
         'thermostatted',
@@ -54,7 +52,6 @@ def simulate(
         'Write sensor_msgs/Imu instead of counts, with the angular rate if the unit has a '
         'gyroscope.',
         False,
-        '--imu',
     ),
     level: int = option(
         'Compression of the bags (zstd level): 1 is fast, 19 gives the smallest files.',

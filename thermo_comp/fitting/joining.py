@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the joining of bags that are successive parts of one recording, as split by a recorder.
+Owns the joining of bags that are successive parts of one recording, as split by a recorder, or
+recorded one after the other while the unit is turned to the next attitude.
 
-The unit stays switched on between the parts of a recording, so the parts have one turn-on, the
-lags do not restart, and a rest at the end of a part continues in the next part.
+Between the parts of a recording the unit may have stayed switched on, so the parts count as one
+turn-on: positions of one turn-on do not show how well the bias repeats from turn-on to turn-on.
+The lags do not restart, and a rest at the end of a part may continue in the next part.
 """
 
 from __future__ import annotations
@@ -19,8 +21,12 @@ from ..recording.blocks import Block
 from .reduction import Readings, ReducedBag, StillInterval
 from .sources import FitSource
 
-#: Longest gap or overlap of two parts of one recording [s]; switching off and on takes longer.
-CONTINUED_S = 3.0
+#: Longest gap between two parts of one recording [s]: time to turn the unit by hand and to start
+#: the recorder again. If the unit is nevertheless switched off and on in the gap, the offsets of
+#: its turn-ons count as those of mountings.
+LONGEST_GAP_S = 60.0
+#: Longest overlap of the stamps of two parts of one recording [s].
+LONGEST_OVERLAP_S = 3.0
 #: Number of windows before the end of a part, and after it, whose steps are compared with the step
 #: between the two parts.
 _N_COMPARED = 20
@@ -49,8 +55,8 @@ def _continues(part: ReducedBag, bag: ReducedBag) -> bool:
     is_at_1g = bag.source.force is None and part.source.force is None
     is_of_unit = bag.source.serial == part.source.serial
     # The overlap is at most a tenth of a part: recordings whose stamps all begin at 0 exceed this.
-    overlap_s = min(CONTINUED_S, 1e-10 * (part.end_ns - part.start_ns))
-    is_next = -overlap_s < gap_s < max(CONTINUED_S, 2.0 * bag.cycle_s)
+    overlap_s = min(LONGEST_OVERLAP_S, 1e-10 * (part.end_ns - part.start_ns))
+    is_next = -overlap_s < gap_s < max(LONGEST_GAP_S, 2.0 * bag.cycle_s)
     return bool(is_next and is_alike and is_at_1g and is_of_unit)
 
 

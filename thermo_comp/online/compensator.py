@@ -116,7 +116,13 @@ class Compensator:
 
     def _stuck_check(self) -> StuckCheck:
         scales = [abs(axis.scale_factor) for axis in self.calibration.axes]
-        return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales))
+        noise_sds = [
+            scale * density / math.sqrt(self.calibration.unit.cycle_time_s)
+            for scale, density in zip(
+                scales, self.calibration.noise_density_m_s2_sqrt_hz, strict=True
+            )
+        ]
+        return StuckCheck(self.config.stuck_timeout_s, MOTION * max(scales), noise_sds)
 
     @property
     def _gravity_settings(self) -> tuple[float, float]:
@@ -246,7 +252,10 @@ class Compensator:
         self.thermal.queue.keep(lambda entry: entry[0] <= stamp_ns)
         self.thermal.reset()
         self.stuck = self._stuck_check()
+        is_refuted = self.gravity.is_refuted
         self.gravity = GravityCheck(*self._gravity_settings)
+        # A jump of time does not mend a wrong calibration: windows that agree restore the output.
+        self.gravity.is_refuted = is_refuted
         self.counters.n_time_jumps += 1
         self.last_ns = stamp_ns - 1
 
@@ -325,6 +334,9 @@ class Compensator:
         usual_s = max(STALE_INTERVALS * tracker.board.interval_s, SHORTEST_STALE_S)
         state = thermal.sample(stamp_ns)
         loose_k = tracker.loose_k(state[GRADIENT])
+        for name, twin in tracker.copies.items():
+            if twin.is_copy and faults[name][0] is Fault.NONE:
+                faults[name] = Fault.COPY, 0.0
         if loose_k and faults[BOARD_INPUT][0] is Fault.NONE:
             faults[BOARD_INPUT] = Fault.LOOSE, loose_k
         return CompensatorStatus(
