@@ -17,9 +17,8 @@ from .shared_options import option
 
 if TYPE_CHECKING:
     from ..recording.writer import BagWriter
-    from ..simulation.campaign import Position
+    from ..simulation.campaign import Position, Spin
     from ..simulation.run import SimulatedRun
-    from ..simulation.spin import Spin
     from ..simulation.unit import UnitModel
 
 #: Rate table: topic of the rotation rate, interval between two messages [s], sd of the radius [m].
@@ -79,7 +78,7 @@ def simulate(
     """
     from ..recording.writer import BagWriter
     from ..simulation import campaign, presets, run
-    from ..simulation.spin import Bend
+    from ..simulation.unit import Bend
 
     with options.usage_of(name='--unit'):
         specimen = presets.unit_preset(unit, unit_seed)

@@ -215,10 +215,7 @@ class RateCheck:
 
     @property
     def noise_excess(self) -> float:
-        """
-        Excess of the noise variance of a sample over the calibrated variance, relative to the
-        calibrated variance, because of a sample rate above the calibrated rate.
-        """
+        """Relative excess of a sample's noise variance due to a rate above the calibrated rate."""
         excess = self.ratio - 1.0
         return excess if excess > RATE_TOLERANCE else 0.0
 
@@ -231,14 +228,10 @@ class RateCheck:
             return
         n, dt = n_seen - last[0], (stamp_ns - last[1]) * 1e-9
         level = self._level + n - LARGEST_RATE * dt / self._cycle_s
-        if level <= 0.0:
-            self._level = 0.0
-            self.is_too_fast = False
-        else:
-            # Excess samples are counted up to twice the allowance, so that the alarm ends soon
-            # after a long excess.
-            self._level = min(level, 2.0 * self._allowance)
-            self.is_too_fast = self._counts_cycles and self._level > self._allowance
+        # Excess samples are counted up to twice the allowance, so that the alarm ends soon after a
+        # long excess.
+        self._level = min(max(level, 0.0), 2.0 * self._allowance)
+        self.is_too_fast = self._counts_cycles and self._level > self._allowance
         n, dt = n_seen - self._window[0], (stamp_ns - self._window[1]) * 1e-9
         if dt >= _WINDOW_S:
             self.ratio = n * self._cycle_s / dt
@@ -283,10 +276,8 @@ class GravityCheck:
     ) -> None:
         """Take a force [m/s^2], its covariance (xx to zz), and the trace of its noise part."""
         self._watch_step(stamp_ns, force, covariance, noise)
-        if (
-            not 0 <= stamp_ns - self._begin_ns < LONGEST_WINDOW_NS
-            or not 0 <= stamp_ns - self._last_ns < 3 * WINDOW_NS
-        ):
+        since_ns, step_ns = stamp_ns - self._begin_ns, stamp_ns - self._last_ns
+        if not (0 <= since_ns < LONGEST_WINDOW_NS and 0 <= step_ns < 3 * WINDOW_NS):
             self._forces = []
         if not self._forces:
             self._begin_ns = stamp_ns
@@ -300,20 +291,14 @@ class GravityCheck:
     def _watch_step(
         self, stamp_ns: int, force: Sequence[float], covariance: Sequence[float], noise: float
     ) -> None:
-        """
-        Refute the calibration if |f| steps from its value at rest to a value out of the tolerance
-        and keeps the new value for `STEP_NS`; a step refutes sooner than means of windows do.
-        """
+        """Refute the calibration if |f| steps, at rest, beyond the tolerance for `STEP_NS`."""
         rests = self.result and self.result.is_still and self._last_mean
         if self.is_refuted or not (self._off or rests):
             self._off, self._is_resting = [], False
             return
         # Largest difference of two samples at rest, including four sd of the noise difference.
         near = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise / 3.0)
-        was_resting, reference = (
-            self._is_resting,
-            self._off[0] if self._off else self._last_mean or (),
-        )
+        was_resting, reference = self._is_resting, (self._off or [self._last_mean or ()])[0]
         is_near = max(abs(a - b) for a, b in zip(force, reference, strict=True)) <= near
         variance = max(variance_along(force, covariance), noise / 3.0)
         residual = math.hypot(*force) - self.gravity
@@ -340,40 +325,30 @@ class GravityCheck:
         mean = [math.fsum(values) / n for values in axes]
         squares = [(v - m) ** 2 for values, m in zip(axes, mean, strict=True) for v in values]
         scatter = math.fsum(squares) / (n - 1)
-        last, self._last_mean = self._last_mean, mean
+        last, self._last_mean = self._last_mean or [math.inf] * 3, mean
         # Largest difference of two means at rest, including four sd of the noise difference.
         change = LARGEST_CHANGE + 4.0 * math.sqrt(2.0 * noise_variance / (3.0 * n))
-        is_still = (
-            scatter <= SCATTER_FACTOR**2 * noise_variance
-            and last is not None
-            and max(abs(a - b) for a, b in zip(mean, last, strict=True)) <= change
-        )
-        if not is_still:
+        largest = max(abs(a - b) for a, b in zip(mean, last, strict=True))
+        if not (scatter <= SCATTER_FACTOR**2 * noise_variance and largest <= change):
             self.result = self.result and self.result._replace(is_still=False)
             return
         size = math.hypot(*mean)
         # The mean of a window reduces the noise of the samples, but not the calibration's error.
         noise = noise_variance / 3.0
         variance = max(variance_along(mean, covariance) - noise, 0.0) + noise / n
-        if self._judge(abs(size - self.gravity), math.sqrt(variance)):
+        limit = self._tolerance + REFUTING_SIGMAS * math.sqrt(variance)
+        is_against = abs(size - self.gravity) > limit
+        if is_against == self._is_against:
+            self._n_agreeing += 1
+        else:
             # The windows before a change of the verdict do not describe the present error.
-            self._weight = 0.0
+            self._is_against, self._n_agreeing, self._weight = is_against, 1, 0.0
+        if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
+            self.is_refuted = is_against
         decay = 1.0 - 1.0 / MEMORY_WINDOWS
         self._weight = self._weight * decay + 1.0
         gain = 1.0 / self._weight
         residual, sd, n, _ = self.result or (0.0, 0.0, 0, False)
         residual += gain * (size - self.gravity - residual)
         sd = math.sqrt(sd**2 + gain * (variance - sd**2))
-        self.result = GravityResidual(residual, sd, n + 1, is_still)
-
-    def _judge(self, residual: float, sd: float) -> bool:
-        """
-        Count consecutive windows with equal verdicts; return whether the verdict has changed.
-        """
-        was_against = self._is_against
-        is_against = residual > self._tolerance + REFUTING_SIGMAS * sd
-        self._n_agreeing = self._n_agreeing + 1 if is_against == self._is_against else 1
-        self._is_against = is_against
-        if self._n_agreeing >= (REFUTING_WINDOWS if is_against else RESTORING_WINDOWS):
-            self.is_refuted = is_against
-        return is_against != was_against
+        self.result = GravityResidual(residual, sd, n + 1, is_still=True)
