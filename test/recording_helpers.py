@@ -40,10 +40,6 @@ class Message:
     is_little: bool = True
 
 
-def write_bools(bag, topic, log_ns, flags):
-    bag.write_raw(topic, BOOL, log_ns, [bytes((0, 1, 0, 0, bool(flag))) for flag in flags])
-
-
 @lru_cache(maxsize=2)
 def typestore(ros=2):
     return get_typestore(Stores.ROS2_JAZZY if ros == 2 else Stores.ROS1_NOETIC)
