@@ -34,7 +34,6 @@ from .gyroscope import RateRow, add_gyroscope
 from .initial_triad import within_positions
 from .initialisation import Problem, initial_triad
 from .joining import joined
-from .missing_readings import judge_missing
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
 from .options import COUNTS_FULL_SCALE, FitOptions
 from .priors import constants_of, offset_sd_of
@@ -292,7 +291,7 @@ def _fit(
     up = start.directions(windows.data)
     has_case = all(len(bag.case.value) for bag in bags)
     findings += enforce(data_checks.judge_windows(windows, up, has_case, known), options)
-    findings += judge_missing(windows)
+    findings += raw_checks.judge_missing(bags, windows)
     progress(0.7)
     fit = regressed(
         windows, Problem(bags, options, start, up, progress, is_by_settled, has_pieces)
