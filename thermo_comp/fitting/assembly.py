@@ -44,9 +44,9 @@ from .thermal_ranges import (
     union,
     usable_board_lag,
     valid_range,
+    with_unseen_axes,
 )
 from .unknowns import State
-from .unseen_axes import with_unseen_axes
 from .windows import PART, Model, ThermalWindows
 
 

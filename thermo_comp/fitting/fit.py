@@ -41,7 +41,7 @@ from .reduction import ReducedBag, reduce_source
 from .selection import Fit
 from .sensors import without_copies
 from .sources import FitSource
-from .unseen_axes import judge_unseen_axes
+from .thermal_ranges import judge_unseen_axes
 from .windows import FEWEST_WINDOWS
 
 Progress = Callable[[float], None]
