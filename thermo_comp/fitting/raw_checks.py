@@ -115,8 +115,7 @@ def _judge_thermometers(bags: Sequence[ReducedBag]) -> Iterator[Finding]:
                 'before and after, left out: does the thermometer lose contact?',
             )
     for name in names:
-        read = [b.temperatures[name].value for b in bags if name in b.temperatures]
-        celsius = np.concatenate(read)
+        celsius = np.concatenate([bag.readings(name).value for bag in bags])
         if len(celsius) and KELVINS[0] < np.median(celsius) < KELVINS[1]:
             reads = f'temperature/{name} reads {np.min(celsius):.4g} .. {np.max(celsius):.4g} degC'
             yield advice('kelvins', f'{reads}: that looks like kelvins; record degC')

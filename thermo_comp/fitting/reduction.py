@@ -126,15 +126,19 @@ class ReducedBag:
         name, sha256 = self.source.name, self.source.sha256 or ''
         return self.parts or (Source(name, sha256, self.n_samples),)
 
+    def readings(self, name: str) -> Readings:
+        """Return the readings of a thermometer, no readings if the bag lacks the thermometer."""
+        return self.temperatures.get(name, Readings())
+
     @property
     def board(self) -> Readings:
         """Readings of the board's thermometer."""
-        return self.temperatures.get('board', Readings())
+        return self.readings('board')
 
     @property
     def case(self) -> Readings:
         """Readings of the case's thermometer."""
-        return self.temperatures.get('case', Readings())
+        return self.readings('case')
 
 
 class _Pass:

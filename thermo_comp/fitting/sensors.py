@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 from operator import itemgetter
 
 import numpy as np
@@ -33,12 +32,6 @@ class RateHistory:
 
     rate: Floats
     rate_sd: float
-
-    @property
-    def is_resting(self) -> Bools:
-        """Whether there is no ramp within five minutes before and after each grid point."""
-        moving = np.abs(self.rate) > max(0.2 * self.fastest, self.least_ramp)
-        return np.asarray(np.convolve(moving, np.ones(61))[30:-30] < 0.5)
 
     @property
     def least_ramp(self) -> float:
@@ -160,10 +153,8 @@ def _rate_histories(
     side = _BIN_S * _BINS_PER_SIDE
     result = []
     for readings in recorded:
-        if len(readings.value) < 30:
-            continue
-        time = (readings.stamp_ns - readings.stamp_ns[0]) * 1e-9
-        n_bins = int(time[-1] / _BIN_S)
+        time = (readings.stamp_ns - readings.stamp_ns[:1]) * 1e-9
+        n_bins = int(time[-1] / _BIN_S) if len(time) >= 30 else 0
         if n_bins < 6 * _BINS_PER_SIDE:
             continue
         # The mean over a minute is the change of the integral over the minute, divided by 60 s.
@@ -193,8 +184,12 @@ def _slowest_ramp(histories: Sequence[RateHistory], usual: float) -> float:
 
 def _ripple(histories: Sequence[RateHistory], lag_s: float, usual: float) -> float:
     """Return the amplitude of ripple of the ambient temperature in soaks [K]."""
-    rates = [history.rate[history.is_resting] for history in histories]
-    resting = np.concatenate(rates) if rates else np.zeros(0)
+    rates = [np.zeros(0)]
+    for history in histories:
+        moving = np.abs(history.rate) > max(0.2 * history.fastest, history.least_ramp)
+        # A soak has no ramp within five minutes before and after a grid point.
+        rates.append(history.rate[np.convolve(moving, np.ones(61))[30:-30] < 0.5])
+    resting = np.concatenate(rates)
     if len(resting) < 60:
         return usual
     noise = float(np.median([history.rate_sd for history in histories]))
@@ -212,7 +207,7 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
     for name in sensors:
         rate, gradient = [np.zeros(0)], [np.zeros(0)]
         for bag in bags:
-            board, sensor = bag.board, bag.temperatures.get(name, Readings())
+            board, sensor = bag.board, bag.readings(name)
             if min(len(board.value), len(sensor.value)) < 30:
                 continue
             first = max(board.stamp_ns[0], sensor.stamp_ns[0])
@@ -236,11 +231,10 @@ def gradients_at_rest(bags: Sequence[ReducedBag], sensors: Sequence[str]) -> dic
 def without_copies(bags: Sequence[ReducedBag]) -> tuple[list[ReducedBag], list[str]]:
     """Return the bags without thermometers that repeat the board's readings; their names."""
     names = sorted(set.intersection(*({*bag.temperatures} for bag in bags)) - {'board'})
-    is_read = any(len(bag.board.value) for bag in bags)
     copies = [
         name
         for name in names
-        if is_read
+        if any(len(bag.board.value) for bag in bags)
         and all(np.array_equal(bag.temperatures[name].value, bag.board.value) for bag in bags)
     ]
     kept = [
@@ -260,16 +254,12 @@ def board_span(bags: Sequence[ReducedBag], reference: float) -> tuple[float, flo
 
 
 def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str, int, float]]:
-    """
-    Return thermometer, stamp and value of each reading in the order of the stamps, and for equal
-    stamps in the order of `inputs`.
-    """
-    rows: list[tuple[str, int, float]] = []
-    for name in inputs:
-        readings = bag.temperatures.get(name, Readings())
-        rows += zip(
-            repeat(name), readings.stamp_ns.tolist(), readings.value.tolist(), strict=False
-        )
+    """Return thermometer, stamp, value of readings by stamp; equal stamps as in `inputs`."""
+    rows = [
+        (name, stamp_ns, value)
+        for name in inputs
+        for stamp_ns, value in zip(*map(np.ndarray.tolist, bag.readings(name)), strict=True)
+    ]
     return sorted(rows, key=itemgetter(1))
 
 
