@@ -56,19 +56,7 @@ class _Shape(NamedTuple):
     has_gradient: bool = False
 
 
-class _Steps(NamedTuple):
-    """
-    First steps of a search in the logarithms of both time constants of a part, in the share of the
-    gradient, and in the ratio of lead to first time constant; a step of 0 keeps a value constant.
-    """
-
-    tau: float
-    second: float = 0.0
-    share: float = 0.0
-    lead: float = 0.0
-
-
-# Ratio of the RMS residual to white noise below which no further shape of `_SHAPES` is tried.
+# Ratio of the RMS residual to white noise up to which no other shape or lag is tried.
 _EXPLAINED_RATIO = 1.1
 # Shapes of the curves, in the order of the trials. A spline of 4 nodes determines a lag best, but
 # cannot describe a kink of the bias, so the limit of its RMS residual is low.
@@ -174,28 +162,28 @@ class _PartCurves:
         data, columns = windows.data, windows.model.columns
         rows = slice(None, None, max(len(data.time) // n_windows, 1))
         of_board = [k for k, column in enumerate(columns) if column.group == 'board']
+        taus = np.array([columns[k].tau_s for k in of_board])
         _, self._first, self._position = np.unique(
             data.position[rows], return_index=True, return_inverse=True
         )
         self._age = data.age[rows, None]
         self._is_of_bag = data.bag[rows, None] == np.arange(data.bag[-1] + 1.0)
-        self._root_weight = np.sqrt(data.weight[rows])[:, None]
-        self._share = data.weight[rows, None]
-        self._share = self._share / np.add.reduceat(self._share, self._first)[self._position]
+        weight = data.weight[rows, None]
+        self._root_weight = np.sqrt(weight)
+        self._share = weight / np.add.reduceat(weight, self._first)[self._position]
         self._case = windows.gradient[rows]
         self._t = windows.temperature[rows] - windows.model.reference_temperature
-        self._taus = np.array([columns[k].tau_s for k in of_board])
         #: Time constants tried [s]: four short ones, and those of the columns of group `board`.
-        self._tried = np.array([15.0, 21.0, 30.0, 42.0, *self._taus])
+        self._tried = np.array([15.0, 21.0, 30.0, 42.0, *taus])
         # The lag m is interpolated between the time constants tau of the columns: m / tau is a
         # smooth function of tau, whose limit at tau = 0 is the rate of the temperature.
-        ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / self._taus))[rows]
-        knots = _interpolation_place(np.append(0.0, self._taus))
+        ratios = np.column_stack((windows.rate, windows.raw[:, of_board] / taus))[rows]
+        knots = _interpolation_place(np.append(0.0, taus))
         self._ratio = CubicSpline(knots, ratios, axis=1)
         # The lag L_tau(G) of the gradient G is interpolated over tau; its limit at tau = 0 is G.
         of_case = [
             [c.group == 'gradient_lag' and c.tau_s == tau and c.sensor == 'case' for c in columns]
-            for tau in self._taus
+            for tau in taus
         ]
         self._has_case = bool(np.any(of_case, axis=1).all())
         if self._has_case:
@@ -230,12 +218,12 @@ class _PartCurves:
         """
         Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual.
 
-        If the RMS residual exceeds 1.1 times the white noise `noise`, a second stage or another
-        share of the gradient is tried, and must reduce the RMS residual by more than 5 %.
+        If noise does not explain the residual, a second stage or another share of the gradient is
+        tried, and must reduce the RMS residual by more than 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)
-        enough = 1.1**2 * noise**2 * len(self._t)
+        enough = _EXPLAINED_RATIO**2 * noise**2 * len(self._t)
         if self._square(best, axis) > enough:
             starts = [one_stage]
             if self._has_case:
@@ -246,19 +234,18 @@ class _PartCurves:
             if not any(self._is_of_use(near, axis, noise, 8.0, 1.5) for near in (best, *starts)):
                 # Neither a second stage nor another share would reduce this residual enough.
                 return best
-            lags = [self._searched(axis, _in_two_stages(one_stage), _Steps(0.2, 0.4))]
+            lags = [self._searched(axis, _in_two_stages(one_stage), (0.2, 0.4, 0.0, 0.0))]
             if best.lead_s:
-                steps = _Steps(0.2, 0.4, lead=0.1)
-                lags.append(self._searched(axis, _in_two_stages(best), steps))
+                lags.append(self._searched(axis, _in_two_stages(best), (0.2, 0.4, 0.0, 0.1)))
             if self._has_case:
                 for near in starts:
                     first = near._replace(tau_s=max(near.tau_s, 15.0))
-                    lags.append(self._searched(axis, first, _Steps(0.2, share=0.1)))
+                    lags.append(self._searched(axis, first, (0.2, 0.0, 0.1, 0.0)))
             best = self._better(axis, best, min(lags, key=lambda lag: self._square(lag, axis)))
         is_incomplete = self._is_of_use(best, axis, noise) and self._square(best, axis) > enough
         if self._has_case and is_incomplete:
             first = best if best.second_tau_s else _in_two_stages(best)
-            searched = self._searched(axis, first, _Steps(0.2, 0.4, share=0.3))
+            searched = self._searched(axis, first, (0.2, 0.4, 0.3, 0.0))
             best = self._better(axis, best, searched)
         return best
 
@@ -284,16 +271,15 @@ class _PartCurves:
             return lag
         longer, lead = 0.03 * np.clip(steps, -10.0, 20.0)
         first = lag._replace(tau_s=float(tau * (1.0 + longer)), **{key: float(lead * unit)})
-        of_lead = _Steps(0.1, **{'share' if self._has_case else 'lead': 0.1})
-        found = self._searched(axis, first, of_lead)
+        share_and_lead = (0.1, 0.0) if self._has_case else (0.0, 0.1)
+        found = self._searched(axis, first, (0.1, 0.0, *share_and_lead))
         return found if self._square(found, axis) <= enough else lag
 
     def refined(self, lag: Part, axis: int) -> Part:
         """Return the lag with the smallest RMS residual, by a search from `lag` in small steps."""
         if not lag.tau_s:
             return lag
-        near = _Steps(0.03, 0.06, 0.02, 0.02)
-        steps = _Steps(*(step * bool(value) for step, value in zip(near, lag, strict=True)))
+        steps = np.where(lag, (0.03, 0.06, 0.02, 0.02), 0.0)
         return self._searched(axis, lag, steps, accuracy=1e-3)
 
     def _better(self, axis: int, simple: Part, other: Part) -> Part:
@@ -301,12 +287,15 @@ class _PartCurves:
         is_better = self._square(other, axis) < self._square(simple, axis) / 1.05**2
         return other if is_better else simple
 
-    def _searched(self, axis: int, first: Part, steps: _Steps, accuracy: float = 0.01) -> Part:
+    def _searched(
+        self, axis: int, first: Part, steps: Sequence[float] | Floats, accuracy: float = 0.01
+    ) -> Part:
         """
         Return the lag of the smallest RMS residual by the simplex method, from the lag `first`.
 
-        `accuracy`: half of the largest extent of the final simplex, in logarithms of the time
-        constants, in the share, and in the ratio of lead to first time constant
+        The coordinates are the logarithms of both time constants, the share of the gradient, and
+        the ratio of lead to first time constant. `steps`: first steps in the coordinates; 0 keeps
+        a coordinate constant. `accuracy`: half of the largest extent of the final simplex.
         """
         tau, second, share, lead = first
         start = np.array([np.log(tau), np.log(second or 1.0), share, lead / tau])
@@ -382,7 +371,12 @@ class _PartCurves:
     def _weighted(self, lag: Part, axis: int) -> Floats:
         """Return the residuals of an axis times the roots of the windows' weights, shape (n,)."""
         series, measured = self._series(lag, axis), self._measured[:, axis]
-        return np.asarray(measured - series @ _solved(series, measured))
+        normal, right = series.T @ series, series.T @ measured
+        # Regressors of any magnitude are divided by their size.
+        size = np.sqrt(np.diag(normal)) + 1e-12
+        normal = normal / np.outer(size, size)
+        normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors
+        return np.asarray(measured - series @ (dposv(normal, right / size)[1] / size))
 
     def _series(self, lag: Part, axis: int) -> Floats:
         """Return the weighted regressors of bias, scale and initial lag states, shape (n, k)."""
@@ -429,11 +423,7 @@ def _in_two_stages(lag: Part) -> Part:
 
 
 def _in_order(tau_s: float, second_tau_s: float, sensor_share: float, lead_share: float) -> Part:
-    """
-    Return a lag with the longer time constant first, and the shorter at most 0.89 of the longer.
-
-    `lead_share`: ratio of the lead to `tau_s`
-    """
+    """Return a lag with the longer time constant first; `lead_share`: ratio of lead to `tau_s`."""
     # `Part` accepts ratios of its two time constants up to 0.9, after rounding to 0.1 s.
     longer, shorter = max(tau_s, second_tau_s), min(tau_s, second_tau_s)
     return Part(longer, min(shorter, 0.89 * longer), sensor_share, lead_share * tau_s)
@@ -442,12 +432,3 @@ def _in_order(tau_s: float, second_tau_s: float, sensor_share: float, lead_share
 def _interpolation_place(tau_s: Floats) -> Floats:
     """Map time constants [s] to 0..1, the abscissa of the interpolation; 200 s become 0.5."""
     return np.asarray(tau_s / (tau_s + 200.0))
-
-
-def _solved(series: Floats, measured: Floats) -> Floats:
-    """Return the least-squares coefficients of regressors of any magnitude."""
-    normal, right = series.T @ series, series.T @ measured
-    size = np.sqrt(np.diag(normal)) + 1e-12
-    normal = normal / np.outer(size, size)
-    normal[np.diag_indices_from(normal)] += 1e-7  # a ridge, for nearly collinear regressors
-    return np.asarray(dposv(normal, right / size)[1] / size)
