@@ -135,7 +135,7 @@ def _valid_columns(
     """Return the response columns in use with their valid ranges."""
     lower, upper = temperature_range(windows)
     is_weighed = np.any(state.weights != 0.0, axis=(0, 1))
-    n_alone = windows.model.part_curves.sums.shape[1]
+    n_alone = windows.model.part_sums.shape[1]
     alone = is_weighed[len(windows.model.sets.groups) :]
     weighed = _of_columns(windows, is_weighed)
     of_parts = _of_columns(windows, is_weighed & (np.arange(len(is_weighed)) >= n_alone))
@@ -163,8 +163,8 @@ def _valid_columns(
 
 
 def _of_columns(windows: ThermalWindows, mask: Bools) -> list[int]:
-    """Return the response columns that a mask selects, directly or in a sum of `part_curves`."""
-    sums, n_curves = windows.model.part_curves.sums, len(windows.model.sets.groups)
+    """Return the response columns that a mask selects, directly or in a sum of `part_sums`."""
+    sums, n_curves = windows.model.part_sums, len(windows.model.sets.groups)
     contained = mask[: sums.shape[1]] | (sums != 0.0)[mask[sums.shape[1] :]].any(axis=0)
     return [int(k) for k in np.flatnonzero(contained[n_curves:])]
 
@@ -298,7 +298,7 @@ def file_jacobian(
 
     `used`: response columns in the file; `kinds`: nonlinear terms in the file
     """
-    sets, sums = model.sets, model.part_curves.sums
+    sets, sums = model.sets, model.part_sums
     n, m = sets.static.n_free, sets.dynamic.n_free
     # The last row is zero: the index -1 of a parameter that is not estimated selects this row.
     unknown = np.eye(layout.n_unit + 1, layout.n_unit)

@@ -243,7 +243,7 @@ def _is_slow(windows: ThermalWindows) -> Bools:
     """
     model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])
-    of_part = ((model.part_curves.sums != 0.0) * taus).max(axis=1, initial=0.0)
+    of_part = ((model.part_sums != 0.0) * taus).max(axis=1, initial=0.0)
     return np.asarray(np.append(taus, of_part) > longest_s / np.log(10.0))
 
 
