@@ -251,13 +251,12 @@ def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     Count a bag's samples at rest: all; those before the estimate of the board temperature is
     accurate; later ones without a temperature, but between readings of each thermometer.
     """
-    grid = track.start_s + track.step_s * np.arange(len(track.states))
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
     begin_s = 1e-9 * (max((stamp_ns[0] for stamp_ns in read), default=bag.start_ns) - bag.start_ns)
     end_s = 1e-9 * (min((stamp_ns[-1] for stamp_ns in read), default=bag.start_ns) - bag.start_ns)
     n_still = n_unsettled = n_between = 0.0
     for rest in bag.intervals:
-        is_known = np.interp(rest.time, grid, track.is_known, left=0.0) == 1.0
+        is_known = np.interp(rest.time, track.grid_s, track.is_known, left=0.0) == 1.0
         is_settled = rest.time >= track.settled_s
         n_still += float(rest.count.sum())
         n_unsettled += float(rest.count[(rest.time >= track.start_s) & ~is_settled].sum())

@@ -142,10 +142,7 @@ class ReducedBag:
 
 
 class _Pass:
-    """
-    The results of reading the blocks of a source once: cells of the samples, temperature readings,
-    possible causes of a lack of rests; `has_rate`: whether all angular rates are finite.
-    """
+    """A pass over the blocks of a source; `has_rate`: whether all angular rates are finite."""
 
     def __init__(self, source: FitSource, accumulator: CellAccumulator) -> None:
         readings: dict[str, list[Readings]] = {}
@@ -244,18 +241,23 @@ def _reduced(
         ranges = stillness.still_intervals(cells, min_rest_s or 3.0, still_sd)
     restless = reading.causes.cause(cells, still_sd)
     if not ranges and not restless:
-        restless = f'no still interval: {_why_restless(cells, reading.n_samples, still_sd)}'
+        if 2 * cells.n_saturated > reading.n_samples:
+            share = f'{100.0 * cells.n_saturated / reading.n_samples:.0f} % of its samples'
+            why = f'{share} are at the full scale: is --full-scale right?'
+        else:
+            why = stillness.why_restless(cells, still_sd)
+        restless = f'no still interval: {why}'
         if min_rest_s is not None:
             restless += f'; --min-rest accepts rests of {min_rest_s:g} s or more only'
     per_window = max(1, round(window_s / cells.cell_s)) if cells.cell_s else 1
-    sizes = [min(per_window, max(1, (b - a) // fewest_windows)) for a, b in ranges]
+    has_rate = reading.has_rate
     bag = ReducedBag(
         source=source,
         start_ns=cells.start_ns,
         end_ns=cells.end_ns,
         intervals=tuple(
-            _windows(cells, *edges, size, reading.has_rate)
-            for edges, size in zip(ranges, sizes, strict=True)
+            _windows(cells, a, b, min(per_window, max(1, (b - a) // fewest_windows)), has_rate)
+            for a, b in ranges
         ),
         temperatures=reading.temperatures,
         n_spikes=reading.n_spikes,
@@ -265,7 +267,7 @@ def _reduced(
         n_glitches=cells.n_glitches,
         n_repeated=cells.n_repeated,
         n_cells=len(cells.count),
-        n_still_cells=sum(upper - lower for lower, upper in ranges),
+        n_still_cells=sum(b - a for a, b in ranges),
         # A bag without a usable sample has no cells, and gets the requested window length.
         window_s=round(per_window * cells.cell_s, 6) or window_s,
         cycle_s=_cycle_s(cells),
@@ -273,7 +275,7 @@ def _reduced(
         middle=cells.middle,
         max_abs=_max_abs(cells),
         restless=restless,
-        angular_rate='whole' if reading.has_rate else 'part' if cells.rate.any() else 'none',
+        angular_rate='whole' if has_rate else 'part' if cells.rate.any() else 'none',
     )
     if (reader := source.reader()) is not None:
         bag = replace(bag, info=reader.info, since_s=reader.since_s)
@@ -343,21 +345,12 @@ def _max_abs(cells: Cells) -> float:
     return float(np.quantile(sizes, 0.99))
 
 
-def _why_restless(cells: Cells, n_samples: int, still_sd: float) -> str:
-    if 2 * cells.n_saturated > n_samples:
-        share = 100.0 * cells.n_saturated / n_samples
-        return f'{share:.0f} % of its samples are at the full scale: is --full-scale right?'
-    return stillness.why_restless(cells, still_sd)
-
-
 def _rests(cells: Cells, min_rest_s: float | None, still_sd: float) -> list[tuple[int, int]]:
     """Find the rests, with the thresholds whose rests determine bias and scale best."""
     candidates: list[list[tuple[int, int]]] = []
-    # Values tried for the largest ratio of a rest's variance to the variance of the quietest
-    # cells, in ascending order.
+    # Largest ratio of a rest's variance to that of the quietest cells; smallest length of a rest.
     ratios = tuple(stillness.VARIANCE_RATIO * 2.0**power for power in range(6))
     of_ratios = stillness.still_runs(cells, still_sd, ratios)
-    # Values tried for the smallest length of a rest [s], in descending order.
     for shortest_s in (3.0, 2.0, 1.0) if min_rest_s is None else (min_rest_s,):
         for runs in of_ratios:
             ranges = stillness.long_enough(cells, runs, shortest_s)

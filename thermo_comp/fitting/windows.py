@@ -158,6 +158,11 @@ class Track(NamedTuple):
     is_known: Bools
     settled_s: float = -np.inf
 
+    @property
+    def grid_s(self) -> Floats:
+        """Time of each state [s], shape (n,)."""
+        return np.asarray(self.start_s + self.step_s * np.arange(len(self.states)))
+
 
 @dataclass(frozen=True)
 class ThermalWindows:
@@ -243,7 +248,7 @@ def thermal_windows(
     numbers: list[int] = []
     has_rate = all(interval.angular_rate is not None for bag in bags for interval in bag.intervals)
     for number, (bag, track) in enumerate(zip(bags, tracks, strict=True)):
-        grid, states = _with_memory(track, spec)
+        grid, states = track.grid_s, _with_memory(track, spec)
         # `np.interp` would copy a strided or boolean series at each call.
         known, all_series = track.is_known.astype(np.float64), np.ascontiguousarray(states.T)
         for interval in bag.intervals:
@@ -432,12 +437,8 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     return Track(start_s, step_s, states, is_known, start_s + step_s * n_unsettled)
 
 
-def _with_memory(track: Track, spec: MemorySpec) -> tuple[Floats, Floats]:
-    """Return a time grid [s], and the thermal states on this grid with their lags."""
-    states = track.states
-    grid = np.asarray(track.start_s + track.step_s * np.arange(len(states)), dtype=np.float64)
-    # The lags of all grid points are computed at once, which is faster than reading by reading.
-    layout = StateLayout(spec)
-    gradients = [states[:, layout.places[Gradient(name)]] for name in spec.sensors]
-    memory = memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)
-    return grid, np.hstack((states, memory))
+def _with_memory(track: Track, spec: MemorySpec) -> Floats:
+    """Return the thermal states of a track with their lags, computed at once for speed."""
+    states, places = track.states, StateLayout(spec).places
+    gradients = [states[:, places[Gradient(name)]] for name in spec.sensors]
+    return np.hstack((states, memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)))
