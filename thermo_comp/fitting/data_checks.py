@@ -77,12 +77,12 @@ def judge_windows(
     temperatures beyond the range of the prior are judged instead of the span and the ramps.
     """
     yield _judge_positions(up)
-    used_bags = list({id(bag): bag for bag, _ in windows.rests}.values())
     if not windows.has_temperature:
         what = 'no change of temperature was read'
-        if not any(len(bag.board.value) for bag in used_bags):
-            is_read = any(len(of.value) for bag in used_bags for of in bag.temperatures.values())
-            what = 'the bags have no thermometer' + ' of the board' * is_read
+        bags = [bag for bag, _ in windows.rests]
+        read = {name for bag in bags for name in bag.temperatures if len(bag.readings(name).value)}
+        if 'board' not in read:
+            what = 'the bags have no thermometer' + ' of the board' * bool(read)
         text = f'{what}: the calibration holds at the temperature of the test'
         yield advice('temperature', text)
         return
