@@ -64,9 +64,7 @@ def constant_calibration(
     bias = 0.5 * (means.max(axis=0) + means.min(axis=0))
     half = 0.5 * (means.max(axis=0) - means.min(axis=0))
     if not np.all(half > 0.0):
-        axes = ', '.join(
-            axis for axis, size in zip('xyz', half.tolist(), strict=True) if size == 0.0
-        )
+        axes = ', '.join('xyz'[k] for k in np.flatnonzero(half == 0.0))
         raise FitError(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'

@@ -31,7 +31,7 @@ from ..thermal.plausibility import CONTINUED_SHARE
 from ..thermal.thermometer import COLDEST, HOTTEST
 from ..typing import Bools, Floats, Ints
 from ..unit.provenance import Source
-from .coverage import best_rests, directions, distinct_directions, rough_centre
+from .coverage import best_rests, n_directions
 from .initial_triad import block_means
 from .sources import FitSource, angular_velocity
 
@@ -216,8 +216,7 @@ def reduce_source(
         # Cells of 5 samples are used if they give rests in six attitudes or more.
         shorter, _ = reduced(5)
         means = np.array([interval.mean.mean(axis=0) for interval in shorter.intervals])
-        means = means.reshape(-1, 3)
-        if len(distinct_directions(directions(means, rough_centre(means)))) >= 6:
+        if n_directions(means.reshape(-1, 3)) >= 6:
             return shorter
     return usual
 
@@ -296,18 +295,14 @@ def _cycle_s(cells: Cells) -> float:
 
 
 def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
-    """
-    Keep plausible readings with rising stamps; average groups of readings over about 0.2 s if
-    the mean interval between readings is at most 0.1 s.
-
-    No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
-    """
+    """Keep plausible readings with rising stamps; average those of over 10 Hz over 0.2 s."""
     stamp_ns, value = np.asarray(stamp_ns, np.int64), np.asarray(value, np.float64)
     before = np.concatenate((last_ns if len(last_ns) else stamp_ns[:1] - 1, stamp_ns[:-1]))
     use = (value >= COLDEST) & (value <= HOTTEST)
     use &= stamp_ns > np.maximum.accumulate(before[: len(stamp_ns)])
     stamp_ns, value = stamp_ns[use], value[use]
     span_s = np.ptp(stamp_ns) * 1e-9 if len(stamp_ns) else 0.0
+    # No thermometer responds within 0.2 s, and the tracker's loop over readings is slow in Python.
     size = int(0.2 * (len(stamp_ns) - 1) / span_s) if span_s else 1
     n = len(stamp_ns) // size * size if size > 1 else 0
     if n:
