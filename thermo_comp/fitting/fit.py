@@ -362,7 +362,8 @@ def _judged(
     findings = enforce(raw_checks.judge_prior(serial, options.prior), options)
     findings += enforce(raw_checks.judge_bags(bags, options), options)
     kept, copies = without_copies(bags)
-    return kept, findings + raw_checks.judge_copies(copies)
+    text = 'repeats the readings of the board, and is left out'
+    return kept, findings + [data_checks.advice('copy', f'temperature/{k} {text}') for k in copies]
 
 
 def _unusable(error: ValueError, up: Floats) -> FitError:

@@ -104,9 +104,8 @@ def _regress(windows: ThermalWindows, problem: Problem, *, is_at_rest: bool = Fa
         # of the unit, in a pose not from a change of the attitude, and in Golovach's model tilts
         # would absorb errors of the two sets.
         data = replace(data, tilt=data.tilt[:, :0])
-    data = replace(data, has_prior=known is not None)
-    if not problem.is_by_settled:
-        data = replace(data, settled=None)
+    settled = data.settled if problem.is_by_settled else None
+    data = replace(data, has_prior=known is not None, settled=settled)
     regression = Regression(data, options.gravity, start.scale)
     state = initial_state(regression, start, problem.up)
     prior = _initial_prior(windows, start, options)
@@ -205,9 +204,9 @@ def _initial_prior(
 
 def _with_faces(prior: Prior, up: Floats) -> Prior:
     """
-    Return the prior with a smaller misalignment sd if a noisy sensor has only positions near its
-    six faces. Faces hardly determine misalignments, and misalignments of some degrees would, to
-    second order, explain any errors of |f|. The published covariance keeps the sd of `prior`.
+    Return the prior with a smaller misalignment sd if a noisy sensor is only held on its faces:
+    there misalignments of some degrees would, to second order, explain any errors of |f|. The
+    published covariance keeps the sd of `prior`.
     """
     by_element = up[:, [1, 2, 2]] * up[:, [0, 0, 1]]
     # Smaller sd of an element of M [rad]: the cross-axis sensitivity of good consumer MEMS.
@@ -236,10 +235,8 @@ def _narrowed(prior: Prior, regression: Regression, state: State, options: FitOp
 
 def _is_slow(windows: ThermalWindows) -> Bools:
     """
-    Return which columns, shape (m,), have lags that settle by less than 90 % in the longest bag.
-
-    A slow column is nearly collinear with the curve, and its effect after settling would be
-    extrapolated. `select` does not use slow columns; the covariance includes them, see `claim`.
+    Return which columns, (m,), have lags that settle by less than 90 % in the longest bag: such a
+    column is nearly collinear with the curve, so `select` does not use it, but `claim` does.
     """
     model, longest_s = windows.model, float(windows.data.age.max())
     taus = np.array([0.0] * len(model.sets.groups) + [column.tau_s for column in model.columns])

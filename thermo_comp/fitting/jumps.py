@@ -128,7 +128,6 @@ def _examine(
         return None
     beside = before | after
     at, r = _place_and_colour(time, accel, quiet_sd)
-    # A step changes the mean level of the quiet samples; a shock, which decays, does not.
     lasting, relative_sd, residual = _step(time[beside], accel[beside], time[at])
     # Two levels are rounded, the level before and the level after the step.
     by_rounding = 2.0**0.5 * rounding_sd

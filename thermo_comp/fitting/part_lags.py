@@ -106,7 +106,7 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
             continue
         subset = _PartCurves(windows, start, shape, 3000)
         lags = [subset.refined(lag, axis) for axis, lag in enumerate(searched)]
-        parts, ratio = _parts_of(windows, start, shape, lags, noise)
+        parts, ratio = _PartCurves(windows, start, shape, len(data.time)).parts(lags, noise)
         # A residual above `most_noise` times the white noise has a cause besides white noise and
         # lags, such as slow noise: the lags are then accepted only if the RMS residual of each
         # axis is at most a quarter of its RMS residual without a lag.
@@ -122,38 +122,15 @@ def find_parts(windows: ThermalWindows, start: ConstantCalibration) -> list[Part
         curves = _PartCurves(windows, start, _SHAPES[0], 500)
         lags = [curves.one_stage(axis) for axis in range(3)]
         if min(map(curves.reduction, lags, range(3))) > 2.0:
-            return [_parts_of(windows, start, _SHAPES[0], lags, noise)[0], *accepted]
+            full = _PartCurves(windows, start, _SHAPES[0], len(data.time))
+            return [full.parts(lags, noise)[0], *accepted]
     return accepted
-
-
-def _parts_of(
-    windows: ThermalWindows,
-    start: ConstantCalibration,
-    shape: _Shape,
-    lags: Sequence[Part],
-    noise: Floats,
-) -> tuple[Parts, float]:
-    """Return the lags with the weights of the windows, and the ratio of RMS residual to noise."""
-    data = windows.data
-    full = _PartCurves(windows, start, shape, len(data.time))
-    residual = np.column_stack([full.residual(lag, axis) for axis, lag in enumerate(lags)])
-    factors = undisturbed(residual, data.weight, data.position)
-    square = np.average(residual**2, axis=0, weights=data.weight * factors)
-    square /= max(1.0 - full.n_parameters(lags[0]) / len(data.time), 0.05)
-    ratio = float(np.sqrt((square / noise**2).max()))
-    x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
-    # Largest left-out drift at which the lags are kept without trial of other models: 10 sd of the
-    # noise if noise explains the residual of a shape without stress (its curves extrapolate badly
-    # to left-out data), else 2 sd.
-    is_curve = ratio <= shape.most_noise and not shape.has_stress
-    return Parts((x, y, z), factors, (10.0 if is_curve else 2.0) * float(noise.mean())), ratio
 
 
 class _PartCurves:
     """
-    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags.
-
-    Every k-th window is used, with the largest k that keeps at least `n_windows` windows.
+    Bias and scale factor of each axis as functions of x, the temperature of a part, for any lags;
+    every k-th window is used, with the largest k that keeps at least `n_windows` windows.
     """
 
     def __init__(
@@ -168,7 +145,8 @@ class _PartCurves:
         )
         self._age = data.age[rows, None]
         self._is_of_bag = data.bag[rows, None] == np.arange(data.bag[-1] + 1.0)
-        weight = data.weight[rows, None]
+        self._weight = data.weight[rows]
+        weight = self._weight[:, None]
         self._root_weight = np.sqrt(weight)
         self._share = weight / np.add.reduceat(weight, self._first)[self._position]
         self._case = windows.gradient[rows]
@@ -207,11 +185,8 @@ class _PartCurves:
     def _is_of_use(
         self, lag: Part, axis: int, noise: float, most_noise: float = 3.0, reduction: float = 4.0
     ) -> bool:
-        """
-        Whether the residual is at most `most_noise` times the noise, or `lag` divides the residual
-        by `reduction` or more.
-        """
-        typical = 1.4826 * np.median(np.abs(self.residual(lag, axis)))
+        """Whether the residual is within `most_noise` noises, or `lag` divides it enough."""
+        typical = 1.4826 * np.median(np.abs(self._weighted(lag, axis) / self._root_weight[:, 0]))
         return bool(typical <= most_noise * noise or self.reduction(lag, axis) >= reduction)
 
     def _lag(self, axis: int, noise: float) -> Part:
@@ -356,13 +331,23 @@ class _PartCurves:
         """Return the ratio of the RMS residual of an axis without a lag to that with `lag`."""
         return float(np.sqrt(self._square(Part(0.0), axis) / self._square(lag, axis)))
 
-    def n_parameters(self, lag: Part) -> int:
-        """Return the number of unknowns of an axis: coefficients, and one level per position."""
-        return int(self._series(lag, 0).shape[1]) + len(self._first)
-
-    def residual(self, lag: Part, axis: int) -> Floats:
-        """Return the residuals of one axis in all windows, shape (n,) [m/s^2]."""
-        return np.asarray(self._weighted(lag, axis) / self._root_weight[:, 0])
+    def parts(self, lags: Sequence[Part], noise: Floats) -> tuple[Parts, float]:
+        """Return the lags with factors of the weights, and the ratio of RMS residual to noise."""
+        weighted = np.column_stack([self._weighted(lag, axis) for axis, lag in enumerate(lags)])
+        residual = weighted / self._root_weight
+        factors = undisturbed(residual, self._weight, self._position)
+        square = np.average(residual**2, axis=0, weights=self._weight * factors)
+        # The unknowns of an axis are the coefficients, and one level per position.
+        n_unknowns = self._series(lags[0], 0).shape[1] + len(self._first)
+        square /= max(1.0 - n_unknowns / len(residual), 0.05)
+        ratio = float(np.sqrt((square / noise**2).max()))
+        x, y, z = (Part(*map(round, lag, (1, 1, 4, 1))) for lag in lags)
+        # Largest left-out drift at which the lags are kept without trial of other models: 10 sd of
+        # the noise if noise explains the residual of a shape without stress (its curves
+        # extrapolate badly to left-out data), else 2 sd.
+        is_curve = ratio <= self._shape.most_noise and not self._shape.has_stress
+        most_drift = (10.0 if is_curve else 2.0) * float(noise.mean())
+        return Parts((x, y, z), factors, most_drift), ratio
 
     def _square(self, lag: Part, axis: int) -> float:
         left = self._weighted(lag, axis)

@@ -211,14 +211,6 @@ def describe(jump: Jump, per_mg: float, since_s: float = 0.0) -> str:
     )
 
 
-def judge_copies(names: Sequence[str]) -> list[Finding]:
-    """Report the thermometers `names`, whose readings are equal to the board's."""
-    return [
-        advice('copy', f'temperature/{name} repeats the readings of the board, and is left out')
-        for name in names
-    ]
-
-
 def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterator[Finding]:
     """Report which share of the time at rest is left out without a temperature, and why."""
     if not windows.has_temperature:

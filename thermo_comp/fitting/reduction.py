@@ -314,12 +314,9 @@ def thinned(stamp_ns: Ints, value: Floats, last_ns: Ints) -> Readings:
 
 
 def is_spike(value: Floats) -> Bools:
-    """
-    Return which readings are more than 10 K from the median of the five readings about them, (n,).
-
-    A thermometer with a loose contact reads -127 or 85 degC for a moment. The fit estimates the
-    noise of a thermometer without spikes, so that the tracker rejects such readings as outliers.
-    """
+    """Return which readings are over 10 K from the median of the five about them, shape (n,)."""
+    # A thermometer with a loose contact reads -127 or 85 degC for a moment. The fit estimates its
+    # noise without such readings, so that the tracker rejects them as outliers.
     far = np.zeros(len(value), dtype=bool)
     if len(value) > 4:
         middle = np.median(sliding_window_view(value, 5), axis=1)

@@ -92,10 +92,7 @@ def is_better_with_tilts(fit: Fit, tilted: Fit) -> bool:
 
 
 def in_pieces(bag: ReducedBag) -> ReducedBag:
-    """
-    Divide each rest of a bag into equal pieces of about an hour. The fit takes each piece for a
-    separate position, with a separate attitude, as if the support had tilted between the pieces.
-    """
+    """Divide each rest of a bag into equal pieces of about an hour, as separate positions."""
     pieces = [piece for rest in bag.intervals for piece in _pieces(rest, bag.window_s)]
     return replace(bag, intervals=tuple(pieces))
 

@@ -68,10 +68,7 @@ def is_steady(windows: ThermalWindows) -> Bools:
 
 
 def is_without_drift(data: Windows, scale: Floats) -> Bools:
-    """
-    Return the positions in which the RMS drift of the samples of each axis is at most three times
-    the white noise of a window, shape (n_positions,).
-    """
+    """Return positions whose RMS drift is within 3 times a window's noise, (n_positions,)."""
     drift = within_positions(data.mean / scale, data.position) * np.sqrt(data.weight)[:, None]
     square = np.add.reduceat(drift**2, data.edges[:-1], axis=0) / np.diff(data.edges)[:, None]
     return np.asarray((square <= (3.0 * white_noise_of(data, scale)) ** 2).all(axis=1))
@@ -79,9 +76,8 @@ def is_without_drift(data: Windows, scale: Floats) -> Bools:
 
 def constant_in(data: Windows, steady: Bools, settled: Bools) -> Windows:
     """
-    Return the windows with constant columns in the positions of the mask `steady`, (n_positions,),
-    and without effects of initial lag states in the positions of the mask `settled`,
-    (n_positions,), in which such effects would only fit the noise.
+    Return the windows with constant columns in the positions of the mask `steady`, and without
+    effects of initial lag states, which would only fit noise, in `settled`; both (n_positions,).
     """
     in_steady = steady[data.position][:, np.newaxis]
     means = (data.columns - within_positions(data.columns, data.position))[data.edges[:-1]]

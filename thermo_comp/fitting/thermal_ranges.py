@@ -208,10 +208,7 @@ def _ends(fit: Fit, known: Calibration | None) -> Range:
 
 
 def _unknown_slope(fit: Fit) -> float:
-    """
-    Return the sd of the slope of an extrapolated scale factor [1/K]: half of the RMS, over the
-    axes, of the slopes of the fitted scale curves.
-    """
+    """Return half of the RMS slope of the fitted scale curves over the axes [1/K]."""
     windows, state = fit.windows.data, fit.posterior.state
     is_curve = np.isin(windows.groups, (CURVE, PART)) & (windows.kelvins > 0.0)
     slopes = state.weights[1][:, is_curve] / windows.kelvins[is_curve]

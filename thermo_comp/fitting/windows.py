@@ -290,7 +290,6 @@ def _rows(
 ) -> _Rows:
     """
     Average the windows of a rest selected by `use` to windows of 60 s, shorter in a short rest.
-
     `states`: thermal states, (width, n); `begin_s`: time at which the lags begin [s]
     """
     time, count = interval.time[use], interval.count[use]
@@ -364,10 +363,7 @@ def _windows(
 
 
 def _settled(model: Model, spec: MemorySpec, rows: _Rows, table: ColumnTable) -> Floats:
-    """
-    Return the columns at 9 constant board temperatures over the range of the windows, with settled
-    lags and the median gradient of the static regime, shape (9, m).
-    """
+    """Return the columns at 9 board temperatures over the windows' range, lags settled, (9, m)."""
     board, is_static = rows.thermal[:, 0], rows.thermal[:, 3] <= 0.5
     some = is_static if is_static.any() else np.ones_like(is_static)
     states = np.zeros((StateLayout(spec).width, 9))
@@ -389,10 +385,7 @@ def _sections(position: Ints, time: Floats) -> Ints:
 
 
 def _kelvins(model: Model, values: Floats, raw: Floats, t: Floats, gradient: Floats) -> Floats:
-    """
-    Return the temperature change that corresponds to the RMS of each column [K], shape (m,): the
-    RMS divided by the largest slope of the column over temperature; 0 if this slope is 0.
-    """
+    """Return the RMS of each column divided by its largest slope over temperature [K], (m,)."""
     farthest = float(np.abs(t).max(initial=0.0))
     flow = float(np.sqrt(np.mean(gradient**2))) or 1.0
     grid = np.linspace(float(t.min()), float(t.max()) + 1e-9, 100)
