@@ -116,8 +116,8 @@ def with_forces(
     for p, (bag, rest) in enumerate(windows.rests):
         if (known := bag.source.force) is not None:
             first_ns = bag.start_ns - round(bag.since_s * 1e9)
-            size, spin[p], sd[p] = known.of(rest.start_ns, rest.end_ns, first_ns)
-            still[p] = options.gravity if size is None else size
+            size = known.of(rest.start_ns, rest.end_ns, first_ns, options.gravity)
+            still[p], spin[p], sd[p] = size
     prior = options.prior.nonlinearity if options.prior else None
     is_usual = np.ptp([*np.hypot(still, spin), options.gravity]) < 1e-3 * options.gravity
     if is_usual and prior is None and options.k2_sd is None and options.k3_sd is None:
