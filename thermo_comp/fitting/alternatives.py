@@ -21,7 +21,7 @@ from .priors import prior_model
 from .reduction import ReducedBag
 from .selection import Fit, Selected
 from .sensors import board_span, gradients_at_rest, learn_detector
-from .windows import PART, PART_SUMS, SET, Model, ThermalWindows, Track, thermal_windows
+from .windows import PART, PRODUCTS, SET, Model, ThermalWindows, Track, thermal_windows
 
 
 def model_of(
@@ -53,7 +53,7 @@ def model_of(
     if options.groups is not None:
         groups = {*options.groups, *options.forced}
         if PART in groups:
-            groups.update(PART_SUMS)
+            groups.update(('board', *PRODUCTS))
         columns = tuple(column for column in columns if column.group in groups)
     sets = sets_of(options, bags)
     return Model(options.model, sets, columns, sensors, detector, reference, parts)

@@ -29,8 +29,6 @@ from ..unit.gravity import parse_acceleration
 #: Keys of a bag's metadata about |f|.
 MAGNITUDE, ROTATION = 'specific_force_magnitude_m_s2', 'rotation_topic'
 RADIUS, RADIUS_SD = 'rotation_radius_m', 'rotation_radius_sd_m'
-# The name of a bag, such as 01.mcap or run_*; a number with its unit, such as 10s, is no name.
-_NAME = re.compile(r'[A-Za-z_*?]{2}|[*]')
 
 
 class Section(NamedTuple):
@@ -215,7 +213,8 @@ def _asked_sections(text: str, path: Path) -> tuple[Section, ...]:
     mine: list[str] = []
     for line in content.splitlines():
         first, _, rest = line.strip().replace(',', ' ').partition(' ')
-        if not first or first[0] == '#' or not _NAME.search(first):
+        # A name of a bag is 01.mcap or run_*; a number with its unit, such as 10s, is no name.
+        if not first or first[0] == '#' or not re.search(r'[A-Za-z_*?]{2}|[*]', first):
             mine.append(line)
         elif fnmatch(path.name, first):
             mine.append(rest)
