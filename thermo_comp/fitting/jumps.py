@@ -65,10 +65,9 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     Two rests are compared if the gap between them is at most 30 s or 250 samples, whichever is
     longer, and their directions differ by less than 10 degrees.
     """
-    cycle_s = bag.cycle_s if np.isfinite(bag.cycle_s) else 0.0
     # At a low sample rate gaps are long: a rest is made of cells, usually of 30 samples each.
-    longest_ns = 1e9 * max(30.0, 250.0 * cycle_s)
-    margin_s = max(_MARGIN_S, 120.0 * cycle_s)  # at least 120 samples
+    longest_ns = 1e9 * max(30.0, 250.0 * bag.cycle_s)
+    margin_s = max(_MARGIN_S, 120.0 * bag.cycle_s)  # at least 120 samples
     means = [np.average(rest.mean, axis=0, weights=rest.count) for rest in bag.intervals]
     ups = [mean / np.linalg.norm(mean) for mean in means]
     gaps = [

@@ -41,7 +41,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
     def total(name: str) -> int:
         return sum(getattr(bag, name) for bag in bags)
 
-    n_samples = max(total('n_samples'), 1)
+    n_samples = total('n_samples')
     part = total('n_saturated') / n_samples
     if part > 0.001:
         yield Finding(
@@ -62,7 +62,7 @@ def judge_bags(bags: Sequence[ReducedBag], options: FitOptions) -> Iterator[Find
             'glitches',
             f'{counted(n, "sample")} far from both neighbours, left out: does the bus lose bits?',
         )
-    still = total('n_still_cells') / max(total('n_cells'), 1)
+    still = total('n_still_cells') / total('n_cells')
     if still < 0.5:
         yield advice(
             'motion',
@@ -218,8 +218,8 @@ def judge_missing(bags: Sequence[ReducedBag], windows: ThermalWindows) -> Iterat
     counts = [_missing(bag, track) for bag, track in zip(bags, windows.tracks, strict=True)]
     n_still, n_unsettled, n_between = np.sum(counts, axis=0).tolist()
     n_used = float(windows.data.weight.sum()) * windows.typical_count
-    unsettled = n_unsettled / max(n_still, 1.0)
-    missing = 1.0 - n_used / max(n_still, 1.0) - unsettled
+    unsettled = n_unsettled / n_still
+    missing = 1.0 - n_used / n_still - unsettled
     reported = 0.1  # smallest share of the time at rest without temperature that is reported
     if missing > reported:
         why = 'do the thermometers and the accelerometer use the same clock?'
@@ -244,8 +244,8 @@ def _missing(bag: ReducedBag, track: Track) -> tuple[float, float, float]:
     accurate; later ones without a temperature, but between readings of each thermometer.
     """
     read = [readings.stamp_ns for readings in bag.temperatures.values() if len(readings.stamp_ns)]
-    begin_s = 1e-9 * (max((stamp_ns[0] for stamp_ns in read), default=bag.start_ns) - bag.start_ns)
-    end_s = 1e-9 * (min((stamp_ns[-1] for stamp_ns in read), default=bag.start_ns) - bag.start_ns)
+    begin_s = 1e-9 * (max(stamp_ns[0] for stamp_ns in read) - bag.start_ns)
+    end_s = 1e-9 * (min(stamp_ns[-1] for stamp_ns in read) - bag.start_ns)
     n_still = n_unsettled = n_between = 0.0
     for rest in bag.intervals:
         is_known = np.interp(rest.time, track.grid_s, track.is_known, left=0.0) == 1.0
@@ -264,9 +264,7 @@ def _longest_pause(bags: Sequence[ReducedBag]) -> str:
         for name, readings in bag.temperatures.items():
             is_new = np.diff(readings.value, prepend=np.nan) != 0.0
             stamps = np.append(readings.stamp_ns[is_new], readings.stamp_ns[-1:])
-            if len(stamps) > 1:
-                pauses.append((float(np.diff(stamps).max()) * 1e-9, name, bag.source.name))
-    if not pauses:
-        return ''
+            pause_s = float(np.diff(stamps).max(initial=0)) * 1e-9
+            pauses.append((pause_s, name, bag.source.name))
     pause_s, name, where = max(pauses)
     return f'{where}: temperature/{name} has no new value for {pause_s:.0f} s'
