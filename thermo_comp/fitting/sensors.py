@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 thermo_comp contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Owns the estimation of thermometer and detector settings from bags, and the bags' thermal states.
+Owns the estimation of thermometer and detector settings from bags.
 
 The rates of temperature here are central differences over two minutes, which are not causal and
 need a recording. The lag and the ramps of the test that these rates show, and the noise of the
@@ -18,8 +18,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from ..thermal.settings import OBVIOUS_SHARE, RAMP_K_MIN, DetectorSettings, ThermometerSettings
-from ..thermal.tracker import ThermalTracker
-from ..typing import Bools, Floats
+from ..typing import Floats
 from .reduction import Readings, ReducedBag
 
 # Interval of the grid of rates [s], and number of intervals on each side in a central difference.
@@ -261,31 +260,3 @@ def readings_in_order(bag: ReducedBag, inputs: Sequence[str]) -> list[tuple[str,
         for stamp_ns, value in zip(*map(np.ndarray.tolist, bag.readings(name)), strict=True)
     ]
     return sorted(rows, key=itemgetter(1))
-
-
-def thermal_states(
-    bag: ReducedBag, tracker: ThermalTracker, step_s: float
-) -> tuple[float, Floats, Bools]:
-    """
-    Run a tracker over a bag; evaluate its thermal state at intervals of `step_s`.
-
-    Returns the time of the first state [s], the states, and whether readings of each are recent.
-    """
-    readings = iter(readings_in_order(bag, ('board', *tracker.spec.sensors)))
-    reading = next(readings, None)
-    step_ns = round(step_s * 1e9)
-    begin = max(int(bag.board.stamp_ns[0]), bag.start_ns)
-    rows, is_heard = [], []
-    board, *others = tracker.thermometers.values()
-    limit_s, other_limit_s = tracker.config.temperature_timeout_s, tracker.config.case_timeout_s
-    for stamp_ns in range(begin, max(bag.end_ns, begin) + step_ns, step_ns):
-        # As in the node, a state depends on all readings with a stamp up to that of the state.
-        while reading is not None and reading[1] <= stamp_ns:
-            tracker.read(*reading)
-            reading = next(readings, None)
-        rows.append(tracker.sample(stamp_ns))
-        is_heard.append(
-            board.beyond(stamp_ns) <= limit_s
-            and all(sensor.beyond(stamp_ns) <= other_limit_s for sensor in others)
-        )
-    return (begin - bag.start_ns) * 1e-9, np.array(rows), np.array(is_heard)

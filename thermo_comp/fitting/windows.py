@@ -29,7 +29,7 @@ from ..unit.columns import Column, ColumnTable, Part, memory_of
 from ..unit.functions import Polynomial, TemperatureFunction
 from .initial_triad import block_means
 from .reduction import ReducedBag, StillInterval
-from .sensors import thermal_states
+from .sensors import readings_in_order
 from .unknowns import Windows
 
 #: Groups of columns: the curve, the difference of the static and dynamic sets, bends (changes of
@@ -409,7 +409,7 @@ def _part_kelvins(values: Floats) -> Floats:
 
 
 def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
-    """Run the tracker over the readings of a bag."""
+    """Run the tracker over the readings of a bag, at 5 states per window."""
     spec = replace(spec, lags=(), plays=())
     if not len(bag.board.value):
         # Without readings, assume the reference temperature since 1e9 s, so that all lags are 0.
@@ -417,15 +417,29 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
         still[:, BOARD] = model.reference_temperature
         end_s = 1.0 + (bag.end_ns - bag.start_ns) * 1e-9
         return Track(-1e9, 1e9 + end_s, still, np.ones(2, dtype=bool))
-    tracker = ThermalTracker(model.detector, spec, ThermalConfig())
-    shortest = min(
-        (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1), default=1.0
-    )
-    step_s = max(shortest / 5.0, 0.1)
-    start_s, states, is_known = thermal_states(bag, tracker, step_s)
-    is_settled = states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])
-    n_unsettled = int(np.argmax(is_settled))
+    config = ThermalConfig()
+    tracker = ThermalTracker(model.detector, spec, config)
+    board, *others = tracker.thermometers.values()
+    lengths_s = (float(np.median(np.diff(i.time))) for i in bag.intervals if len(i.time) > 1)
+    step_s = max(min(lengths_s, default=1.0) / 5.0, 0.1)
+    step_ns, begin_ns = round(step_s * 1e9), max(int(bag.board.stamp_ns[0]), bag.start_ns)
+    rows, is_heard = [], []
+    readings = iter(readings_in_order(bag, ('board', *spec.sensors)))
+    reading = next(readings, None)
+    for stamp_ns in range(begin_ns, max(bag.end_ns, begin_ns) + step_ns, step_ns):
+        # As in the node, a state depends on all readings with a stamp up to that of the state.
+        while reading is not None and reading[1] <= stamp_ns:
+            tracker.read(*reading)
+            reading = next(readings, None)
+        rows.append(tracker.sample(stamp_ns))
+        is_heard.append(
+            board.beyond(stamp_ns) <= config.temperature_timeout_s
+            and all(sensor.beyond(stamp_ns) <= config.case_timeout_s for sensor in others)
+        )
+    states, is_known = np.array(rows), np.array(is_heard)
+    n_unsettled = int(np.argmax(states[:, VAR_BOARD] <= 4.0 * np.median(states[:, VAR_BOARD])))
     is_known[:n_unsettled] = False
+    start_s = (begin_ns - bag.start_ns) * 1e-9
     return Track(start_s, step_s, states, is_known, start_s + step_s * n_unsettled)
 
 
