@@ -167,11 +167,8 @@ def test_a_force_given_by_the_user_overrides_the_force_in_the_bag(tmp_path):
     rate = np.zeros((200, 3))
     rate[:, 2] = np.where(np.arange(200) < 100, 0.0, 5.0)
     by_rate = {ROTATION: 'table/rate', 'rotation_radius_m': '2', 'rotation_radius_sd_m': '0.01'}
-    for name, metadata in (
-        ('a', {MAGNITUDE: '30'}),
-        ('02', by_rate),
-        ('c', {ROTATION: 'table/rate'}),
-    ):
+    bags = {'a': {MAGNITUDE: '30'}, '02': by_rate, 'c': {ROTATION: 'table/rate'}}
+    for name, metadata in bags.items():
         with BagWriter(tmp_path / f'{name}.mcap', metadata=metadata) as writer:
             writer.write_counts('accel/counts', stamps, rate)
             writer.write_counts('table/rate', stamps, rate)

@@ -9,7 +9,7 @@ uncertainty. A refusal stops the fit, unless its `Finding.name` is allowed; advi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -325,29 +325,17 @@ def check_scale(fit: Fit) -> None:
 
 
 def judge_result(
-    K: Floats,
-    rows: Sequence[ResidualRow],
-    slow: float,
-    options: FitOptions,
-    *,
-    span: float,
-    drift: float,
-    noise: float,
-    sigma: float,
-    is_changed: bool,
+    fit: Fit, overall: ResidualRow, norms: Floats, slow: float, options: FitOptions
 ) -> Iterator[Finding]:
     """
-    Check the residuals of a fit.
+    Check the residuals of a fit, `overall`: of all windows.
 
-    K: scale factors; rows: residuals by regime and, last, of all windows
+    norms: ``|f| - g`` of each window, shape (n,) [m/s^2]
     slow: sd of the bias offset of a mounting or turn-on [m/s^2]
-    span: span of the board temperature [K]
-    drift: RMS of ``|f| - g`` about the means of the positions [m/s^2]
-    noise: white noise of a window [m/s^2]
-    sigma: RMS error of a window that the fit does not explain [m/s^2]
-    is_changed: whether a prior far wider than the given calibration has more evidence
     """
-    overall = rows[-1]
+    drift = within_positions(norms[:, None], fit.windows.data.position)
+    span, noise = float(np.ptp(fit.windows.temperature)), fit.selected.score.noise
+    prior, K = fit.posterior.prior, fit.posterior.state.kappa * fit.regression.nominal_scale
     raw, fitted, left_out = (
         row.rms / MICRO_G for row in (overall.raw, overall.fitted, overall.left_out)
     )
@@ -357,18 +345,15 @@ def judge_result(
     # Noise explains a residual of up to twice the white noise.
     if span > 0.0 and is_slow and overall.fitted.rms > 2.0 * noise:
         why = 'temperature does not explain the drift (jumps, mounting, a loose thermometer?)'
-        if drift <= max(2.0 * noise, 0.3 * overall.fitted.rms):
+        if float(np.sqrt(np.mean(drift**2))) <= max(2.0 * noise, 0.3 * overall.fitted.rms):
             why = (
                 '|f| differs between positions, while temperature explains the drift within them: '
                 'the bias does not repeat after the unit is mounted or switched on again'
             )
         yield advice('misfit', f'{text}: {why}')
     elif raw < 1.2 * fitted and span >= LEAST_SPAN_K:
-        why = (
-            ': there is hardly a temperature drift above the noise to correct; are the samples '
-            'already compensated?'
-        )
-        yield advice('compensated', text + why)
+        why = 'there is hardly a temperature drift above the noise to correct; are the samples'
+        yield advice('compensated', f'{text}: {why} already compensated?')
     elif overall.left_out.rms > overall.raw.rms and raw >= 1.2 * fitted and span > 0.0:
         why = 'the other positions predict a left-out position badly; record more positions'
         yield advice('left out', f'{text}: left-out residuals exceed the raw residual: {why}')
@@ -377,14 +362,14 @@ def judge_result(
     alone = overall.two_sets.rms
     # A bias offset of up to 2 sd (2 `slow`) after a new turn-on does not contradict the prior, nor
     # does a residual that the initial lag states explain: then `sigma` is about the noise.
-    contradiction = ''
+    contradiction, sigma = '', float(np.mean(prior.sigma))
     is_above = overall.fitted.rms > np.hypot(1.5 * alone, 2.0 * slow) and sigma > 1.5 * alone
     if options.prior is not None and is_above:
         contradiction = (
             f'|f| - g is {ug_text(overall.fitted.rms)} RMS with the prior, {ug_text(alone)} with '
             'a static and a dynamic set fitted without the prior'
         )
-    elif is_changed:
+    elif prior.informative and prior.informative.is_changed:
         contradiction = 'the parameters differ from the prior by far more than the prior sd'
     if contradiction:
         yield advice(

@@ -31,7 +31,6 @@ from .data_checks import Finding, enforce
 from .environments import contradicting_bag, contradiction, is_better_without, with_excluded_error
 from .evidence import PositionReport, ResidualRow, position_reports, residual_rows
 from .gyroscope import RateRow, add_gyroscope
-from .initial_triad import within_positions
 from .initialisation import Problem, initial_triad
 from .joining import joined
 from .nonlinear import choose, is_beyond, judge_terms, of_file, with_blank, with_forces
@@ -307,17 +306,8 @@ def _fit(
         lacks_effects=fit.selected.lacks_effects,
     )
     residuals, in_sample, left_out = residual_rows(fit)
-    drift = within_positions(in_sample[:, None], fit.windows.data.position)
     findings += enforce(data_checks.judge_constants(fit, residuals[-1].raw.rms, options), options)
-    K, informative = fit.posterior.state.kappa * start.scale, fit.posterior.prior.informative
-    findings += data_checks.judge_result(
-        *(K, residuals, claim.offset_sd, options),
-        span=float(np.ptp(fit.windows.temperature)),
-        drift=float(np.sqrt(np.mean(drift**2))),
-        noise=fit.selected.score.noise,
-        sigma=float(np.mean(fit.posterior.prior.sigma)),
-        is_changed=bool(informative and informative.is_changed),
-    )
+    findings += data_checks.judge_result(fit, residuals[-1], in_sample, claim.offset_sd, options)
     findings += data_checks.judge_mountings(fit, claim.offset_sd, options)
     try:
         nonlinearity = of_file(fit.regression, terms, options)
