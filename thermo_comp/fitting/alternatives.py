@@ -90,7 +90,7 @@ def windows_of(
     `tracks`: thermal states of the bags, if computed before; `undisturbed`: factors of the weights
     of the windows, or None if the fit estimates these factors
     """
-    windows = with_forces(thermal_windows(bags, model, tracks), bags, options)
+    windows = with_forces(thermal_windows(bags, model, tracks), options)
     return replace(windows, data=replace(windows.data, undisturbed=undisturbed))
 
 

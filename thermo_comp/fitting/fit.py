@@ -284,7 +284,7 @@ def _fit(
     windows = windows_of(bags, model_of(bags, options), options)
     if options.prior and windows.data.forces and options.prior.nonlinearity is None:
         options = replace(options, prior=with_blank(options.prior, options))
-        windows = with_forces(windows, bags, options)
+        windows = with_forces(windows, options)
     known = options.prior
     start = initial_triad(windows, options) if known is None else constants_of(known)
     up = start.directions(windows.data)

@@ -49,23 +49,17 @@ def population(calibrations: Sequence[Calibration]) -> Calibration:
     sensors or the form of the curves.
     """
     # Nonlinear terms are left out: few calibrations have them, as a centrifuge determines them.
-    calibrations = [
-        each if each.nonlinearity is None else without_terms(each) for each in calibrations
-    ]
+    calibrations = [without_terms(each) for each in calibrations]
     _check_alike(calibrations)
     keys: dict[Column, list[Column]] = {}
     for calibration in calibrations:
         for column in prior_columns(calibration):
             for common, _ in _on_common_lags(column):
                 keys.setdefault(_without_range(common), []).append(common)
-    columns = [
-        replace(
-            key,
-            range=union(column.range for column in columns),
-            rest_k=float(np.mean([column.rest_k for column in columns])),
-        )
-        for key, columns in keys.items()
-    ]
+    columns = []
+    for key, same in keys.items():
+        rest_k = float(np.mean([column.rest_k for column in same]))
+        columns.append(replace(key, range=union(column.range for column in same), rest_k=rest_k))
     template = _template(calibrations, columns)
     K = np.array([constants_of(calibration).scale for calibration in calibrations])
     mean_K = np.exp(np.mean(np.log(np.abs(K)), axis=0)) * np.sign(K[0])
@@ -87,23 +81,21 @@ def _check_alike(calibrations: Sequence[Calibration]) -> None:
             f'the prior of a type needs the calibrations of at least {UNITS_NEEDED} units, got '
             f'{len(calibrations)}'
         )
-    first = calibrations[0]
-    serials = [calibration.unit.serial for calibration in calibrations]
-    if twice := sorted(serial for serial in set(serials) if serials.count(serial) > 1):
+    first, serials = calibrations[0], [each.unit.serial for each in calibrations]
+    if twice := sorted(serial for serial in serials if serials.count(serial) > 1):
         raise FitError(f'two calibrations are of unit {twice[0]}: give one calibration per unit')
-    for calibration in calibrations:
-        serial, unit = calibration.unit.serial, calibration.unit
-        alike = (unit.input, calibration.reference_temperature_c, calibration.sensors)
+    for each in calibrations:
+        alike = each.unit.input, each.reference_temperature_c, each.sensors
         if alike != (first.unit.input, first.reference_temperature_c, first.sensors):
             raise FitError(
-                f'the calibrations of units {serial} and {first.unit.serial} differ in the key '
-                'unit.input, reference_temperature_c or sensors: they are not of one type'
+                f'the calibrations of units {each.unit.serial} and {first.unit.serial} differ in '
+                'the key unit.input, reference_temperature_c or sensors: they are not of one type'
             )
-        if _shape(calibration) != _shape(first):
+        if _shape(each) != _shape(first):
             raise FitError(
-                f'the curves over temperature of unit {serial} have another form than those of '
-                f'unit {first.unit.serial}: fit both units with the same --model, --static-curve '
-                'and --dynamic-curve'
+                f'the curves over temperature of unit {each.unit.serial} have another form than '
+                f'those of unit {first.unit.serial}: fit both units with the same --model, '
+                '--static-curve and --dynamic-curve'
             )
 
 
