@@ -146,10 +146,7 @@ def _has_drift(windows: ThermalWindows) -> bool:
 
 
 def _ramp_rates(windows: ThermalWindows) -> Floats:
-    """
-    Return the rate of the board temperature [K/min], shape (n,). The rate is set to 0, as noise,
-    where the slope of the windows' mean temperatures is below half of the rate.
-    """
+    """Return the board's rate [K/min], (n,); 0 where it is over twice the windows' slope."""
     rate, edges = windows.rate * 60.0, windows.data.edges
     for rows in map(slice, edges[:-1], edges[1:]):
         if rows.stop - rows.start > 1:

@@ -145,10 +145,7 @@ def is_beyond(windows: ThermalWindows) -> bool:
 
 
 def prior_sd(kinds: Sequence[Kind], options: FitOptions) -> Floats:
-    """
-    Return the prior sd of the coefficients of k terms, then the prior sd of their changes per
-    kelvin, 2 % of those of the coefficients, shape (2 k,).
-    """
+    """Return the prior sds of k coefficients, then of their changes per kelvin, shape (2 k,)."""
     sd = np.array([options.nonlinear_sd(kind) for kind in kinds])
     return np.concatenate((sd, 0.02 * sd))
 
@@ -206,10 +203,7 @@ class _TermFits:
 def choose(
     regression: Regression, selected: Selected, options: FitOptions
 ) -> tuple[Selected, tuple[NonlinearTerm, ...]]:
-    """
-    Choose the nonlinear terms, and those whose coefficient depends on temperature. With a prior
-    calibration there is no choice, because the fit keeps the terms of the prior.
-    """
+    """Choose the nonlinear terms, and which depend on temperature; a prior's terms are kept."""
     forces = regression.forces
     if forces is None or options.prior is not None:
         return selected, ()
