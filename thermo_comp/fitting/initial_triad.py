@@ -55,7 +55,7 @@ def constant_calibration(
     if isinstance(gravity, np.ndarray):
         scale = np.full(3, float(np.median(np.linalg.norm(means, axis=1) / gravity)))
         calibration, rms = _refine(means, gravity, np.zeros(3), scale, misalignment_sd)
-        if not np.all(calibration.scale > 0.0) or not rms < largest_rms:
+        if not rms < largest_rms:
             raise FitError(
                 'the readings at rest contradict the stated |f|: are the values in '
                 '--specific-force, --radius or the metadata of the bags right?'
@@ -69,15 +69,14 @@ def constant_calibration(
             f'an axis ({axes}) reads the same in all positions: the axis is dead, or the unit was '
             'never turned about another axis'
         )
-    tried = []
-    for spread in (1.0, 1.3):
-        scale = np.full(3, float(np.max(half)) * spread / gravity)
-        scale = np.where(half * 4.0 > np.max(half), scale, half / gravity)
-        tried.append(_refine(means, gravity, bias, scale, misalignment_sd))
+    # The largest half range is |f| if two positions are near its axis, else less: try two ratios.
+    scales = (float(np.max(half)) * spread / gravity for spread in (1.0, 1.3))
+    starts = (np.where(half * 4.0 > np.max(half), scale, half / gravity) for scale in scales)
+    tried = (_refine(means, gravity, bias, scale, misalignment_sd) for scale in starts)
     calibration, rms = min(tried, key=lambda fitted: fitted[1])
     # Scattered points may give a very large ellipsoid with a far centre, which is refused.
     is_around = np.all(np.abs(calibration.bias - bias) < 2.0 * np.max(half))
-    if not np.all(calibration.scale > 0.0) or not is_around or not rms < largest_rms:
+    if not (is_around and rms < largest_rms):
         raise FitError(
             'the mean readings of the positions do not lie on an ellipsoid: was the unit at rest '
             'in every position, and are these the readings of an accelerometer, with three axes '
