@@ -272,9 +272,8 @@ def determines_misalignment(up: Floats) -> bool:
     six faces held three times each by hand.
     """
     distinct = distinct_directions(up)
-    if len(distinct) < POSITIONS_FOR_MISALIGNMENT:
-        return False
-    return geometry(distinct, with_misalignment=True) <= 6.0
+    is_enough = len(distinct) >= POSITIONS_FOR_MISALIGNMENT
+    return is_enough and geometry(distinct, with_misalignment=True) <= 6.0
 
 
 def judge_constants(fit: Fit, raw: float, options: FitOptions) -> Iterator[Finding]:

@@ -84,7 +84,7 @@ def find_jumps(bag: ReducedBag) -> tuple[Jump, ...]:
     margins = [max(_margin(part, sds[0]), margin_s) for part in beside]
     if max(margins, default=0.0) > margin_s:
         beside = _beside_gaps(bag, gaps, margins)
-    jumps = (_examine(part, gap, *sds, bag) for part, gap in zip(beside, gaps, strict=True))
+    jumps = (_examine(part, gap, sds, bag) for part, gap in zip(beside, gaps, strict=True))
     return tuple(jump for jump in jumps if jump is not None)
 
 
@@ -114,13 +114,10 @@ def _margin(samples: Floats, quiet_sd: Floats) -> float:
 
 
 def _examine(
-    samples: Floats,
-    gap: tuple[float, float],
-    quiet_sd: Floats,
-    rounding_sd: Floats,
-    bag: ReducedBag,
+    samples: Floats, gap: tuple[float, float], sds: tuple[Floats, Floats], bag: ReducedBag
 ) -> Jump | None:
-    """Return the jump in the samples around a gap between two rests, or None for no jump."""
+    """Return the jump around a gap between two rests, or None; `sds`: of noise, of rounding."""
+    quiet_sd, rounding_sd = sds
     time, accel, gyro = samples[:, 0], samples[:, 1:4], samples[:, 4:]
     before, after = time <= gap[0], time >= gap[1]
     if min(before.sum(), after.sum()) < _FEWEST_SAMPLES:
@@ -162,8 +159,7 @@ def _examine(
     # If someone handled the unit, the samples scatter by far more than twice the quiet noise.
     if not is_no_turn or np.any(spread > 2.0 * quiet_sd):
         return None
-    x, y, z = step.tolist()
-    warmed = _temperature_step(bag, time[0], time[at], time[-1])
+    (x, y, z), warmed = step.tolist(), _temperature_step(bag, time[0], time[at], time[-1])
     return Jump(float(time[at]), float(time[at] - time[at - 1]), (x, y, z), along, *warmed)
 
 
@@ -189,8 +185,7 @@ def _temperature_step(bag: ReducedBag, begin: float, at: float, end: float) -> t
     if min(np.sum(time < at), np.sum(time >= at)) < _FEWEST_SAMPLES:
         return np.nan, np.nan
     (step,), relative_sd, residual = _step(time, value[:, None], at)
-    variance = float(np.sum(residual**2)) / max(len(value) - 3, 1)
-    return float(step), relative_sd * float(np.sqrt(variance))
+    return float(step), relative_sd * float(np.sqrt(np.sum(residual**2) / (len(value) - 3)))
 
 
 def _place_and_colour(time: Floats, accel: Floats, quiet_sd: Floats) -> tuple[int, float]:
