@@ -88,12 +88,7 @@ def constant_calibration(
 def _refine(
     means: Floats, gravity: float | Floats, bias: Floats, scale: Floats, misalignment_sd: float
 ) -> tuple[ConstantCalibration, float]:
-    """
-    Fit the triad, beginning with given values; return also the RMS error of |f| [m/s^2].
-
-    |f| of few positions hardly determines some constants, so the built-in prior of the constants
-    is added, weighted as if |f| had an error of 0.1 %.
-    """
+    """Fit the triad, beginning with given values; return also the RMS error of |f| [m/s^2]."""
     one_g = float(np.median(gravity))
 
     def unpack(parameters: Floats) -> ConstantCalibration:
@@ -107,6 +102,8 @@ def _refine(
         return np.asarray(np.linalg.norm(calibration.force(means), axis=1) / gravity - 1.0)
 
     def residual(parameters: Floats) -> Floats:
+        # |f| of few positions hardly determines some constants, so the built-in prior of the
+        # constants is added, weighted as if |f| had an error of 0.1 %.
         calibration = unpack(parameters)
         bias_sd = BIAS_SD / STANDARD_GRAVITY * one_g
         log_scale = np.log(np.abs(calibration.scale))

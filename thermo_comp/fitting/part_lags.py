@@ -191,10 +191,9 @@ class _PartCurves:
 
     def _lag(self, axis: int, noise: float) -> Part:
         """
-        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual.
-
-        If noise does not explain the residual, a second stage or another share of the gradient is
-        tried, and must reduce the RMS residual by more than 5 %.
+        Return the lag with the smallest RMS residual; 0 s if no lag reduces the residual. If noise
+        does not explain the residual, a second stage or another share of the gradient is tried,
+        and must reduce the RMS residual by more than 5 %.
         """
         one_stage = self.one_stage(axis)
         best = self._with_lead(one_stage, axis)

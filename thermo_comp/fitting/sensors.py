@@ -124,9 +124,8 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
 
 def _flicker(recorded: Sequence[Readings]) -> float:
     """
-    Return the sd of the noise of readings whose quantum is much larger than the noise [K].
-
-    While the temperature passes the edge between two rounded values at the rate r, readings with
+    Return the sd of the noise of readings whose quantum is much larger than the noise [K]. While
+    the temperature passes the edge between two rounded values at the rate r, readings with
     interval h and noise of sd s change ``2 s / (r h sqrt(pi))`` times, but at least once.
     """
     moves = inverse_rates = 0.0
