@@ -69,10 +69,10 @@ def next_direction(covariance: Floats, sd: float, positions: Floats) -> Floats:
     """
     columns = force_columns(_SPHERE)
     weight = np.einsum('nij,nik->jk', columns, columns) / len(columns)
-    columns_of_norm = norm_columns(_SPHERE)
-    moved = columns_of_norm @ covariance
+    of_norm = norm_columns(_SPHERE)
+    moved = of_norm @ covariance
     gain = np.einsum('ij,jk,ik->i', moved, weight, moved)
-    gain /= np.einsum('ij,ij->i', moved, columns_of_norm) + sd * sd
+    gain /= np.einsum('ij,ij->i', moved, of_norm) + sd * sd
     gain[np.max(_SPHERE @ positions.T, axis=1, initial=-1.0) > math.cos(math.radians(20.0))] = 0.0
     good = gain >= max(0.5 * gain.max(), 1e-300)
     # Slices of `_SPHERE`: faces, edges and corners of a cube, and all other directions.
@@ -85,7 +85,7 @@ def farthest(up: Floats) -> tuple[Floats, float]:
     """Return the direction farthest from its nearest vector in `up`, (n, 3); their angle [deg]."""
     nearest = np.max(_SPHERE @ up.T, axis=1, initial=-1.0)
     chosen = int(np.argmin(nearest))
-    return _SPHERE[chosen], float(np.degrees(np.arccos(np.clip(nearest[chosen], -1.0, 1.0))))
+    return _SPHERE[chosen], float(np.degrees(np.arccos(np.minimum(nearest[chosen], 1.0))))
 
 
 def distinct_directions(up: Floats) -> Floats:

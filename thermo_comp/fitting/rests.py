@@ -37,10 +37,9 @@ def is_bench(windows: ThermalWindows, up: Floats) -> bool:
 
 def _is_heated(windows: ThermalWindows) -> Bools:
     """
-    Return the heated or cooled positions, shape (n_positions,): those whose temperature changes by
-    more than a tenth of the span of all temperatures, or whose mean temperature differs by more
-    than a tenth of the span from the median; all positions if there is no such position. Short
-    rests in other attitudes in a room do not count: their drifts hardly separate bias and scale.
+    Return the heated or cooled positions, shape (n_positions,): their temperature changes by over
+    a tenth of the span of all temperatures, or differs from the median by as much; all positions
+    if there are none. Drifts of short rests in a room hardly separate bias and scale.
     """
     t, edges, weight = windows.temperature, windows.data.edges[:-1], windows.data.weight
     mean = block_means(t[:, None], weight, edges)[:, 0]
@@ -52,11 +51,9 @@ def _is_heated(windows: ThermalWindows) -> Bools:
 def is_steady(windows: ThermalWindows) -> Bools:
     """
     Return the positions whose temperatures, and their differences, change (RMS) by less than three
-    sd of the estimated board temperature, shape (n_positions,).
-
-    In such a position the noise of the thermometers would count as temperature changes that cause
-    no drift, so the fitted slopes would be too small: by a ninth for a change of three sd, because
-    a ninth of the mean square change is then noise.
+    sd of the estimated board temperature, shape (n_positions,). In such a position noise would
+    count as temperature changes that cause no drift: at three sd it is a ninth of the mean square
+    change, and the fitted slopes would be a ninth too small.
     """
     data, model = windows.data, windows.model
     lags = [column.group in LAGS and not column.power for column in model.columns]

@@ -116,7 +116,7 @@ def _noise_of(recorded: Sequence[Readings], quantum: float) -> float:
         return 1.4826 * float(np.median(np.abs(second))) / float(np.sqrt(6.0))
     # Most rounded readings are equal to their neighbours, so the median difference is 0. The mean
     # square without the largest 1 % is used instead, less the variance of rounding.
-    square = np.sort(second**2)[: max(1, int(0.99 * len(second)))]
+    square = np.sort(second**2)[: int(0.99 * len(second))]
     noise = float(np.sqrt(max(float(square.mean()) / 6.0 - quantum**2 / 12.0, 0.0)))
     limit = 0.1 * quantum
     return noise if noise > limit else float(np.clip(_flicker(recorded), 0.1 * limit, limit))
