@@ -151,12 +151,12 @@ class Whitener:
 
 
 def _vertex(values: Floats, at: int) -> float:
-    """Return the place of the minimum of the parabola through three values about `at`, -1..1."""
+    """Return the vertex of the parabola through the smallest value, `at`, and its neighbours."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = values[at - 1 : at + 2].tolist()
     bend = before - 2.0 * here + after
-    return float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0
+    return 0.5 * float(before - after) / bend if bend > 0.0 else 0.0
 
 
 @dataclass(frozen=True)

@@ -242,19 +242,23 @@ def thermal_windows(
     spec = memory_of(model.columns, model.sensors)
     tracks = tracks or [_track(bag, model, spec) for bag in bags]
     table = ColumnTable(model.columns, spec, model.reference_temperature)
+    places = StateLayout(spec).places
     parts: list[_Rows] = []
     rests: list[tuple[ReducedBag, StillInterval]] = []
     numbers: list[int] = []
     has_rate = all(interval.angular_rate is not None for bag in bags for interval in bag.intervals)
     for number, (bag, track) in enumerate(zip(bags, tracks, strict=True)):
-        grid, states = track.grid_s, _with_memory(track, spec)
+        # All lags of a bag are computed at once, which is faster than reading by reading.
+        gradients = [track.states[:, places[Gradient(name)]] for name in spec.sensors]
+        memory = memory_on_grid(spec, track.step_s, track.states[:, BOARD], gradients)
         # `np.interp` would copy a strided or boolean series at each call.
-        known, all_series = track.is_known.astype(np.float64), np.ascontiguousarray(states.T)
+        states = np.ascontiguousarray(np.hstack((track.states, memory)).T)
+        grid, known = track.grid_s, track.is_known.astype(np.float64)
         for interval in bag.intervals:
             use = np.interp(interval.time, grid, known, left=0.0) == 1.0
             if use.any():
                 time = interval.time[use]
-                at = np.array([np.interp(time, grid, series) for series in all_series])
+                at = np.array([np.interp(time, grid, series) for series in states])
                 parts.append(_rows(interval, has_rate, use, at, grid[0], model, table))
                 rests.append((bag, interval))
                 numbers.append(number)
@@ -441,10 +445,3 @@ def _track(bag: ReducedBag, model: Model, spec: MemorySpec) -> Track:
     is_known[:n_unsettled] = False
     start_s = (begin_ns - bag.start_ns) * 1e-9
     return Track(start_s, step_s, states, is_known, start_s + step_s * n_unsettled)
-
-
-def _with_memory(track: Track, spec: MemorySpec) -> Floats:
-    """Return the thermal states of a track with their lags, computed at once for speed."""
-    states, places = track.states, StateLayout(spec).places
-    gradients = [states[:, places[Gradient(name)]] for name in spec.sensors]
-    return np.hstack((states, memory_on_grid(spec, track.step_s, states[:, BOARD], gradients)))
