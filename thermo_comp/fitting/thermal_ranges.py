@@ -208,7 +208,7 @@ def _ends(fit: Fit, known: Calibration | None) -> Range:
 
 
 def _unknown_slope(fit: Fit) -> float:
-    """Return half of the RMS slope of the fitted scale curves over the axes [1/K]."""
+    """Return the sd of an extrapolated scale factor's slope [1/K]: half the RMS fitted slope."""
     windows, state = fit.windows.data, fit.posterior.state
     is_curve = np.isin(windows.groups, (CURVE, PART)) & (windows.kelvins > 0.0)
     slopes = state.weights[1][:, is_curve] / windows.kelvins[is_curve]
