@@ -318,6 +318,8 @@ class Series:
         Convert linear functions of the base series, (n_positions, k, n_base): the columns, which
         have initial lag states at the prior mean, get the initial lag states of `state`.
         """
+        if not len(base.lagged):
+            return rows  # not a copy, whose memory layout would change the last bits of products
         result: Floats = rows.copy()
         starts = self.starts(state, base)[:, None]
         result[..., 1 + base.lagged] += starts * rows[..., base.at_start]
